@@ -1,0 +1,184 @@
+"""Robot: a serial arm as plain data, in the form that kinematics and collision checking share."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
+
+MOVING_KINDS = ("revolute", "continuous", "prismatic")
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """One joint of the URDF tree. Limits are meaningless for a fixed joint."""
+
+    name: str
+    kind: str
+    """revolute, continuous, prismatic or fixed."""
+    parent: str
+    child: str
+    T_parent_joint: Float[ndarray, "4 4"]
+    axis: Float[ndarray, "3"]
+    """Unit axis in the joint frame."""
+    lower: float = 0.0
+    """[rad] or [m]; -pi for a continuous joint."""
+    upper: float = 0.0
+    velocity: float = 0.0
+    """[rad/s] or [m/s]"""
+    acceleration: float = 0.0
+    jerk: float = 0.0
+
+    def motion(self, q: float) -> Float[ndarray, "4 4"]:
+        """T_joint_child for the joint value q."""
+        if self.kind == "prismatic":
+            return transform(self.axis * q)
+        if self.kind == "fixed":
+            return np.eye(4)
+        return transform(np.zeros(3), rotation_about(self.axis, q))
+
+
+@dataclass(frozen=True, eq=False)
+class ConvexMesh:
+    """A convex polyhedron in the frame of its link [m]."""
+
+    vertices: Float[ndarray, "v 3"]
+    faces: Int[ndarray, "f 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A serial arm: the joints between base and tip that are not locked are planned.
+
+    Frames: frame 0 is the base link; frame j + 1 moves with planned joint j, and
+    T_base_frame[j + 1] = T_base_frame[j] @ frame_offsets[j] @ M(q_j), where M turns about z, or slides
+    along z for a prismatic joint. Every link is rigidly fixed to one frame.
+    """
+
+    name: str
+    base: str
+    tip: str
+    joints: tuple[Joint, ...]
+    """All joints of the tree below the base, parents before children."""
+    spheres: dict[str, Float[ndarray, "n 4"]] = field(default_factory=dict)
+    """Collision spheres by link, x y z radius in the link frame [m]; they cover `meshes`."""
+    meshes: dict[str, tuple[ConvexMesh, ...]] = field(default_factory=dict)
+    """Convex collision meshes by link: the exact geometry of the judge."""
+    allowed_collisions: frozenset[frozenset[str]] = frozenset()
+    """Pairs of links that are not checked against each other."""
+    locked: dict[str, float] = field(default_factory=dict)
+    """Values of the movable joints that planning holds [rad] or [m]."""
+    notes: tuple[str, ...] = ()
+    """What the reader of the URDF changed or ignored."""
+
+    @cached_property
+    def link_names(self) -> tuple[str, ...]:
+        return (self.base, *(joint.child for joint in self.joints))
+
+    @cached_property
+    def planned_joints(self) -> tuple[Joint, ...]:
+        """Movable, unlocked joints on the chain from base to tip, in order."""
+        by_child = {joint.child: joint for joint in self.joints}
+        chain: list[Joint] = []
+        link = self.tip
+        while link != self.base:
+            chain.append(by_child[link])
+            link = by_child[link].parent
+        return tuple(j for j in reversed(chain) if j.kind in MOVING_KINDS and j.name not in self.locked)
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        return tuple(joint.name for joint in self.planned_joints)
+
+    @property
+    def dof(self) -> int:
+        return len(self.planned_joints)
+
+    def _limit(self, what: str) -> Float[ndarray, "dof"]:
+        return np.array([getattr(joint, what) for joint in self.planned_joints])
+
+    @cached_property
+    def lower(self) -> Float[ndarray, "dof"]:
+        return self._limit("lower")
+
+    @cached_property
+    def upper(self) -> Float[ndarray, "dof"]:
+        return self._limit("upper")
+
+    @cached_property
+    def velocity(self) -> Float[ndarray, "dof"]:
+        return self._limit("velocity")
+
+    @cached_property
+    def acceleration(self) -> Float[ndarray, "dof"]:
+        return self._limit("acceleration")
+
+    @cached_property
+    def jerk(self) -> Float[ndarray, "dof"]:
+        return self._limit("jerk")
+
+    @cached_property
+    def prismatic(self) -> tuple[bool, ...]:
+        return tuple(joint.kind == "prismatic" for joint in self.planned_joints)
+
+    @cached_property
+    def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], list[ndarray]]:
+        links: dict[str, tuple[int, ndarray]] = {self.base: (0, np.eye(4))}
+        offsets: list[ndarray] = []
+        planned = {joint.name for joint in self.planned_joints}
+        for joint in self.joints:
+            frame, T_frame_parent = links[joint.parent]
+            if joint.name in planned:
+                T_joint_frame = transform(np.zeros(3), rotation_z_to(joint.axis))
+                offsets.append(T_frame_parent @ joint.T_parent_joint @ T_joint_frame)
+                links[joint.child] = (len(offsets), inverse(T_joint_frame))
+            else:
+                T_joint_child = joint.motion(self.locked.get(joint.name, 0.0))
+                links[joint.child] = (frame, T_frame_parent @ joint.T_parent_joint @ T_joint_child)
+        return links, offsets
+
+    @cached_property
+    def frame_offsets(self) -> Float[ndarray, "dof 4 4"]:
+        return np.stack(self._frames[1]) if self._frames[1] else np.zeros((0, 4, 4))
+
+    def link_frame(self, link: str) -> int:
+        """Index of the frame that the link is fixed to: 0 for the base, j + 1 behind planned joint j."""
+        return self._link(link)[0]
+
+    def T_frame_link(self, link: str) -> Float[ndarray, "4 4"]:
+        return self._link(link)[1]
+
+    def _link(self, link: str) -> tuple[int, ndarray]:
+        if link not in self._frames[0]:
+            raise unknown_name("link", link, self.link_names)
+        return self._frames[0][link]
+
+    def checked_pairs(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of links with geometry, on different frames, that are checked against each other."""
+        links = [link for link in self.link_names if link in self.spheres]
+        return tuple(
+            (a, b)
+            for i, a in enumerate(links)
+            for b in links[i + 1 :]
+            if frozenset((a, b)) not in self.allowed_collisions and self.link_frame(a) != self.link_frame(b)
+        )
+
+    def with_locked(self, locked: dict[str, float]) -> "Robot":
+        """The same robot with some joints held at values (a planned joint may be named too).
+
+        Raises InputError for an unknown or fixed joint or a value that is not finite. Values beyond the
+        URDF's limits are accepted: gripper openings in published problems exceed them.
+        """
+        movable = [joint.name for joint in self.joints if joint.kind in MOVING_KINDS]
+        for name, value in locked.items():
+            if name not in movable:
+                raise unknown_name("joint in locked", name, movable)
+            if not np.isfinite(value):
+                raise InputError(f"locked: {name} is {value}; it must be a finite number")
+        if all(self.locked.get(name) == value for name, value in locked.items()):
+            return self
+        return replace(self, locked=self.locked | {k: float(v) for k, v in locked.items()})

@@ -1,0 +1,28 @@
+"""Scene: the obstacles around a robot."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from dataclasses import replace as dataclass_replace
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.scenes.shapes import Shape
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Obstacles in the frame of the robot's base. Names are made unique by a number at the end."""
+
+    shapes: tuple[Shape, ...] = ()
+
+    def __init__(self, shapes: Iterable[Shape] = ()) -> None:
+        named: list[Shape] = []
+        taken: set[str] = set()
+        for i, shape in enumerate(shapes):
+            if not isinstance(shape, Shape):
+                raise InputError(f"scene[{i}] is a {type(shape).__name__}; it must be a shape, e.g. rd.Sphere")
+            name, number = shape.name, 2
+            while name in taken:
+                name, number = f"{shape.name}_{number}", number + 1
+            taken.add(name)
+            named.append(shape if name == shape.name else dataclass_replace(shape, name=name))  # type: ignore[type-var]
+        object.__setattr__(self, "shapes", tuple(named))

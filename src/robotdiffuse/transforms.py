@@ -1,0 +1,83 @@
+"""Rigid transforms as 4 x 4 matrices and quaternions in wxyz order (NumPy, float64)."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+
+def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b 3 3"]:
+    """Rotation matrix of a quaternion, normalised first."""
+    w, x, y, z = np.moveaxis(wxyz / np.linalg.norm(wxyz, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quaternion_from_rotation(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "4"]:
+    """Unit quaternion wxyz with w >= 0 of a rotation matrix (Bar-Itzhack's eigenvector method)."""
+    r = rotation
+    k = np.array(
+        [
+            [r[0, 0] - r[1, 1] - r[2, 2], 0, 0, 0],
+            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], 0, 0],
+            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], 0],
+            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
+        ]
+    )
+    x, y, z, w = np.linalg.eigh(k)[1][:, -1]
+    wxyz = np.array([w, x, y, z])
+    return wxyz if w >= 0 else -wxyz
+
+
+def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Float[ndarray, "3 3"]:
+    """URDF's fixed-axis roll, pitch, yaw: Rz(yaw) Ry(pitch) Rx(roll)."""
+    (sr, cr), (sp, cp), (sy, cy) = [(np.sin(a), np.cos(a)) for a in (roll, pitch, yaw)]
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def rotation_about(axis: Float[ndarray, "3"], angle: float) -> Float[ndarray, "3 3"]:
+    """Rotation by an angle [rad] about a unit axis (Rodrigues)."""
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def rotation_z_to(axis: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+    """A rotation R with R @ [0, 0, 1] = axis (a unit vector); the identity for +z."""
+    z = np.array([0.0, 0.0, 1.0])
+    sine, cosine = np.linalg.norm(np.cross(z, axis)), float(axis[2])
+    if sine < 1e-12:
+        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
+    return rotation_about(np.cross(z, axis) / sine, float(np.arctan2(sine, cosine)))
+
+
+def transform(
+    xyz: Float[ndarray, "3"], rotation: Float[ndarray, "3 3"] | None = None
+) -> Float[ndarray, "4 4"]:
+    """The 4 x 4 matrix of a rotation (default none) followed by a translation [m]."""
+    T = np.eye(4)
+    T[:3, 3] = xyz
+    if rotation is not None:
+        T[:3, :3] = rotation
+    return T
+
+
+def inverse(T: Float[ndarray, "4 4"]) -> Float[ndarray, "4 4"]:
+    """Inverse of a rigid transform."""
+    return transform(-T[:3, :3].T @ T[:3, 3], T[:3, :3].T)
+
+
+def rotation_angle(rotation: Float[ndarray, "3 3"]) -> float:
+    """Angle [rad] of a rotation matrix, accurate near 0 and pi."""
+    skew = rotation - rotation.T
+    sine2 = np.sqrt(skew[0, 1] ** 2 + skew[0, 2] ** 2 + skew[1, 2] ** 2)
+    return float(np.arctan2(sine2, np.trace(rotation) - 1))
