@@ -1,0 +1,1 @@
+"""From a verified path to a timed trajectory and to files."""

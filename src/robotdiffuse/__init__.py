@@ -1,0 +1,80 @@
+"""Motion planning for redundant arms: `import robotdiffuse as rd`; every motion is verified."""
+
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robotdiffuse.errors import InputError as InputError
+    from robotdiffuse.paths.export import load_result as load_result
+    from robotdiffuse.planners import load_planner as load_planner
+    from robotdiffuse.planners import plan as plan
+    from robotdiffuse.problem import JointGoal as JointGoal
+    from robotdiffuse.problem import PoseGoal as PoseGoal
+    from robotdiffuse.problem import Problem as Problem
+    from robotdiffuse.problem import load_problem as load_problem
+    from robotdiffuse.robots import load_robot as load_robot
+    from robotdiffuse.scenes.scene import Scene as Scene
+    from robotdiffuse.scenes.shapes import Box as Box
+    from robotdiffuse.scenes.shapes import Capsule as Capsule
+    from robotdiffuse.scenes.shapes import Cylinder as Cylinder
+    from robotdiffuse.scenes.shapes import Mesh as Mesh
+    from robotdiffuse.scenes.shapes import PointCloud as PointCloud
+    from robotdiffuse.scenes.shapes import Sphere as Sphere
+    from robotdiffuse.types import Path as Path
+    from robotdiffuse.types import PlanResult as PlanResult
+    from robotdiffuse.types import Status as Status
+    from robotdiffuse.types import Trajectory as Trajectory
+    from robotdiffuse.verify import verify as verify
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "InputError": "robotdiffuse.errors",
+    "load_result": "robotdiffuse.paths.export",
+    "load_planner": "robotdiffuse.planners",
+    "plan": "robotdiffuse.planners",
+    "JointGoal": "robotdiffuse.problem",
+    "PoseGoal": "robotdiffuse.problem",
+    "Problem": "robotdiffuse.problem",
+    "load_problem": "robotdiffuse.problem",
+    "load_robot": "robotdiffuse.robots",
+    "Scene": "robotdiffuse.scenes.scene",
+    "Box": "robotdiffuse.scenes.shapes",
+    "Capsule": "robotdiffuse.scenes.shapes",
+    "Cylinder": "robotdiffuse.scenes.shapes",
+    "Mesh": "robotdiffuse.scenes.shapes",
+    "PointCloud": "robotdiffuse.scenes.shapes",
+    "Sphere": "robotdiffuse.scenes.shapes",
+    "Path": "robotdiffuse.types",
+    "PlanResult": "robotdiffuse.types",
+    "Status": "robotdiffuse.types",
+    "Trajectory": "robotdiffuse.types",
+    "verify": "robotdiffuse.verify",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+class _Package(ModuleType):
+    def __setattr__(self, name: str, value: object) -> None:
+        # The import system would put the module robotdiffuse.verify in the place of the function.
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Package
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first used: PyTorch and the compiled kernels take a second to import."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'robotdiffuse' has no attribute {name!r}")
+    value = getattr(import_module(_HOME[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
