@@ -29,7 +29,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
 
     Method: the set of places that a link can be at, seen from frame j, is described by its support
     function h(u) = max p.u on a grid of directions u, carried inwards from joint to joint. Turning by an
-    interval of angles is a sliding maximum along a circle of latitude, a rigid offset is h(u) -> h(R^T u) + t.u.
+    interval of angles is a sliding maximum along a circle of latitude, a rigid offset h(u) -> h(R^T u) + t.u.
     Between grid directions h is bounded from above by its sublinearity: for weights that sum to one and
     e = u - sum w_i u_i, h(u) <= sum w_i h(u_i) + |e| max |p|. So each step rounds upwards. Distance from an
     axis is convex, hence the support function, that of the convex hull, loses nothing.
@@ -64,7 +64,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
         offset = robot.frame_offsets[j]
         corners, weights, residual = _interpolation(directions @ offset[:3, :3])
         values = h.reshape(len(moved), -1)
-        h = sum(values[:, corners[k]] * weights[k] for k in range(4)) + residual * r[:, None]
+        h = (values[:, corners] * weights).sum(1) + residual * r[:, None]
         support[moved] = h.reshape(-1, ROWS, COLUMNS) + directions @ offset[:3, 3]
         reach[moved] = r + np.linalg.norm(offset[:3, 3])
     radii.setflags(write=False)

@@ -1,0 +1,223 @@
+"""Compiled part of inverse kinematics: damped Newton iterations from many seeds.
+
+Kept free of jaxtyping: numba compiles these functions. Arrays are float64, C-contiguous.
+Joint kinds: 0 revolute, 1 prismatic, 2 continuous (turns without end; wrapped to its limits when solved).
+"""
+
+import numpy as np
+from numba import njit
+
+REVOLUTE, PRISMATIC, CONTINUOUS = 0, 1, 2
+
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-9, 1e3
+RELAX, TIGHTEN = 0.1, 4.0
+CHECK_EVERY = 6
+"""Iterations between two looks at the progress; a seed that has not halved its error by then is given up."""
+PROGRESS = 0.5
+
+
+@njit(cache=True)
+def _forward(q, offsets, tool, kinds, frame, T, axes, origins):
+    """Axes and origins of the joints before `frame`, and into T the pose of the tool."""
+    for i in range(3):
+        for k in range(4):
+            T[i, k] = 1.0 if i == k else 0.0
+    for j in range(frame):
+        offset = offsets[j]
+        cosine, sine = np.cos(q[j]), np.sin(q[j])
+        for i in range(3):
+            a, b, c, d = T[i, 0], T[i, 1], T[i, 2], T[i, 3]
+            x = a * offset[0, 0] + b * offset[1, 0] + c * offset[2, 0]
+            y = a * offset[0, 1] + b * offset[1, 1] + c * offset[2, 1]
+            z = a * offset[0, 2] + b * offset[1, 2] + c * offset[2, 2]
+            p = a * offset[0, 3] + b * offset[1, 3] + c * offset[2, 3] + d
+            axes[j, i] = z
+            origins[j, i] = p
+            T[i, 2] = z
+            if kinds[j] == PRISMATIC:
+                T[i, 0], T[i, 1], T[i, 3] = x, y, p + z * q[j]
+            else:
+                T[i, 0], T[i, 1], T[i, 3] = x * cosine + y * sine, y * cosine - x * sine, p
+    for i in range(3):
+        a, b, c, d = T[i, 0], T[i, 1], T[i, 2], T[i, 3]
+        for k in range(3):
+            T[i, k] = a * tool[0, k] + b * tool[1, k] + c * tool[2, k]
+        T[i, 3] = a * tool[0, 3] + b * tool[1, 3] + c * tool[2, 3] + d
+
+
+@njit(cache=True)
+def _residual(T, target, rows, rotation_weight, error):
+    """Into `error`: position, then weighted rotation vector from T to the target. Its squared norm."""
+    for i in range(3):
+        error[i] = target[i, 3] - T[i, 3]
+    if rows == 6:
+        # R = target @ T.T; its rotation vector by the sine and cosine of its angle.
+        r01 = r02 = r10 = r12 = r20 = r21 = r00 = r11 = r22 = 0.0
+        for k in range(3):
+            r00 += target[0, k] * T[0, k]
+            r01 += target[0, k] * T[1, k]
+            r02 += target[0, k] * T[2, k]
+            r10 += target[1, k] * T[0, k]
+            r11 += target[1, k] * T[1, k]
+            r12 += target[1, k] * T[2, k]
+            r20 += target[2, k] * T[0, k]
+            r21 += target[2, k] * T[1, k]
+            r22 += target[2, k] * T[2, k]
+        x, y, z = 0.5 * (r21 - r12), 0.5 * (r02 - r20), 0.5 * (r10 - r01)
+        sine = np.sqrt(x * x + y * y + z * z)
+        cosine = 0.5 * (r00 + r11 + r22 - 1.0)
+        scale = 1.0
+        if sine > 1e-12:
+            scale = np.arctan2(sine, cosine) / sine
+        elif cosine < 0.0:  # half a turn: any axis near the right one serves as a direction of descent
+            x, y, z = np.sqrt(max(r00 + 1, 0.0)), np.sqrt(max(r11 + 1, 0.0)), np.sqrt(max(r22 + 1, 0.0))
+            scale = np.pi / np.sqrt(x * x + y * y + z * z)
+        scale *= rotation_weight
+        error[3], error[4], error[5] = x * scale, y * scale, z * scale
+    total = 0.0
+    for i in range(rows):
+        total += error[i] * error[i]
+    return total
+
+
+@njit(cache=True)
+def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
+    for j in range(frame):
+        ax, ay, az = axes[j, 0], axes[j, 1], axes[j, 2]
+        if kinds[j] == PRISMATIC:
+            J[0, j], J[1, j], J[2, j] = ax, ay, az
+            for i in range(3, rows):
+                J[i, j] = 0.0
+        else:
+            dx, dy, dz = T[0, 3] - origins[j, 0], T[1, 3] - origins[j, 1], T[2, 3] - origins[j, 2]
+            J[0, j], J[1, j], J[2, j] = ay * dz - az * dy, az * dx - ax * dz, ax * dy - ay * dx
+            if rows == 6:
+                J[3, j], J[4, j], J[5, j] = rotation_weight * ax, rotation_weight * ay, rotation_weight * az
+
+
+@njit(cache=True)
+def _step(J, error, damping, rows, frame, held, A, y, step):
+    """step = J^T (J J^T + damping I)^-1 error over the joints that are not held, by Cholesky."""
+    for i in range(rows):
+        for k in range(i + 1):
+            total = damping if i == k else 0.0
+            for j in range(frame):
+                if not held[j]:
+                    total += J[i, j] * J[k, j]
+            A[i, k] = total
+    for i in range(rows):
+        for k in range(i + 1):
+            total = A[i, k]
+            for m in range(k):
+                total -= A[i, m] * A[k, m]
+            A[i, k] = np.sqrt(max(total, 1e-30)) if i == k else total / A[k, k]
+    for i in range(rows):
+        total = error[i]
+        for k in range(i):
+            total -= A[i, k] * y[k]
+        y[i] = total / A[i, i]
+    for i in range(rows - 1, -1, -1):
+        total = y[i]
+        for k in range(i + 1, rows):
+            total -= A[k, i] * y[k]
+        y[i] = total / A[i, i]
+    for j in range(frame):
+        total = 0.0
+        if not held[j]:
+            for i in range(rows):
+                total += J[i, j] * y[i]
+        step[j] = total
+
+
+@njit(cache=True)
+def _is_new(q, others, count, kinds, spans, min_distance):
+    """Whether q is further than min_distance from the others: max norm, across the wrap of endless joints."""
+    for n in range(count):
+        far = False
+        for j in range(len(q)):
+            gap = abs(q[j] - others[n, j])
+            if kinds[j] == CONTINUOUS:
+                gap = min(gap, spans[j] - gap)
+            if gap > min_distance:
+                far = True
+                break
+        if not far:
+            return False
+    return True
+
+
+@njit(cache=True)
+def solve_seeds(
+    seeds, known, wanted, offsets, tool, kinds, frame, lower, upper, target,
+    position_only, rotation_weight, position_tolerance, rotation_tolerance, max_iterations, min_distance,
+):  # fmt: skip
+    """Solve seed after seed until `wanted` configurations are found that differ from `known` and each other.
+
+    Returns the new configurations [k, dof] and the number of seeds used.
+    """
+    dof = seeds.shape[1]
+    rows = 3 if position_only else 6
+    T, axes, origins = np.empty((3, 4)), np.empty((dof, 3)), np.empty((dof, 3))
+    error, trial_error, J = np.zeros(6), np.zeros(6), np.zeros((6, dof))
+    A, y, step, held = np.zeros((6, 6)), np.zeros(6), np.zeros(dof), np.zeros(dof, dtype=np.bool_)
+    trial, spans = np.empty(dof), upper - lower
+    found = np.empty((len(known) + wanted, dof))
+    found[: len(known)] = known
+    count, used = len(known), 0
+    for s in range(len(seeds)):
+        used = s + 1
+        q = seeds[s].copy()
+        _forward(q, offsets, tool, kinds, frame, T, axes, origins)
+        cost = _residual(T, target, rows, rotation_weight, error)
+        damping, checked, solved, fresh = FIRST_DAMPING, cost, False, True
+        for iteration in range(max_iterations):
+            position = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
+            rotation = np.sqrt(error[3] ** 2 + error[4] ** 2 + error[5] ** 2) / rotation_weight
+            solved = position <= position_tolerance and (position_only or rotation <= rotation_tolerance)
+            if solved or damping > MOST_DAMPING:
+                break
+            if iteration % CHECK_EVERY == CHECK_EVERY - 1:
+                if cost > PROGRESS * PROGRESS * checked:
+                    break
+                checked = cost
+            if fresh:
+                _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J)
+                fresh = False
+            # Joints that a step would push through their limit are held there, and the rest solved again.
+            held[:] = False
+            _step(J, error, damping * cost, rows, frame, held, A, y, step)
+            again = False
+            for j in range(frame):
+                if kinds[j] != CONTINUOUS and (
+                    (q[j] <= lower[j] and step[j] < 0.0) or (q[j] >= upper[j] and step[j] > 0.0)
+                ):
+                    held[j] = again = True
+            if again:
+                _step(J, error, damping * cost, rows, frame, held, A, y, step)
+            for j in range(dof):
+                trial[j] = q[j]
+                if j < frame:
+                    trial[j] += step[j]
+                    if kinds[j] != CONTINUOUS:
+                        trial[j] = min(max(trial[j], lower[j]), upper[j])
+            _forward(trial, offsets, tool, kinds, frame, T, axes, origins)
+            trial_cost = _residual(T, target, rows, rotation_weight, trial_error)
+            if trial_cost < cost:
+                q[:] = trial
+                error[:] = trial_error
+                cost = trial_cost
+                damping = max(damping * RELAX, LEAST_DAMPING)
+                fresh = True
+            else:
+                damping *= TIGHTEN
+        if not solved:
+            continue
+        for j in range(dof):
+            if kinds[j] == CONTINUOUS:
+                q[j] = min(max(lower[j] + (q[j] - lower[j]) % spans[j], lower[j]), upper[j])
+        if _is_new(q, found, count, kinds, spans, min_distance):
+            found[count] = q
+            count += 1
+            if count == len(found):
+                break
+    return found[len(known) : count], used

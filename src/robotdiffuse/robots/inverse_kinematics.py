@@ -1,0 +1,141 @@
+"""Inverse kinematics: several distinct configurations for a pose of a link."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, solve_seeds
+from robotdiffuse.robots.robot import Robot
+
+KINDS = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "continuous": CONTINUOUS}
+
+
+@dataclass(frozen=True)
+class InverseKinematicsSettings:
+    position_only: bool = False
+    """Ignore the orientation of the pose, as the ROP problems of the paper do."""
+    position_tolerance: float = 1e-6
+    """Largest distance to the position [m]."""
+    rotation_tolerance: float = 1e-6
+    """Largest angle to the orientation [rad]."""
+    min_distance: float = 0.1
+    """Distinct solutions differ by more than this in at least one joint [rad or m]."""
+    limit_margin: float = 1e-6
+    """Distance kept from the joint limits [rad or m]."""
+    seeds_per_round: int = 64
+    """Random configurations that are drawn at a time."""
+    max_rounds: int = 24
+    """Rounds of seeds before the search ends with what it has."""
+    patience: int = 4
+    """Rounds without a new accepted solution after which it ends, once it has one."""
+    max_iterations: int = 60
+    """Steps of the damped Newton method per seed."""
+    rotation_weight: float = 0.3
+    """Metres that one radian of orientation error counts as in the least-squares problem."""
+
+    def __post_init__(self) -> None:
+        for name in ("position_tolerance", "rotation_tolerance", "rotation_weight"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"inverse kinematics: {name} is {getattr(self, name)}; it must be positive")
+        for name in ("seeds_per_round", "max_rounds", "patience", "max_iterations"):
+            if getattr(self, name) < 1:
+                raise InputError(
+                    f"inverse kinematics: {name} is {getattr(self, name)}; it must be at least 1"
+                )
+        for name in ("min_distance", "limit_margin"):
+            if not getattr(self, name) >= 0:
+                raise InputError(
+                    f"inverse kinematics: {name} is {getattr(self, name)}; it must not be negative"
+                )
+
+
+def inverse_kinematics(
+    robot: Robot,
+    frame: str,
+    T_base_frame: Float[ndarray, "4 4"],
+    count: int = 10,
+    *,
+    rng: np.random.Generator,
+    accept: Callable[[Float[ndarray, "n dof"]], Bool[ndarray, "n"]] | None = None,
+    settings: InverseKinematicsSettings | None = None,
+) -> Float[ndarray, "k dof"]:
+    """Up to `count` distinct configurations that bring link `frame` to the pose, inside the joint limits.
+
+    Damped Newton steps (Levenberg-Marquardt) from uniformly random seeds; steps are clipped to the limits,
+    and joints pushed against a limit are held while the others move. Joints behind the link keep random
+    values. The result is empty if the pose was not reached, and depends on nothing but the arguments and the
+    state of `rng`. `accept` is called with batches of solutions, e.g. to keep those free of collision.
+
+    Raises InputError for an unknown link, one that no planned joint moves, a count below 1, or a matrix that
+    is no finite rigid transform.
+    """
+    settings = settings or InverseKinematicsSettings()
+    last = robot.link_frame(frame)
+    if last == 0:
+        raise InputError(f"inverse kinematics: no planned joint moves the link {frame!r}")
+    if count < 1:
+        raise InputError(f"inverse kinematics: count is {count}; it must be at least 1")
+    _check_pose(T_base_frame)
+    lower, upper = robot.lower + settings.limit_margin, robot.upper - settings.limit_margin
+    tool = np.ascontiguousarray(robot.T_frame_link(frame))
+    accepted = np.zeros((0, robot.dof))
+    if np.linalg.norm(T_base_frame[:3, 3] - robot.frame_offsets[0, :3, 3]) > _longest_reach(
+        robot, last, tool
+    ):
+        return accepted
+    target = np.array(T_base_frame, dtype=np.float64)
+    kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
+    known = accepted
+    idle = 0
+    for _ in range(settings.max_rounds):
+        seeds = rng.uniform(lower, upper, (settings.seeds_per_round, robot.dof))
+        before = len(accepted)
+        while len(seeds) and len(accepted) < count:
+            new, used = solve_seeds(
+                seeds,
+                known,
+                count - len(accepted),
+                robot.frame_offsets,
+                tool,
+                kinds,
+                last,
+                lower,
+                upper,
+                target,
+                settings.position_only,
+                settings.rotation_weight,
+                settings.position_tolerance,
+                settings.rotation_tolerance,
+                settings.max_iterations,
+                settings.min_distance,
+            )
+            seeds = seeds[used:]
+            if len(new):
+                known = np.concatenate([known, new])
+                accepted = np.concatenate([accepted, new if accept is None else new[accept(new)]])
+        idle = 0 if len(accepted) > before else idle + 1
+        if len(accepted) >= count or (len(accepted) and idle >= settings.patience):
+            break
+    return accepted
+
+
+def _longest_reach(robot: Robot, last: int, tool: Float[ndarray, "4 4"]) -> float:
+    """Bound on the tool's distance from the first joint's origin [m], over all configurations in the limits."""
+    lengths = np.linalg.norm(robot.frame_offsets[1:last, :3, 3], axis=1).sum() + np.linalg.norm(tool[:3, 3])
+    travel = np.maximum(abs(robot.lower), abs(robot.upper))[:last] @ np.array(robot.prismatic[:last], float)
+    return float(lengths + travel) + 1e-6
+
+
+def _check_pose(T: Float[ndarray, "4 4"]) -> None:
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InputError("inverse kinematics: the pose is not a 4 x 4 matrix of finite numbers")
+    rotation = T[:3, :3]
+    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
+    if not rigid or not np.allclose(T[3], [0, 0, 0, 1]):
+        raise InputError(
+            "inverse kinematics: the pose is no rigid transform (rotation, translation, 0 0 0 1)"
+        )
