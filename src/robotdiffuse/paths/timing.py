@@ -192,9 +192,7 @@ def _path_velocities(
 
 def _piece(
     robot: Robot, line: BlendedPolyline, settings: TimingSettings
-) -> tuple[
-    Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]
-]:
+) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
     """Times, positions, velocities and accelerations of a motion from rest to rest."""
     grid = _grid(line, settings)
     speeds = _path_velocities(robot, line, grid, settings)

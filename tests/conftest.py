@@ -1,0 +1,36 @@
+"""Runs the whole package under jaxtyping and beartype: a wrong shape annotation fails the suite."""
+
+import ast
+import os
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+from hypothesis import settings
+from jaxtyping import install_import_hook
+
+SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
+
+
+def imports_numba(file: Path) -> bool:
+    """Compiled functions must stay undecorated, so their modules are left out of the hook."""
+    return any(
+        (isinstance(node, ast.Import) and any(alias.name == "numba" for alias in node.names))
+        or (isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "numba")
+        for node in ast.walk(ast.parse(file.read_text()))
+    )
+
+
+def checked_modules() -> list[str]:
+    """All modules without compiled functions. Packages are left out: a name covers all that is below it."""
+    return [
+        ".".join(file.relative_to(SOURCE.parent).with_suffix("").parts)
+        for file in sorted(SOURCE.rglob("*.py"))
+        if file.name != "__init__.py" and not imports_numba(file)
+    ]
+
+
+install_import_hook(checked_modules(), "beartype.beartype")
+
+settings.register_profile("suite", deadline=None, max_examples=40)
+settings.load_profile("suite")

@@ -1,0 +1,92 @@
+"""The direction of imports, and what `import robotdiffuse` costs."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
+MODULES = sorted(SOURCE.rglob("*.py"))
+
+CHAIN = ("errors", "transforms", "types", "robots", "scenes", "collision", "problem", "verify", "paths")
+BELOW = {room: set(CHAIN[: i + 1]) for i, room in enumerate(CHAIN)}
+BELOW["learning"] = {*CHAIN[: CHAIN.index("collision") + 1], "learning"}
+BELOW["planners"] = {*CHAIN, "learning", "planners"}
+BELOW["simulation"] = {*CHAIN, "simulation"}
+BELOW["viewer"] = {*CHAIN, "viewer"}
+BELOW["generation"] = {*CHAIN, "learning", "planners", "generation"}
+BELOW["evaluation"] = {*CHAIN, "learning", "planners", "simulation", "generation", "evaluation"}
+EXCEPTIONS = {("types", "paths")}
+"""Trajectory.save and PlanResult.save import the writer when they are called."""
+
+EXTRAS = {
+    "pybullet": {"simulation"},
+    "pybullet_data": {"simulation"},
+    "ompl": {"planners"},
+    "ray": {"generation"},
+    "viser": {"viewer"},
+    "pinocchio": set(),
+    "example_robot_data": set(),
+}
+"""Packages that the core install lacks, and the rooms that may import them."""
+
+
+def room(file: Path) -> str:
+    first = file.relative_to(SOURCE).parts[0]
+    return first.removesuffix(".py")
+
+
+def imported(file: Path) -> Iterator[str]:
+    """Full names of everything that a module imports, at the top or inside functions."""
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file}:{node.lineno}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+@pytest.mark.parametrize("file", MODULES, ids=lambda file: str(file.relative_to(SOURCE)))
+def test_imports_point_one_way(file: Path) -> None:
+    here = room(file)
+    for name in imported(file):
+        top, _, rest = name.partition(".")
+        if top in EXTRAS:
+            assert here in EXTRAS[top], f"{here} must not import {top}: the core install lacks it"
+        there = rest.partition(".")[0]
+        if top != "robotdiffuse" or here in ("__init__", "cli") or (here, there) in EXCEPTIONS:
+            continue
+        assert there in BELOW[here] or there == "__version__", f"{here} must not import {there}"
+
+
+def test_every_room_has_a_place_in_the_order() -> None:
+    assert {room(file) for file in MODULES} <= {*BELOW, "cli", "__init__"}
+
+
+def run(code: str) -> str:
+    return subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    ).stdout.strip()
+
+
+def test_import_loads_nothing_heavy() -> None:
+    code = "import sys, robotdiffuse, robotdiffuse.cli; print([m for m in {} if m in sys.modules])"
+    assert run(code.format(("torch", "numba", "coal", "toppra", "matplotlib"))) == "[]"
+
+
+def test_public_names_resolve_and_verify_is_the_function() -> None:
+    code = (
+        "import robotdiffuse as rd, robotdiffuse.verify\n"
+        "print(callable(rd.verify), all(hasattr(rd, name) for name in rd.__all__))"
+    )
+    assert run(code) == "True True"
+
+
+def test_unknown_attribute() -> None:
+    import robotdiffuse
+
+    with pytest.raises(AttributeError, match="no attribute 'planing'"):
+        _ = robotdiffuse.planing  # type: ignore[attr-defined]

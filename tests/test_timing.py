@@ -1,0 +1,190 @@
+"""Timing: limits, rest at both ends, geometry that stays on verified ground."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.paths.blending import DEVIATION, BlendedPolyline, half_widths
+from robotdiffuse.paths.timing import TimingSettings, time_parameterize
+from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.types import Path, Trajectory
+
+VELOCITY = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
+ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+
+
+def arm(velocity: tuple[float, ...] = VELOCITY, acceleration: tuple[float, ...] = ACCELERATION) -> Robot:
+    """A chain of revolute joints: timing looks at the limits alone."""
+    joints = tuple(
+        Joint(
+            f"j{i}", "revolute", f"l{i}", f"l{i + 1}", np.eye(4), np.array([0.0, 0.0, 1.0]), -3.0, 3.0, v, a
+        )
+        for i, (v, a) in enumerate(zip(velocity, acceleration, strict=True))
+    )
+    return Robot("arm", "l0", f"l{len(joints)}", joints)
+
+
+def path(robot: Robot, positions: object) -> Path:
+    return Path(robot.joint_names, np.asarray(positions, dtype=np.float64))
+
+
+def always(_: Path) -> bool:
+    return True
+
+
+def distance_to_polyline(points: np.ndarray, waypoints: np.ndarray) -> np.ndarray:
+    best = np.full(len(points), np.inf)
+    for a, b in zip(waypoints[:-1], waypoints[1:], strict=True):
+        ab = b - a
+        t = np.clip((points - a) @ ab / max(ab @ ab, 1e-300), 0, 1)
+        best = np.minimum(best, np.linalg.norm(points - a - t[:, None] * ab, axis=1))
+    return best
+
+
+def check(robot: Robot, p: Path, t: Trajectory, settings: TimingSettings) -> None:
+    assert t.times[0] == 0 and (np.diff(t.times) > 0).all()
+    assert np.diff(t.times).max() <= 1.1 * settings.sample_time + 1e-9
+    assert np.array_equal(t.positions[0], p.positions[0])
+    assert np.array_equal(t.positions[-1], p.positions[-1])
+    assert not t.velocities[[0, -1]].any()
+    assert (np.abs(t.velocities) <= 1.01 * settings.velocity_scale * robot.velocity).all()
+    assert (np.abs(t.accelerations) <= 1.01 * settings.acceleration_scale * robot.acceleration).all()
+    assert distance_to_polyline(t.positions, p.positions).max() <= settings.corner_deviation + 1e-9
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(2, 12),
+    scale=st.floats(-6, 0.3),
+    settings=st.builds(
+        TimingSettings,
+        velocity_scale=st.floats(0.05, 1),
+        acceleration_scale=st.floats(0.05, 1),
+        corner_deviation=st.sampled_from([0.0, 1e-4, 0.01, 0.1, 1.0]),
+    ),
+    kind=st.sampled_from(["random", "there and back", "nearly straight", "repeated", "one joint"]),
+)
+def test_limits_rest_and_geometry(
+    seed: int, count: int, scale: float, settings: TimingSettings, kind: str
+) -> None:
+    rng = np.random.default_rng(seed)
+    q = 10**scale * rng.uniform(-1, 1, (count, 7))
+    if kind == "there and back":
+        q = q[np.arange(count) % 2]
+    elif kind == "nearly straight":
+        q = np.linspace(0, 1, count)[:, None] * q[0] + 1e-7 * q
+    elif kind == "repeated":
+        q = np.repeat(q, 3, axis=0)
+    elif kind == "one joint":
+        q[:, :6] = 0
+    robot = arm()
+    p = path(robot, q)
+    valid = (lambda _: rng.random() < 0.5) if seed % 2 else always
+    check(robot, p, time_parameterize(robot, p, valid, settings), settings)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_velocities_and_accelerations_are_the_derivatives(seed: int) -> None:
+    robot = arm()
+    p = path(robot, np.cumsum(np.random.default_rng(seed).normal(0, 0.5, (6, 7)), axis=0))
+    t = time_parameterize(robot, p, always, TimingSettings(sample_time=0.001))
+    dt = np.diff(t.times)[:-1]
+    middle = 0.5 * (t.velocities[:-2] + t.velocities[1:-1])
+    assert np.abs(np.diff(t.positions[:-1], axis=0) / dt[:, None] - middle).max() < 0.01
+    # Acceleration jumps at the switching points, so that the integral is compared, not the slope.
+    gained = np.cumsum(0.5 * (t.accelerations[:-2] + t.accelerations[1:-1]) * dt[:, None], axis=0)
+    assert np.abs(gained - t.velocities[1:-1]).max() < 0.15
+
+
+def test_one_joint_against_the_closed_form() -> None:
+    """Bang-bang: 2 sqrt(d / a) below the velocity limit, d / v + v / a above it."""
+    robot = arm((2.0,), (8.0,))
+    for d, expected in ((0.125, 2 * np.sqrt(0.125 / 8)), (3.0, 3.0 / 2 + 2.0 / 8)):
+        t = time_parameterize(robot, path(robot, [[0.0], [d]]), always)
+        assert t.duration == pytest.approx(expected, rel=0.01)
+
+
+def test_halved_scales_are_slower_by_their_factor() -> None:
+    robot = arm((2.0,), (8.0,))
+    p = path(robot, [[0.0], [0.1]])
+    fast, slow = (
+        time_parameterize(robot, p, always, TimingSettings(acceleration_scale=a)).duration
+        for a in (1.0, 0.25)
+    )
+    assert slow == pytest.approx(2 * fast, rel=1e-3)
+
+
+def test_path_of_length_zero_is_two_rows_at_rest() -> None:
+    robot = arm()
+    for rows in (1, 2, 5):
+        t = time_parameterize(robot, path(robot, np.full((rows, 7), 0.3)), always)
+        assert t.times.tolist() == [0.0, 0.01]
+        assert (t.positions == 0.3).all() and not t.velocities.any() and not t.accelerations.any()
+
+
+def corner(robot: Robot) -> Path:
+    q = np.zeros((3, 7))
+    q[1:, 0] = 1.0
+    q[2, 1] = 1.0
+    return path(robot, q)
+
+
+def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:
+    robot = arm()
+    p = corner(robot)
+    rounded = time_parameterize(robot, p, always)
+    stopped = time_parameterize(robot, p, lambda _: False)
+    assert rounded.duration < 0.9 * stopped.duration
+    nearest = np.linalg.norm(stopped.positions - p.positions[1], axis=1).argmin()
+    assert np.array_equal(stopped.positions[nearest], p.positions[1])
+    assert np.abs(stopped.velocities[nearest]).max() < 1e-9
+    assert distance_to_polyline(stopped.positions, p.positions).max() < 1e-12
+
+
+def test_only_the_corner_that_fails_is_tightened() -> None:
+    """An obstacle inside the first corner alone: the second keeps its rounding."""
+    robot = arm()
+    q = np.zeros((4, 7))
+    q[1:, 0] = 1.0
+    q[2:, 1] = 1.0
+    q[3, 2] = 1.0
+    p = path(robot, q)
+
+    def cuts(positions: np.ndarray, k: int) -> float:
+        return float(np.linalg.norm(positions - q[k], axis=1).min())
+
+    def valid(piece: Path) -> bool:
+        near = np.linalg.norm(piece.positions - q[1], axis=1) < 0.4
+        return not near.any() or distance_to_polyline(piece.positions[near], q).max() < 0.03
+
+    t = time_parameterize(robot, p, valid)
+    assert valid(replace(p, positions=t.positions))
+    assert cuts(t.positions, 1) < 0.03
+    assert cuts(t.positions, 2) > 0.09
+
+
+def test_blend_reaches_the_deviation_and_is_twice_differentiable() -> None:
+    waypoints = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0]])
+    d = half_widths(waypoints, np.array([0.05]))
+    line = BlendedPolyline(waypoints, d)
+    assert np.linalg.norm(line(np.array([1.0]), 0) - waypoints[1]) == pytest.approx(0.05)
+    assert d[0] * DEVIATION * np.sqrt(2) == pytest.approx(0.05)
+    s = np.linspace(0, line.length, 20001)
+    for order in (0, 1):
+        slope = np.gradient(line(s, order), s, axis=0)[1:-1]
+        assert np.abs(slope - line(s, order + 1)[1:-1]).max() < 2e-3
+
+
+def test_refusals() -> None:
+    robot = arm((2.0, 0.0), (8.0, 8.0))
+    with pytest.raises(InputError, match="velocity limit of j1 is 0.0"):
+        time_parameterize(robot, path(robot, [[0.0, 0.0], [1.0, 1.0]]), always)
+    for field, value in (("velocity_scale", 1.5), ("acceleration_scale", 0.0), ("sample_time", 0.0)):
+        with pytest.raises(InputError, match=f"timing.{field} is {value}"):
+            TimingSettings(**{field: value})
+    with pytest.raises(InputError, match="corner_deviation"):
+        TimingSettings(corner_deviation=-0.1)
