@@ -1,0 +1,67 @@
+"""CollisionChecker: the compiled kernels for one robot in one scene."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from robotdiffuse.collision import distance, lanes
+from robotdiffuse.collision.arrays import compile_robot, compile_scene, reach, robot_groups
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+
+
+class CollisionChecker:
+    """Collision of covering spheres against the obstacles of a scene and between links.
+
+    The spheres cover the robot's meshes, so that what is called free is free. Links that no planned joint
+    moves are checked against other links alone, for no motion could change how they stand to the scene.
+    A mesh obstacle counts by its surface: the arm is one piece that starts outside, so it cannot get in.
+    """
+
+    def __init__(self, robot: Robot, scene: Scene, padding: float = 0.0) -> None:
+        """`padding` [m] is added to the spheres' radii towards the scene."""
+        self.robot, self.scene, self.padding = robot, scene, np.float32(padding)
+        self.robot_arrays = compile_robot(robot)
+        self.scene_arrays = compile_scene(scene, reach(robot))
+        groups = robot_groups(robot)
+        self.links = tuple(link for link in groups if robot.link_frame(link) > 0)
+        """The moving links with spheres, in the order of `link_clearances`."""
+        self.pairs = tuple((groups[a], groups[b]) for a, b in self.robot_arrays.pairs)
+        """The checked pairs of links, in the order of `pair_clearances`."""
+
+    def free(self, q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
+        """Whether each configuration is free of collision."""
+        return lanes.free_many(self.robot_arrays, self.scene_arrays, _float32(q), self.padding)
+
+    def link_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n links"]:
+        """Signed distance of each moving link to the scene [m], at most 1 m; near point clouds at most 0.12 m."""
+        found = distance.link_clearances(self.robot_arrays, self.scene_arrays, _float32(q), distance.CAP)
+        return found - self.padding
+
+    def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
+        """Distance between the links of each checked pair [m], at most 1 m."""
+        return distance.pair_clearances(self.robot_arrays, _float32(q), distance.CAP)
+
+    def clearance(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n"]:
+        """Least distance to the scene and between links [m], at most 1 m; negative in collision."""
+        every = [self.link_clearances(q), self.pair_clearances(q), np.full((len(q), 1), distance.CAP)]
+        return np.concatenate(every, axis=1).min(axis=1)
+
+    def cost_gradients(
+        self, q: Float[ndarray, "n dof"], margin: float, self_margin: float = 0.01
+    ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:
+        """Collision cost of each configuration and its gradient: the paper's hinge, squared.
+
+        `margin` and `self_margin` [m]: distances to obstacles and between links below which cost arises.
+        """
+        return distance.cost_gradients(
+            self.robot_arrays,
+            self.scene_arrays,
+            _float32(q),
+            np.float32(margin) + self.padding,
+            np.float32(self_margin),
+        )
+
+
+def _float32(q: ndarray) -> ndarray:
+    return np.ascontiguousarray(q, np.float32)

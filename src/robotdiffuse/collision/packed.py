@@ -1,0 +1,82 @@
+"""Link clearances of many configurations in as many packed scenes: the denoiser's input in training."""
+
+import numpy as np
+from jaxtyping import Float32, Int8
+from numba import njit
+from numpy import ndarray
+
+from robotdiffuse.collision.arrays import RobotArrays, SceneArrays, compile_scene
+from robotdiffuse.collision.distance import frames_of, link_clearance
+from robotdiffuse.scenes.scene import Scene
+
+SPHERE, BOX = 1, 2
+"""Kinds in a packed scene; 0 means no obstacle. Parameters: centre, radius; or centre, size, wxyz."""
+
+
+@njit(cache=True, _nrt=False)
+def _unpack(kinds, params, spheres, boxes):
+    """Writes the rows of SceneArrays; returns how many spheres and boxes there are."""
+    n, m = 0, 0
+    for k in range(len(kinds)):
+        p = params[k]
+        if kinds[k] == SPHERE:
+            for i in range(4):
+                spheres[n, i] = p[i]
+            n += 1
+        elif kinds[k] == BOX:
+            w, x, y, z = p[6], p[7], p[8], p[9]
+            for i in range(3):
+                boxes[m, i] = p[i]
+                boxes[m, 12 + i] = p[3 + i] * np.float32(0.5)
+            # rows of the world-to-box rotation: the columns of the quaternion's matrix
+            boxes[m, 3], boxes[m, 4], boxes[m, 5] = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
+            boxes[m, 6], boxes[m, 7], boxes[m, 8] = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
+            boxes[m, 9], boxes[m, 10], boxes[m, 11] = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+            m += 1
+    return n, m
+
+
+@njit(cache=True, nogil=True)
+def _packed_link_clearances(robot, empty, fixed_boxes, kinds, params, q, limit):
+    first = np.searchsorted(robot.frame, 1)
+    out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
+    frames = np.empty((q.shape[2] + 1, 12), np.float32)
+    spheres = np.empty((kinds.shape[1], 4), np.float32)
+    fixed = len(fixed_boxes)
+    boxes = np.empty((kinds.shape[1] + fixed, 15), np.float32)
+    boxes[:fixed] = fixed_boxes
+    for b in range(len(q)):
+        n, m = _unpack(kinds[b], params[b], spheres, boxes[fixed:])
+        scene = SceneArrays(
+            spheres[:n],
+            boxes[: fixed + m],
+            empty.cylinders,
+            empty.capsules,
+            empty.points,
+            empty.cell_first,
+            empty.grid,
+            empty.grid_frame,
+        )
+        for i in range(q.shape[1]):
+            frames_of(robot, q[b, i], frames)
+            for g in range(first, len(robot.frame)):
+                out[b, i, g - first] = link_clearance(robot, scene, g, frames[robot.frame[g]], limit)
+    return out
+
+
+def packed_link_clearances(
+    robot: RobotArrays,
+    kinds: Int8[ndarray, "batch obstacles"],
+    params: Float32[ndarray, "batch obstacles 10"],
+    q: Float32[ndarray, "batch frames dof"],
+    fixed: Scene,
+    limit: float,
+) -> Float32[ndarray, "batch frames links"]:
+    """Signed distances of the moving links to the obstacles [m], at most `limit`, for each sample's own scene.
+
+    `fixed` holds the boxes that are part of every scene (the floor). `robot` comes from `compile_robot`.
+    """
+    fixed_arrays = compile_scene(fixed)
+    return _packed_link_clearances(
+        robot, fixed_arrays, fixed_arrays.boxes, kinds, params, q, np.float32(limit)
+    )
