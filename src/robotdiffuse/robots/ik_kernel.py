@@ -1,13 +1,14 @@
 """Compiled part of inverse kinematics: damped Newton iterations from many seeds.
 
 Kept free of jaxtyping: numba compiles these functions. Arrays are float64, C-contiguous.
-Joint kinds: 0 revolute, 1 prismatic, 2 continuous (turns without end; wrapped to its limits when solved).
+A continuous joint turns without end while solving and is wrapped to [-pi, pi] when solved.
 """
 
 import numpy as np
 from numba import njit
 
 REVOLUTE, PRISMATIC, CONTINUOUS = 0, 1, 2
+TURN = 2 * np.pi
 
 FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-9, 1e3
 RELAX, TIGHTEN = 0.1, 4.0
@@ -130,14 +131,14 @@ def _step(J, error, damping, rows, frame, held, A, y, step):
 
 
 @njit(cache=True)
-def _is_new(q, others, count, kinds, spans, min_distance):
+def _is_new(q, others, count, kinds, min_distance):
     """Whether q is further than min_distance from the others: max norm, across the wrap of endless joints."""
     for n in range(count):
         far = False
         for j in range(len(q)):
             gap = abs(q[j] - others[n, j])
             if kinds[j] == CONTINUOUS:
-                gap = min(gap, spans[j] - gap)
+                gap = min(gap, TURN - gap)
             if gap > min_distance:
                 far = True
                 break
@@ -160,7 +161,7 @@ def solve_seeds(
     T, axes, origins = np.empty((3, 4)), np.empty((dof, 3)), np.empty((dof, 3))
     error, trial_error, J = np.zeros(6), np.zeros(6), np.zeros((6, dof))
     A, y, step, held = np.zeros((6, 6)), np.zeros(6), np.zeros(dof), np.zeros(dof, dtype=np.bool_)
-    trial, spans = np.empty(dof), upper - lower
+    trial = np.empty(dof)
     found = np.empty((len(known) + wanted, dof))
     found[: len(known)] = known
     count, used = len(known), 0
@@ -214,8 +215,8 @@ def solve_seeds(
             continue
         for j in range(dof):
             if kinds[j] == CONTINUOUS:
-                q[j] = min(max(lower[j] + (q[j] - lower[j]) % spans[j], lower[j]), upper[j])
-        if _is_new(q, found, count, kinds, spans, min_distance):
+                q[j] = min(max((q[j] + np.pi) % TURN - np.pi, lower[j]), upper[j])
+        if _is_new(q, found, count, kinds, min_distance):
             found[count] = q
             count += 1
             if count == len(found):

@@ -124,7 +124,7 @@ def inverse_kinematics(
 
 
 def _longest_reach(robot: Robot, last: int, tool: Float[ndarray, "4 4"]) -> float:
-    """Bound on the tool's distance from the first joint's origin [m], over all configurations in the limits."""
+    """Bound on the tool's distance from the first joint's origin [m], over all configurations."""
     lengths = np.linalg.norm(robot.frame_offsets[1:last, :3, 3], axis=1).sum() + np.linalg.norm(tool[:3, 3])
     travel = np.maximum(abs(robot.lower), abs(robot.upper))[:last] @ np.array(robot.prismatic[:last], float)
     return float(lengths + travel) + 1e-6

@@ -1,0 +1,83 @@
+"""Robots that the kinematics tests share: four published arms, and some made by hand."""
+
+from functools import cache
+from importlib.metadata import distribution
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+
+from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.urdf import read_urdf
+from robotdiffuse.transforms import transform
+
+TIPS = {"panda": "panda_hand", "iiwa": "lbr_iiwa_link_7", "xarm7": "link7", "ur5": "tool0", "awkward": "tool"}
+DESCRIPTIONS = {
+    "panda": "panda_description/urdf/panda.urdf",
+    "xarm7": "xarm_description/urdf/xarm7.urdf",
+    "ur5": "ur_description/urdf/ur5_joint_limited_robot.urdf",
+}
+
+AWKWARD = """<robot name="awkward">
+  <link name="floor"/> <link name="base"/> <link name="rail"/> <link name="turret"/> <link name="arm"/>
+  <link name="bracket"/> <link name="wrist"/> <link name="flange"/> <link name="tool"/> <link name="lid"/>
+  <joint name="stand" type="fixed"><parent link="floor"/><child link="base"/>
+    <origin xyz="0.1 -0.2 0.3" rpy="0.3 -0.2 0.5"/></joint>
+  <joint name="rail_joint" type="prismatic"><parent link="base"/><child link="rail"/>
+    <origin xyz="0 0.1 0" rpy="0.1 0.2 0.3"/><axis xyz="1 2 0.5"/>
+    <limit lower="-0.4" upper="0.5" velocity="1" effort="1"/></joint>
+  <joint name="turret_joint" type="continuous"><parent link="rail"/><child link="turret"/>
+    <origin xyz="0 0 0.2" rpy="0 0 1"/><axis xyz="0 0 -1"/><limit velocity="1" effort="1"/></joint>
+  <joint name="lid_joint" type="revolute"><parent link="turret"/><child link="lid"/>
+    <origin xyz="0.1 0 0"/><axis xyz="0 1 0"/><limit lower="0" upper="1" velocity="1" effort="1"/></joint>
+  <joint name="arm_joint" type="revolute"><parent link="turret"/><child link="arm"/>
+    <origin xyz="0.05 0 0.1" rpy="-0.4 0 0"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="1.5" velocity="1" effort="1"/></joint>
+  <joint name="bracket_joint" type="fixed"><parent link="arm"/><child link="bracket"/>
+    <origin xyz="0.3 0 0.02" rpy="0 0.7 0"/></joint>
+  <joint name="wrist_joint" type="revolute"><parent link="bracket"/><child link="wrist"/>
+    <origin xyz="0.2 0 0"/><axis xyz="1 -1 1"/>
+    <limit lower="-2.5" upper="2.5" velocity="1" effort="1"/></joint>
+  <joint name="flange_joint" type="continuous"><parent link="wrist"/><child link="flange"/>
+    <origin xyz="0.1 0.02 0" rpy="0 1 0"/><axis xyz="0 0 1"/><limit velocity="1" effort="1"/></joint>
+  <joint name="tool_joint" type="revolute"><parent link="flange"/><child link="tool"/>
+    <origin xyz="0 0 0.1" rpy="1 0 0"/><axis xyz="1 0 0"/>
+    <limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
+</robot>
+"""
+"""Skew axes, a prismatic and two continuous joints, a fixed joint within the chain and a branch beside it."""
+
+
+def urdf_file(name: str, folder: Path) -> Path:
+    """The URDF of a robot in TIPS; skips the test if the package that holds it is not installed."""
+    if name == "awkward":
+        file = folder / "awkward.urdf"
+        file.write_text(AWKWARD)
+        return file
+    if name == "iiwa":
+        return Path(pytest.importorskip("pybullet_data").getDataPath()) / "kuka_iiwa" / "model.urdf"
+    pytest.importorskip("pinocchio")
+    data = distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")
+    return Path(str(data)) / DESCRIPTIONS[name]
+
+
+@cache
+def example_robot(name: str) -> Robot:
+    base = "base" if name == "awkward" else None
+    with TemporaryDirectory() as folder:
+        return read_urdf(urdf_file(name, Path(folder)), base=base, tip=TIPS[name])
+
+
+def planar_arm(*lengths: float) -> Robot:
+    """Links of these lengths along x, joints about z."""
+    xs = (0.0, *lengths)
+    joints = [
+        Joint(
+            f"j{i}", "revolute", f"l{i}", f"l{i + 1}", transform(np.array([x, 0, 0])), np.array([0, 0, 1.0])
+        )
+        for i, x in enumerate(xs[:-1])
+    ]
+    last = len(lengths)
+    tip = Joint("tip", "fixed", f"l{last}", "tip", transform(np.array([xs[-1], 0, 0])), np.array([0, 0, 1.0]))
+    return Robot("planar", "l0", "tip", (*joints, tip))
