@@ -2,8 +2,8 @@
 
     python benchmarks/inverse_kinematics.py [--poses 1000]
 
-Prints the report that is kept in benchmarks/results/inverse_kinematics.txt. Poses are those of panda_hand at
-configurations drawn uniformly within the limits. Errors are measured by NumPy kinematics, not by the solver's.
+Prints the report that is kept in benchmarks/results/inverse_kinematics.txt. Poses are those of panda_hand
+at configurations drawn uniformly within the limits. Errors are measured by NumPy kinematics.
 """
 
 import argparse

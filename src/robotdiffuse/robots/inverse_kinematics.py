@@ -28,7 +28,7 @@ class InverseKinematicsSettings:
     """Distance kept from the joint limits [rad or m]."""
     seeds_per_round: int = 64
     """Random configurations that are drawn at a time."""
-    max_rounds: int = 24
+    max_rounds: int = 64
     """Rounds of seeds before the search ends with what it has."""
     patience: int = 4
     """Rounds without a new accepted solution after which it ends, once it has one."""
@@ -68,7 +68,8 @@ def inverse_kinematics(
     Damped Newton steps (Levenberg-Marquardt) from uniformly random seeds; steps are clipped to the limits,
     and joints pushed against a limit are held while the others move. Joints behind the link keep random
     values. The result is empty if the pose was not reached, and depends on nothing but the arguments and the
-    state of `rng`. `accept` is called with batches of solutions, e.g. to keep those free of collision.
+    state of `rng`. `accept` is called with batches of solutions, e.g. to keep those free of collision; what
+    it refuses does not stop a solution nearby from being tried.
 
     Raises InputError for an unknown link, one that no planned joint moves, a count below 1, or a matrix that
     is no finite rigid transform.
@@ -83,13 +84,11 @@ def inverse_kinematics(
     lower, upper = robot.lower + settings.limit_margin, robot.upper - settings.limit_margin
     tool = np.ascontiguousarray(robot.T_frame_link(frame))
     accepted = np.zeros((0, robot.dof))
-    if np.linalg.norm(T_base_frame[:3, 3] - robot.frame_offsets[0, :3, 3]) > _longest_reach(
-        robot, last, tool
-    ):
+    distance = np.linalg.norm(T_base_frame[:3, 3] - robot.frame_offsets[0, :3, 3])
+    if distance > _longest_reach(robot, last, tool):
         return accepted
     target = np.array(T_base_frame, dtype=np.float64)
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
-    known = accepted
     idle = 0
     for _ in range(settings.max_rounds):
         seeds = rng.uniform(lower, upper, (settings.seeds_per_round, robot.dof))
@@ -97,7 +96,7 @@ def inverse_kinematics(
         while len(seeds) and len(accepted) < count:
             new, used = solve_seeds(
                 seeds,
-                known,
+                accepted,
                 count - len(accepted),
                 robot.frame_offsets,
                 tool,
@@ -115,7 +114,6 @@ def inverse_kinematics(
             )
             seeds = seeds[used:]
             if len(new):
-                known = np.concatenate([known, new])
                 accepted = np.concatenate([accepted, new if accept is None else new[accept(new)]])
         idle = 0 if len(accepted) > before else idle + 1
         if len(accepted) >= count or (len(accepted) and idle >= settings.patience):
