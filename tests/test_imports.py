@@ -11,7 +11,18 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 MODULES = sorted(SOURCE.rglob("*.py"))
 
-CHAIN = ("errors", "transforms", "types", "robots", "scenes", "collision", "problem", "verify", "paths")
+CHAIN = (
+    "errors",
+    "transforms",
+    "types",
+    "robots",
+    "scenes",
+    "collision",
+    "problem",
+    "problem_files",
+    "verify",
+    "paths",
+)
 BELOW = {room: set(CHAIN[: i + 1]) for i, room in enumerate(CHAIN)}
 BELOW["learning"] = {*CHAIN[: CHAIN.index("collision") + 1], "learning"}
 BELOW["planners"] = {*CHAIN, "learning", "planners"}
@@ -19,8 +30,8 @@ BELOW["simulation"] = {*CHAIN, "simulation"}
 BELOW["viewer"] = {*CHAIN, "viewer"}
 BELOW["generation"] = {*CHAIN, "learning", "planners", "generation"}
 BELOW["evaluation"] = {*CHAIN, "learning", "planners", "simulation", "generation", "evaluation"}
-EXCEPTIONS = {("types", "paths")}
-"""Trajectory.save and PlanResult.save import the writer when they are called."""
+EXCEPTIONS = {("types", "paths"), ("problem", "problem_files")}
+"""Trajectory.save, PlanResult.save and Problem.load import writer and reader when they are called."""
 
 EXTRAS = {
     "pybullet": {"simulation"},

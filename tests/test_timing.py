@@ -1,6 +1,7 @@
 """Timing: limits, rest at both ends, geometry that stays on verified ground."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -38,7 +39,7 @@ def always(_: Path) -> bool:
 
 def distance_to_polyline(points: np.ndarray, waypoints: np.ndarray) -> np.ndarray:
     best = np.full(len(points), np.inf)
-    for a, b in zip(waypoints[:-1], waypoints[1:], strict=True):
+    for a, b in pairwise(waypoints):
         ab = b - a
         t = np.clip((points - a) @ ab / max(ab @ ab, 1e-300), 0, 1)
         best = np.minimum(best, np.linalg.norm(points - a - t[:, None] * ab, axis=1))
@@ -184,7 +185,7 @@ def test_refusals() -> None:
     with pytest.raises(InputError, match="velocity limit of j1 is 0.0"):
         time_parameterize(robot, path(robot, [[0.0, 0.0], [1.0, 1.0]]), always)
     for field, value in (("velocity_scale", 1.5), ("acceleration_scale", 0.0), ("sample_time", 0.0)):
-        with pytest.raises(InputError, match=f"timing.{field} is {value}"):
+        with pytest.raises(InputError, match=rf"timing\.{field} is {value}"):
             TimingSettings(**{field: value})
     with pytest.raises(InputError, match="corner_deviation"):
         TimingSettings(corner_deviation=-0.1)

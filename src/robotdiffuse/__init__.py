@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from robotdiffuse.problem import JointGoal as JointGoal
     from robotdiffuse.problem import PoseGoal as PoseGoal
     from robotdiffuse.problem import Problem as Problem
-    from robotdiffuse.problem import load_problem as load_problem
+    from robotdiffuse.problem_files import load_problem as load_problem
     from robotdiffuse.robots import load_robot as load_robot
     from robotdiffuse.scenes.scene import Scene as Scene
     from robotdiffuse.scenes.shapes import Box as Box
@@ -38,7 +38,7 @@ _HOME = {
     "JointGoal": "robotdiffuse.problem",
     "PoseGoal": "robotdiffuse.problem",
     "Problem": "robotdiffuse.problem",
-    "load_problem": "robotdiffuse.problem",
+    "load_problem": "robotdiffuse.problem_files",
     "load_robot": "robotdiffuse.robots",
     "Scene": "robotdiffuse.scenes.scene",
     "Box": "robotdiffuse.scenes.shapes",
@@ -68,7 +68,7 @@ sys.modules[__name__].__class__ = _Package
 
 
 def __getattr__(name: str) -> object:
-    """Import a public name when it is first used: PyTorch and the compiled kernels take a second to import."""
+    """Import a public name when it is first used: PyTorch and the kernels take a second to import."""
     if name not in _HOME:
         raise AttributeError(f"module 'robotdiffuse' has no attribute {name!r}")
     value = getattr(import_module(_HOME[name]), name)

@@ -1,4 +1,4 @@
-"""A polyline with rounded corners: twice continuously differentiable, with a known distance to the polyline."""
+"""A polyline with rounded corners: twice continuously differentiable, at a known distance to the polyline."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int

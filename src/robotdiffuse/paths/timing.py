@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -130,7 +131,7 @@ def _timed(
     """Pieces between stops, one after the other. The motion stops where the deviation is zero."""
     stops = [0, *(np.flatnonzero(deviations == 0) + 1), len(waypoints) - 1]
     pieces = []
-    for a, b in zip(stops[:-1], stops[1:], strict=True):
+    for a, b in pairwise(stops):
         part = waypoints[a : b + 1]
         line = BlendedPolyline(part, half_widths(part, deviations[a : b - 1]))
         pieces.append(_piece(robot, line, settings))

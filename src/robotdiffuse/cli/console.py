@@ -1,0 +1,32 @@
+"""Tables on the terminal."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robotdiffuse.types import PlanResult
+
+
+def print_result(result: "PlanResult") -> None:
+    """The outcome of a call to plan(), as a table; status and reason also where there is no plan."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(show_header=False, title=f"{result.robot}: {result.status.value}", title_justify="left")
+    rows = [
+        ("reason", result.reason),
+        ("planner", f"{result.planner} ({result.stage})" if result.stage else result.planner),
+        ("planning time", f"{1e3 * result.planning_time:.1f} ms"),
+    ]
+    if result.path is not None:
+        rows.append(("path", f"{len(result.path.positions)} waypoints, length {result.path.length:.3f} rad"))
+        rows.append(("verified", "yes"))
+    if result.min_clearance is not None:
+        rows.append(("least clearance", f"{1e3 * result.min_clearance:.1f} mm"))
+    if result.trajectory is not None:
+        rows.append(("motion", f"{result.trajectory.duration:.2f} s, {len(result.trajectory.times)} rows"))
+    rows += [("note", note) for note in result.notes]
+    rows.append(("seed", str(result.seed)))
+    for name, value in rows:
+        table.add_row(name, escape(value))
+    Console().print(table)

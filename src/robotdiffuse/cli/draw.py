@@ -1,0 +1,31 @@
+"""Replays (.html) and pictures (.png): the only place that imports the viewer."""
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robotdiffuse.problem import Problem
+    from robotdiffuse.types import PlanResult
+
+ENDINGS = (".html", ".png")
+
+
+def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
+    """Draw the motion of a solved result in its scene, by the ending of the file."""
+    motion = result.trajectory or result.path
+    assert motion is not None, "only a solved result has a motion"
+    if file.suffix.lower() == ".html":
+        from robotdiffuse.viewer.html import write_replay as write
+    else:
+        from robotdiffuse.viewer.picture import write_picture as write
+    write(problem.robot, problem.scene, motion, file, result=result)
+
+
+def show(file: Path) -> None:
+    """Open a file in the browser, where there is a screen to show it on."""
+    import webbrowser
+
+    if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(file.resolve().as_uri())

@@ -1,0 +1,111 @@
+"""robotdiffuse plan, robotdiffuse demo"""
+
+import argparse
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robotdiffuse.cli.arguments import natural, positive
+from robotdiffuse.cli.console import print_result
+from robotdiffuse.cli.draw import ENDINGS, draw, show
+
+if TYPE_CHECKING:
+    from robotdiffuse.problem import Problem
+    from robotdiffuse.types import PlanResult
+
+DEMO = "shelf.yaml"
+DEMO_TIME_LIMIT = 5.0
+"""[s], for the first call too, which may compile."""
+
+
+def add_plan(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "plan",
+        help="plan the motion that a problem file asks for",
+        description="Plan a verified motion. Exit status: 0 solved, 1 no plan, 2 bad input.",
+    )
+    parser.add_argument("problem", metavar="PROBLEM", help="problem file (.yaml, .json or .jsonl)")
+    parser.add_argument(
+        "--index", type=natural, default=0, help="which problem of a .jsonl file (default: 0)"
+    )
+    parser.add_argument(
+        "--planner", metavar="NAME", help="see `robotdiffuse planners` (default: robotdiffuse)"
+    )
+    parser.add_argument(
+        "--time-limit", type=positive, default=1.0, metavar="S", help="wall time for planning (default: 1 s)"
+    )
+    parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
+    parser.add_argument(
+        "--out",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="result (.json), trajectory (.csv), replay (.html) or picture (.png); repeatable",
+    )
+    parser.add_argument("--view", action="store_true", help="write a replay (.html) and open it")
+    parser.set_defaults(run=run_plan)
+
+
+def add_demo(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "demo",
+        help="plan a bundled problem and draw the motion",
+        description="Plan a bundled problem with obstacles; write demo.png and demo.html to this folder.",
+    )
+    parser.set_defaults(run=run_demo)
+
+
+def run_plan(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.paths.export import check_output, save_result
+    from robotdiffuse.planners import DEFAULT_PLANNER, check_planner
+    from robotdiffuse.problem_files import load_problem, problem_record
+
+    name = arguments.planner or DEFAULT_PLANNER
+    check_planner(name)
+    outputs = [check_output(file, (".json", ".csv", *ENDINGS)) for file in arguments.out]
+    if arguments.view:
+        outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
+    problem = load_problem(arguments.problem, arguments.index)
+    result = solve(problem, name, arguments.time_limit, arguments.seed)
+    print_result(result)
+    for file in outputs:
+        if file.suffix.lower() == ".json":
+            save_result(result, file, problem_record(problem))
+        elif result.trajectory is None:
+            continue
+        elif file.suffix.lower() == ".csv":
+            save_result(result, file)
+        else:
+            draw(problem, result, file)
+        print(f"wrote {file}")
+    if arguments.view and result.trajectory is not None:
+        show(outputs[-1])
+    return 0 if result.solved else 1
+
+
+def run_demo(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.paths.export import check_output
+    from robotdiffuse.planners import DEFAULT_PLANNER
+    from robotdiffuse.problem_files import load_problem
+
+    outputs = [check_output(file, ENDINGS) for file in ("demo.png", "demo.html")]
+    with as_file(files("robotdiffuse") / "examples" / DEMO) as file:
+        problem = load_problem(file)
+    result = solve(problem, DEFAULT_PLANNER, DEMO_TIME_LIMIT, seed=0)
+    print_result(result)
+    if result.trajectory is None:
+        return 1
+    for file in outputs:
+        draw(problem, result, file)
+        print(f"wrote {file.resolve()}")
+    return 0
+
+
+def solve(problem: "Problem", planner: str, time_limit: float, seed: int) -> "PlanResult":
+    """Load the planner and plan, behind a spinner: the first call on a machine compiles for some seconds."""
+    from rich.console import Console
+
+    from robotdiffuse.planners import load_planner
+
+    with Console(stderr=True).status(f"planning with {planner}"):
+        return load_planner(planner).plan(problem, time_limit=time_limit, seed=seed)

@@ -1,0 +1,87 @@
+"""robotdiffuse robot info, robotdiffuse robot add"""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from robotdiffuse.cli.arguments import assignment, natural
+
+if TYPE_CHECKING:
+    from robotdiffuse.robots.robot import Robot
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "robot", help="show or prepare a robot", description="Show a robot, or prepare one for planning."
+    )
+    actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+
+    info = actions.add_parser(
+        "info", help="joints, limits and collision model", description="Show what is known of a robot."
+    )
+    info.add_argument("robot", metavar="ROBOT", help="a bundled name, a prepared folder or a URDF file")
+    info.set_defaults(run=run_info)
+
+    make = actions.add_parser(
+        "add",
+        help="prepare a robot from its URDF",
+        description="Fit covering spheres to the collision meshes of a URDF and find the pairs of links that "
+        "need no check; write it all to a folder that problems can name.",
+    )
+    make.add_argument("urdf", metavar="URDF", help="URDF file of a serial arm")
+    make.add_argument("--out", metavar="FOLDER", help="where to write it (default: the robot's name)")
+    make.add_argument("--base", metavar="LINK", help="first link of the arm (default: the root)")
+    make.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where a gripper begins)")
+    make.add_argument(
+        "--lock",
+        type=assignment,
+        action="append",
+        default=[],
+        metavar="JOINT=VALUE",
+        help="hold a joint at a value [rad or m]; repeatable",
+    )
+    make.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
+    make.set_defaults(run=run_add)
+
+
+def run_info(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.robots import load_robot
+
+    print_robot(load_robot(arguments.robot))
+    return 0
+
+
+def print_robot(robot: "Robot") -> None:
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    console = Console()
+    joints = Table(
+        "joint",
+        "kind",
+        "lower",
+        "upper",
+        "velocity",
+        "acceleration",
+        "jerk",
+        title=robot.name,
+        title_justify="left",
+    )
+    for joint in robot.planned_joints:
+        limits = (joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk)
+        joints.add_row(escape(joint.name), joint.kind, *(f"{value:g}" for value in limits))
+    console.print(joints)
+    spheres = sum(len(rows) for rows in robot.spheres.values())
+    meshes = sum(len(pieces) for pieces in robot.meshes.values())
+    table = Table(show_header=False)
+    table.add_row("base, tip", escape(f"{robot.base}, {robot.tip}"))
+    table.add_row("links", str(len(robot.link_names)))
+    table.add_row(
+        "collision model", f"{spheres} spheres on {len(robot.spheres)} links, {meshes} convex meshes"
+    )
+    table.add_row("checked pairs of links", str(len(robot.checked_pairs())))
+    for name, value in robot.locked.items():
+        table.add_row("locked", escape(f"{name} = {value:g}"))
+    for note in robot.notes:
+        table.add_row("note", escape(note))
+    console.print(table)

@@ -1,0 +1,82 @@
+"""robotdiffuse view, robotdiffuse verify"""
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robotdiffuse.cli.draw import ENDINGS, draw, show
+from robotdiffuse.errors import InputError
+
+if TYPE_CHECKING:
+    from robotdiffuse.problem import Problem
+    from robotdiffuse.types import PlanResult
+
+
+def add_view(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "view",
+        help="draw a result as a replay (.html) or a picture (.png)",
+        description="Draw the motion of a result file. Without --out, a replay opens in the browser.",
+    )
+    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
+    parser.add_argument(
+        "--out",
+        action="append",
+        metavar="FILE",
+        help="FILE.html or FILE.png; repeatable (default: RESULT's name with .html)",
+    )
+    parser.set_defaults(run=run_view)
+
+
+def add_verify(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "verify",
+        help="judge the motion of a result file anew",
+        description="Judge the motion of a result file anew. Exit status: 0 valid, 1 not valid, 2 bad input.",
+    )
+    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
+    parser.set_defaults(run=run_verify)
+
+
+def read(file: str) -> "tuple[PlanResult, Problem]":
+    """A solved result and its problem. Raises InputError where the file holds no motion or no problem."""
+    from robotdiffuse.paths.export import load_result
+    from robotdiffuse.problem_files import problem_from_record
+
+    saved = load_result(file)
+    if not saved.result.solved:
+        raise InputError(
+            f"{file} holds no motion: its status is {saved.result.status.value} ({saved.result.reason})"
+        )
+    if saved.problem is None:
+        raise InputError(f"{file} holds no problem; write it by `robotdiffuse plan PROBLEM --out FILE.json`")
+    return saved.result, problem_from_record(saved.problem)
+
+
+def run_view(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.paths.export import check_output
+
+    files = arguments.out or [f"{Path(arguments.result).stem}.html"]
+    outputs = [check_output(file, ENDINGS) for file in files]
+    result, problem = read(arguments.result)
+    for file in outputs:
+        draw(problem, result, file)
+        print(f"wrote {file}")
+    if not arguments.out:
+        show(outputs[0])
+    return 0
+
+
+def run_verify(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.verify import verify, verify_trajectory
+
+    result, problem = read(arguments.result)
+    reports = {"path": verify(problem, result.path)} if result.path is not None else {}
+    if result.trajectory is not None:
+        reports["trajectory"] = verify_trajectory(problem, result.trajectory)
+    for what, report in reports.items():
+        if report.violation is not None:
+            print(f"{what}: not valid: {report.violation.message} (at {report.violation.time:.3f})")
+        else:
+            print(f"{what}: valid, clearance at least {1e3 * (report.min_clearance or 0.0):.1f} mm")
+    return 0 if all(report.valid for report in reports.values()) else 1
