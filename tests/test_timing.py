@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.blending import DEVIATION, BlendedPolyline, half_widths
-from robotdiffuse.paths.timing import TimingSettings, time_parameterize
+from robotdiffuse.paths.timing import SAME, TimingSettings, time_parameterize
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.types import Path, Trajectory
 
@@ -54,12 +54,12 @@ def check(robot: Robot, p: Path, t: Trajectory, settings: TimingSettings) -> Non
     assert not t.velocities[[0, -1]].any()
     assert (np.abs(t.velocities) <= 1.01 * settings.velocity_scale * robot.velocity).all()
     assert (np.abs(t.accelerations) <= 1.01 * settings.acceleration_scale * robot.acceleration).all()
-    assert distance_to_polyline(t.positions, p.positions).max() <= settings.corner_deviation + 1e-9
+    assert distance_to_polyline(t.positions, p.positions).max() <= settings.corner_deviation + 2 * SAME
 
 
 @given(
     seed=st.integers(0, 2**32 - 1),
-    count=st.integers(2, 12),
+    count=st.integers(2, 40),
     scale=st.floats(-6, 0.3),
     settings=st.builds(
         TimingSettings,
@@ -67,7 +67,9 @@ def check(robot: Robot, p: Path, t: Trajectory, settings: TimingSettings) -> Non
         acceleration_scale=st.floats(0.05, 1),
         corner_deviation=st.sampled_from([0.0, 1e-4, 0.01, 0.1, 1.0]),
     ),
-    kind=st.sampled_from(["random", "there and back", "nearly straight", "repeated", "one joint"]),
+    kind=st.sampled_from(
+        ["random", "there and back", "nearly straight", "repeated", "one joint", "steps of all sizes"]
+    ),
 )
 def test_limits_rest_and_geometry(
     seed: int, count: int, scale: float, settings: TimingSettings, kind: str
@@ -82,6 +84,8 @@ def test_limits_rest_and_geometry(
         q = np.repeat(q, 3, axis=0)
     elif kind == "one joint":
         q[:, :6] = 0
+    elif kind == "steps of all sizes":  # toppra failed on steps below 1e-6 among long ones
+        q = q[0] + 10 ** rng.uniform(-9, 0, (count, 1)) * q
     robot = arm()
     p = path(robot, q)
     valid = (lambda _: rng.random() < 0.5) if seed % 2 else always
@@ -184,8 +188,11 @@ def test_refusals() -> None:
     robot = arm((2.0, 0.0), (8.0, 8.0))
     with pytest.raises(InputError, match="velocity limit of j1 is 0.0"):
         time_parameterize(robot, path(robot, [[0.0, 0.0], [1.0, 1.0]]), always)
-    for field, value in (("velocity_scale", 1.5), ("acceleration_scale", 0.0), ("sample_time", 0.0)):
-        with pytest.raises(InputError, match=rf"timing\.{field} is {value}"):
-            TimingSettings(**{field: value})
+    with pytest.raises(InputError, match=r"timing\.velocity_scale is 1.5"):
+        TimingSettings(velocity_scale=1.5)
+    with pytest.raises(InputError, match=r"timing\.acceleration_scale is 0.0"):
+        TimingSettings(acceleration_scale=0.0)
+    with pytest.raises(InputError, match=r"timing\.sample_time is 0.0"):
+        TimingSettings(sample_time=0.0)
     with pytest.raises(InputError, match="corner_deviation"):
         TimingSettings(corner_deviation=-0.1)

@@ -28,7 +28,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         "need no check; write it all to a folder that problems can name.",
     )
     make.add_argument("urdf", metavar="URDF", help="URDF file of a serial arm")
-    make.add_argument("--out", metavar="FOLDER", help="where to write it (default: the robot's name)")
+    make.add_argument("--name", metavar="NAME", help="name that problems use (default: the URDF's)")
+    make.add_argument("--out", metavar="FOLDER", help="where to write it (default: the user's robots)")
     make.add_argument("--base", metavar="LINK", help="first link of the arm (default: the root)")
     make.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where a gripper begins)")
     make.add_argument(
@@ -39,6 +40,10 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar="JOINT=VALUE",
         help="hold a joint at a value [rad or m]; repeatable",
     )
+    make.add_argument(
+        "--limits", metavar="FILE", help="joint limits in the form of MoveIt's joint_limits.yaml"
+    )
+    make.add_argument("--licence", metavar="TEXT", help="licence of the URDF's geometry, kept as a note")
     make.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
     make.set_defaults(run=run_add)
 
@@ -47,6 +52,39 @@ def run_info(arguments: argparse.Namespace) -> int:
     from robotdiffuse.robots import load_robot
 
     print_robot(load_robot(arguments.robot))
+    return 0
+
+
+def run_add(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    from robotdiffuse.robots.add import add_robot
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("reading")
+        report = add_robot(
+            arguments.urdf,
+            name=arguments.name,
+            base=arguments.base,
+            tip=arguments.tip,
+            locked=dict(arguments.lock),
+            limits=arguments.limits,
+            out=arguments.out,
+            licence=arguments.licence or "see the URDF",
+            seed=arguments.seed,
+            progress=lambda what, step, steps: bar.update(
+                task, description=what, completed=step, total=steps
+            ),
+        )
+    table = Table("link", "spheres", "sticking out [mm]", "covered")
+    for link in report.links:
+        covered = "yes" if link.covered else "no"
+        table.add_row(link.link, str(link.spheres), f"{1e3 * link.stick_out:.1f}", covered)
+    Console().print(table)
+    print_robot(report.robot)
+    print(f"wrote {report.folder}")
     return 0
 
 

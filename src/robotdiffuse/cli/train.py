@@ -50,7 +50,8 @@ def _add_shared(parser: argparse.ArgumentParser) -> None:
 
 def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, object]:
     """The options that were given; the others keep the defaults of the settings."""
-    given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
+    given: dict[str, object] = {name: getattr(arguments, name) for name in names}
+    given = {name: value for name, value in given.items() if value is not None}
     return given | {"minutes": None} if "samples" in given else given
 
 

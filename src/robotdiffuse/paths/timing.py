@@ -17,7 +17,7 @@ SHRINK = 0.25
 """Factor on the deviation of a corner whose rounding was not valid."""
 ROUNDS = 3
 """How often a corner shrinks before the motion stops at it instead."""
-SAME = 1e-9
+SAME = 1e-6
 """Waypoints nearer to each other than this are one [rad]."""
 
 
@@ -174,8 +174,13 @@ def _path_velocities(
     import toppra
 
     class Geometry(toppra.interpolator.AbstractGeometricPath):
-        dof = robot.dof
-        path_interval = np.array([0.0, line.length])
+        @property
+        def dof(self) -> int:
+            return robot.dof
+
+        @property
+        def path_interval(self) -> ndarray:
+            return np.array([0.0, line.length])
 
         def __call__(self, path_positions: ndarray | float, order: int = 0) -> ndarray:
             return line(np.atleast_1d(np.asarray(path_positions, dtype=np.float64)), order)
@@ -188,7 +193,10 @@ def _path_velocities(
     algorithm = toppra.algorithm.TOPPRA(
         [velocity, acceleration], Geometry(), gridpoints=grid, solver_wrapper="seidel"
     )
-    return algorithm.compute_parameterization(0.0, 0.0)[1]
+    speeds = algorithm.compute_parameterization(0.0, 0.0)[1]
+    if speeds is None or np.isnan(speeds).any() or (speeds[1:-1] <= 0).any():
+        raise RuntimeError("toppra found no timing; every path has one, so this is a numerical failure")
+    return speeds
 
 
 def _piece(
@@ -228,8 +236,6 @@ def _excess(
     settings: TimingSettings,
 ) -> float:
     """How many times slower the motion must be (at least 1) to keep the limits between grid points too."""
-    if np.isnan(speeds).any() or (speeds[1:-1] <= 0).any():
-        raise RuntimeError("toppra found no timing; every path has one, so this is a numerical failure")
     pull = np.diff(speeds**2) / (2 * np.diff(grid))
     worst = 1.0
     for part in (0.0, 0.25, 0.5, 0.75, 1.0):
