@@ -138,12 +138,14 @@ class ContinuousCollision:
         return Sweep(contact, certified if hit is None else 0.0, spheres, meshes)
 
     def _first_pieces(self, motion: "_Motion") -> _Pieces:
-        end = len(motion.q) - 1
+        """Pieces of about equal motion bound, after one of no length at the start."""
+        last = len(motion.q) - 1
         worst = motion.travelled.max(axis=1, initial=0)
         count = max(1, int(np.ceil(worst[-1] / FIRST_TRAVEL)))
-        knots = np.interp(np.linspace(0, worst[-1], count + 1), worst, np.arange(end + 1))
-        knots[0], knots[-1] = 0, end
-        return _Pieces(knots[:-1], knots[1:], np.ones((count, len(self.exact.checks)), bool))
+        knots = np.interp(np.linspace(0, worst[-1], count + 1), worst, np.arange(last + 1))
+        knots[0], knots[-1] = 0, last
+        knots = np.concatenate([[0], knots])
+        return _Pieces(knots[:-1], knots[1:], np.ones((count + 1, len(self.exact.checks)), bool))
 
     def _sphere_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n checks"]:
         """Lower bounds of the clearances; minus infinity for checks that the spheres do not know."""
@@ -163,7 +165,7 @@ class ContinuousCollision:
         distances, names = self.exact.nearest(motion.configurations(samples), checks, cutoffs)
         left = [i for i, name in enumerate(names) if name != other]
         episode = distances[: left[0] if left else len(samples)]
-        return Contact(self.exact.checks[check], other, at, float(-episode.min(initial=0)))
+        return Contact(self.exact.checks[check], other, at, max(0.0, -float(episode.min())))
 
 
 class _Motion:

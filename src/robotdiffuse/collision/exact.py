@@ -244,7 +244,7 @@ class ExactCollision:
                 a = centers_in_base(frames, firsts, centers)
                 b = centers_in_base(frames, others, other_centers)
                 gap = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1) - reach
-                return gap.reshape(len(frames), -1)
+                return gap.reshape(len(frames), len(firsts) * len(others))
 
             return _Candidates(firsts, others, lower_pair)
 
@@ -256,7 +256,7 @@ class ExactCollision:
             x = centers_in_base(frames, firsts, centers)[:, :, None] - middle
             outside = np.abs(np.einsum("oij,npoj->npoi", rotation, x)) - half
             gap = np.linalg.norm(np.maximum(outside, 0), axis=-1) + np.minimum(outside.max(axis=-1), 0)
-            return (gap - rounding - radii[:, None]).reshape(len(frames), -1)
+            return (gap - rounding - radii[:, None]).reshape(len(frames), len(firsts) * len(middle))
 
         return _Candidates(firsts, tuple(self._obstacles), lower_scene)
 

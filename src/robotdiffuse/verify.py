@@ -1,0 +1,271 @@
+"""The judge: is a motion free of collision, within limits, and from the start to the goal?
+
+Collision between waypoints is settled by a certificate, not by sampling: see collision/continuous.py. The
+judge knows nothing of planners.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy import ndarray
+
+from robotdiffuse.collision.continuous import Contact, ContinuousCollision
+from robotdiffuse.collision.exact import describe_contact
+from robotdiffuse.errors import InputError
+from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.transforms import rotation_angle
+from robotdiffuse.types import Path, Trajectory
+
+
+@dataclass(frozen=True)
+class VerifySettings:
+    """What counts as a violation."""
+
+    contact: float = 1e-4
+    """Meshes closer than this [m] count as touching; at or above it, clearances are certified."""
+    limit_slack: float = 1e-6
+    """Joint limits may be exceeded by this [rad] or [m]."""
+    start_tolerance: float = 1e-6
+    """Largest difference of any joint from the problem's start [rad] or [m]."""
+    goal_tolerance: float = 1e-4
+    """Largest difference of any joint from one of the goal configurations [rad] or [m]."""
+    goal_distance: float = 0.01
+    """Largest distance from the position of a goal pose [m] (the paper's 1 cm)."""
+    goal_angle: float = float(np.radians(15))
+    """Largest angle from the orientation of a goal pose [rad] (the paper's 15 degrees)."""
+    rate_slack: float = 0.01
+    """Share by which a trajectory may exceed velocity and acceleration limits."""
+    jump: float = 1.5
+    """A step of a trajectory longer than this times what the velocity limit allows in its time is a jump."""
+    reversal_angle: float = float(np.radians(150))
+    """A turn in joint space by more than this [rad] is a sharp reversal ..."""
+    reversal_step: float = 0.05
+    """... if the straight moves before and after it are both at least this long [rad, joint-space L2]."""
+    reversals: int = 3
+    """More sharp reversals than this are twitching."""
+    tightness: float = 0.5
+    """`Report.min_clearance` is at least this share of the least clearance that was measured, in (0, 1)."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.tightness < 1:
+            raise InputError(f"tightness is {self.tightness}; it must lie between 0 and 1, both excluded")
+        if self.contact <= 0:
+            raise InputError(f"contact is {self.contact}; it must be positive, or bisection has no end")
+
+
+@dataclass(frozen=True)
+class Violation:
+    """The first thing along the motion that is wrong."""
+
+    kind: str
+    """not_finite, start, limits, scene_collision, self_collision, twitch or goal; for trajectories also time,
+    velocity, acceleration and jump."""
+    time: float
+    """Where: for a path, waypoint index plus fraction of the segment; for a trajectory, seconds."""
+    message: str
+    """One line."""
+    subject: str | None = None
+    """The link that collides, or the joint that is out of limits."""
+    other: str | None = None
+    """The obstacle or the other link."""
+    excess: float | None = None
+    """By how much: the greatest depth until the contact ends [m]; beyond the limit, or off the goal, in its
+    unit."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The verdict."""
+
+    valid: bool
+    violation: Violation | None
+    """None if and only if the motion is valid."""
+    min_clearance: float | None
+    """No point of a moving link comes nearer to an obstacle, or to a link it is checked against, than this
+    [m]: a lower bound over the whole motion, at most 1 m. None for an invalid motion."""
+    sphere_checks: int
+    """Configurations checked by covering spheres."""
+    mesh_checks: int
+    """Distances of one link to the scene or to another link, by exact meshes."""
+
+
+def verify(problem: Problem, path: Path, settings: VerifySettings | None = None) -> Report:
+    """Judge a path for a problem. Raises InputError if its joints are not those of the robot."""
+    return verifier(problem, settings or VerifySettings()).path(path)
+
+
+def verify_trajectory(
+    problem: Problem, trajectory: Trajectory, settings: VerifySettings | None = None
+) -> Report:
+    """Judge a trajectory, taken as straight in joint space between its rows, with its rates and times."""
+    return verifier(problem, settings or VerifySettings()).trajectory(trajectory)
+
+
+class Verifier:
+    """Judges motions for one problem; what the robot and the scene need is prepared once."""
+
+    def __init__(self, problem: Problem, settings: VerifySettings) -> None:
+        self.problem, self.settings, self.robot = problem, settings, problem.robot
+
+    def path(self, path: Path) -> Report:
+        """See `verify`."""
+        self._check_shape(path.joint_names, path.positions)
+        return self._report(path.positions, None, [])
+
+    def trajectory(self, trajectory: Trajectory) -> Report:
+        """See `verify_trajectory`."""
+        self._check_shape(trajectory.joint_names, trajectory.positions)
+        rows = (trajectory.times, trajectory.velocities, trajectory.accelerations)
+        for name, values in zip(("times", "velocities", "accelerations"), rows, strict=True):
+            if len(values) != len(trajectory.positions):
+                raise InputError(
+                    f"trajectory.{name} has {len(values)} rows; positions has {len(trajectory.positions)}"
+                )
+        if not all(np.isfinite(values).all() for values in rows):
+            violation = Violation("not_finite", 0.0, "the trajectory holds values that are not finite")
+            return Report(False, violation, None, 0, 0)
+        backwards = np.flatnonzero(np.diff(trajectory.times) <= 0)
+        if len(backwards):
+            at = float(trajectory.times[backwards[0] + 1])
+            message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
+            return Report(False, Violation("time", at, message), None, 0, 0)
+        return self._report(trajectory.positions, trajectory.times, self._rates(trajectory))
+
+    def collision_free(self, path: Path) -> bool:
+        """Whether a path is certified free of collision; neither its ends nor limits are looked at."""
+        self._check_shape(path.joint_names, path.positions)
+        return self._continuous.sweep(path.positions).contact is None
+
+    def _check_shape(self, joint_names: tuple[str, ...], positions: ndarray) -> None:
+        if tuple(joint_names) != self.robot.joint_names:
+            given, right = ", ".join(joint_names), ", ".join(self.robot.joint_names)
+            raise InputError(f"path.joint_names is {given}; the robot's planned joints are {right}")
+        if positions.ndim != 2 or positions.shape[1] != self.robot.dof or len(positions) == 0:
+            raise InputError(
+                f"path.positions has shape {positions.shape}; it must be n x {self.robot.dof} with n >= 1"
+            )
+
+    def _report(self, q: ndarray, times: ndarray | None, found: list[Violation]) -> Report:
+        """The verdict on waypoints; `found` are violations known already. The earliest one is reported."""
+        bad = np.flatnonzero(~np.isfinite(q).all(axis=1))
+        if len(bad):
+            at = float(bad[0] if times is None else times[bad[0]])
+            message = f"waypoint {bad[0]} holds values that are not finite"
+            return Report(False, Violation("not_finite", at, message), None, 0, 0)
+        clock = np.arange(len(q), dtype=float) if times is None else times
+        found = [
+            v
+            for v in (self._start(q), self._limits(q, clock), *found, self._twitch(q, clock))
+            if v is not None
+        ]
+        first = min(found, key=lambda violation: violation.time, default=None)
+        last = len(q) - 1 if first is None else int(np.searchsorted(clock, first.time))
+        sweep = self._continuous.sweep(q[: last + 1])
+        collision = None
+        if sweep.contact is not None:
+            collision = _collision(
+                sweep.contact, float(np.interp(sweep.contact.at, np.arange(len(clock)), clock))
+            )
+        every = [v for v in (first, collision, self._goal(q[-1], float(clock[-1]))) if v is not None]
+        violation = min(every, key=lambda v: v.time, default=None)
+        clearance = sweep.clearance if violation is None else None
+        return Report(violation is None, violation, clearance, sweep.sphere_checks, sweep.mesh_checks)
+
+    def _start(self, q: ndarray) -> Violation | None:
+        difference = np.abs(q[0] - self.problem.start)
+        if (difference <= self.settings.start_tolerance).all():
+            return None
+        j = int(difference.argmax())
+        name, excess = self.robot.joint_names[j], float(difference[j])
+        message = (
+            f"the motion begins at {name} = {q[0, j]:.6g}; the problem's start is {self.problem.start[j]:.6g}"
+        )
+        return Violation("start", 0.0, message, name, None, excess)
+
+    def _limits(self, q: ndarray, clock: ndarray) -> Violation | None:
+        excess = np.maximum(self.robot.lower - q, q - self.robot.upper)
+        bad = np.flatnonzero((excess > self.settings.limit_slack).any(axis=1))
+        if not len(bad):
+            return None
+        i, j = int(bad[0]), int(excess[bad[0]].argmax())
+        name, low, high = self.robot.joint_names[j], self.robot.lower[j], self.robot.upper[j]
+        message = f"{name} is {q[i, j]:.6g} at waypoint {i}; its limits are {low:.6g} to {high:.6g}"
+        return Violation("limits", float(clock[i]), message, name, None, float(excess[i, j]))
+
+    def _rates(self, trajectory: Trajectory) -> list[Violation]:
+        """Velocity and acceleration limits (0: the robot gives none), and steps too long for their time."""
+        share, robot, found = 1 + self.settings.rate_slack, self.robot, []
+        steps = np.abs(np.diff(trajectory.positions, axis=0)) / np.diff(trajectory.times)[:, None]
+        for kind, rates, limit, factor, what in (
+            ("velocity", trajectory.velocities, robot.velocity, share, "velocity"),
+            ("acceleration", trajectory.accelerations, robot.acceleration, share, "acceleration"),
+            ("jump", steps, robot.velocity, self.settings.jump, "mean velocity from here to the next row"),
+        ):
+            most = np.where(limit > 0, limit, np.inf)
+            bad = np.flatnonzero((np.abs(rates) > most * factor).any(axis=1))
+            if len(bad):
+                i = int(bad[0])
+                j = int((np.abs(rates[i]) / most).argmax())
+                name, rate, time = robot.joint_names[j], abs(float(rates[i, j])), float(trajectory.times[i])
+                message = f"{name} at {time:.3f} s: its {what} is {rate:.6g}, its limit {limit[j]:.6g}"
+                found.append(Violation(kind, time, message, name, None, rate - float(limit[j])))
+        return found
+
+    def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
+        """More sharp reversals than allowed, counted on waypoints at least `reversal_step` apart."""
+        settings, kept = self.settings, [0]
+        if not len(q) > settings.reversals + 2:
+            return None
+        for i in range(1, len(q)):
+            if np.linalg.norm(q[i] - q[kept[-1]]) >= settings.reversal_step:
+                kept.append(i)
+        steps = np.diff(q[kept], axis=0)
+        steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+        cosines = (steps[1:] * steps[:-1]).sum(axis=1)
+        sharp = np.flatnonzero(cosines < np.cos(settings.reversal_angle))
+        if len(sharp) <= settings.reversals:
+            return None
+        at = float(clock[kept[sharp[settings.reversals] + 1]])
+        message = (
+            f"the motion twitches: {len(sharp)} sharp reversals; at most {settings.reversals} are allowed"
+        )
+        return Violation("twitch", at, message, None, None, float(len(sharp) - settings.reversals))
+
+    def _goal(self, end: ndarray, time: float) -> Violation | None:
+        goal, settings = self.problem.goal, self.settings
+        if isinstance(goal, JointGoal):
+            off = float(np.abs(goal.positions - end).max(axis=1).min(initial=np.inf))
+            if off <= settings.goal_tolerance:
+                return None
+            message = f"the motion ends {off:.3g} from the nearest goal configuration (largest joint error)"
+            return Violation("goal", time, message, None, None, off)
+        T_base_end = link_pose(self.robot, end, goal.frame)
+        distance = float(np.linalg.norm(T_base_end[:3, 3] - goal.T_base_frame[:3, 3]))
+        angle = rotation_angle(T_base_end[:3, :3].T @ goal.T_base_frame[:3, :3])
+        if distance <= settings.goal_distance and angle <= settings.goal_angle:
+            return None
+        message = (
+            f"the motion ends with {goal.frame} {distance * 100:.2f} cm and {np.degrees(angle):.1f} degrees "
+            f"off the goal pose"
+        )
+        return Violation("goal", time, message, goal.frame, None, distance)
+
+    @cached_property
+    def _continuous(self) -> ContinuousCollision:
+        settings = self.settings
+        return ContinuousCollision(self.robot, self.problem.scene, settings.contact, settings.tightness)
+
+
+@lru_cache(maxsize=8)
+def verifier(problem: Problem, settings: VerifySettings) -> Verifier:
+    """The Verifier of a problem; the last few are kept, so that many paths of one problem are judged fast."""
+    return Verifier(problem, settings)
+
+
+def _collision(contact: Contact, time: float) -> Violation:
+    (link, pair), other = contact.check, contact.other
+    kind = "scene_collision" if pair is None else "self_collision"
+    message = describe_contact(link, other, contact.depth, pair is not None)
+    return Violation(kind, time, message, link, other, contact.depth)
