@@ -7,6 +7,7 @@ at configurations drawn uniformly within the limits. Errors are measured by NumP
 """
 
 import argparse
+import os
 import platform
 import time
 from datetime import date
@@ -38,6 +39,7 @@ def main() -> None:
     robot, rng = load_robot("panda"), np.random.default_rng(0)
     packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba"))
     print(f"{date.today()}; {processor()}, one core; Python {platform.python_version()}, {packages}")
+    print(f"load average of the machine's {os.cpu_count()} cores before: {os.getloadavg()[0]:.1f}")
 
     start = time.perf_counter()
     inverse_kinematics(robot, FRAME, transform(np.array([0.4, 0.0, 0.4])), rng=rng)
