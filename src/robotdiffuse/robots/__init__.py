@@ -1,0 +1,67 @@
+"""Robots: joints, limits, kinematics, collision spheres; bundled ones by name, any serial arm by its URDF."""
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.robots.bundle import ROBOT_FILE, read_bundle, read_source
+from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
+
+__all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
+
+DATA = Path(__file__).parent / "data"
+ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}")))
+"""Names of the bundled robots."""
+
+
+def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robot:
+    """A robot by its bundled name, the name that `robotdiffuse robot add` gave it, or a path to a URDF.
+
+    A URDF is looked up by its content among the robots that were added; a new or changed one is fitted with
+    spheres first, which takes about half a minute, and kept. `locked` holds joints at values (see
+    Robot.with_locked). Raises InputError for an unknown name or bad input.
+    """
+    text = str(name)
+    if isinstance(name, Path) or text.endswith((".urdf", ".xml")) or "/" in text or "\\" in text:
+        robot = _from_urdf(Path(name))
+    else:
+        robot = _by_name(text)
+    return robot.with_locked(locked or {})
+
+
+def _by_name(name: str) -> Robot:
+    if name in ROBOTS:
+        return _bundled(name)
+    added = _added()
+    if name not in added:
+        raise unknown_name("robot", name, [*ROBOTS, *added])
+    return read_bundle(added[name])
+
+
+@lru_cache
+def _bundled(name: str) -> Robot:
+    return read_bundle(DATA / name)
+
+
+def _added() -> dict[str, Path]:
+    from robotdiffuse.robots.add import user_robots
+
+    return {file.parent.name: file.parent for file in sorted(user_robots().glob(f"*/{ROBOT_FILE}"))}
+
+
+def _from_urdf(urdf: Path) -> Robot:
+    from robotdiffuse.robots.add import add_robot, user_robots
+    from robotdiffuse.robots.urdf import content_hash, read_urdf
+
+    digest = content_hash(urdf)
+    for folder in _added().values():
+        try:
+            if read_source(folder).get("sha256") == digest:
+                return read_bundle(folder)
+        except InputError:
+            continue  # a damaged folder of another robot is no reason to fail
+    name = read_urdf(urdf).name
+    report = add_robot(urdf, out=user_robots() / f"{name}-{digest[:8]}")
+    note = f"spheres were fitted to {urdf.name} ({report.sphere_count}) and kept in {report.folder}"
+    return replace(report.robot, notes=(*report.robot.notes, note))

@@ -1,0 +1,219 @@
+"""Pairs of links that need no check against each other, found by sampling configurations."""
+
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Robot
+from robotdiffuse.transforms import rotation_about
+
+ADJACENT, ALWAYS, NEVER, DEFAULT, CHECKED = "adjacent", "always", "never", "default", "checked"
+
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """How the pairs are found."""
+
+    samples: int = 20_000
+    """Configurations, uniform within the limits of all joints, gripper joints included."""
+    always: float = 0.95
+    """Share of collisions from which on a pair counts as always colliding (MoveIt's setup assistant: 0.95)."""
+    descents: int = 20
+    """Closest samples from which a pair that never collided is driven towards collision, to be sure."""
+
+    def __post_init__(self) -> None:
+        if self.samples < 100:
+            raise InputError(f"samples is {self.samples}; fewer than 100 find no pairs")
+        if not 0.5 < self.always <= 1:
+            raise InputError(f"always is {self.always}; it must be above 0.5 and at most 1")
+
+
+@dataclass(frozen=True)
+class PairReport:
+    """What sampling says about two links."""
+
+    links: tuple[str, str]
+    reason: str
+    """adjacent, always, never or default (allowed), or checked."""
+    colliding: float
+    """Share of the configurations in which the meshes collide."""
+    false_positives: float
+    """Share in which the meshes are free and the spheres collide."""
+
+
+def find_allowed_collisions(
+    robot: Robot, settings: SamplingSettings, rng: np.random.Generator
+) -> tuple[PairReport, ...]:
+    """One report for each pair of links with meshes on different frames; the robot needs covering spheres.
+
+    Allowed are, as in MoveIt's setup assistant: adjacent links (joined by a joint, links without geometry
+    between them skipped); pairs that always or never collide; and pairs that collide in the default pose, all
+    joints at zero, if that is within the limits. Meshes are tested with Coal, where the covering spheres do
+    not already show that they are apart. Pairs that never collided are driven together by random descent from
+    their closest samples; those that can be made to collide are checked.
+    """
+    sampler = _Sampler(robot)
+    default = np.zeros((1, len(sampler.joints)))
+    inside = ((default >= sampler.lower) & (default <= sampler.upper)).all()
+    q = sampler.random(settings.samples, rng)
+    poses = sampler.poses(q)
+    default_poses = sampler.poses(default)
+    adjacent = _adjacent(robot)
+    reports = []
+    for a, b in _moving_pairs(robot):
+        near = sampler.sphere_distance(poses, a, b)
+        touching = near <= 0
+        colliding = np.zeros(len(q), dtype=bool)
+        for i in np.flatnonzero(touching):
+            colliding[i] = sampler.collide(poses, a, b, int(i))
+        if frozenset((a, b)) in adjacent:
+            reason = ADJACENT
+        elif colliding.mean() >= settings.always:
+            reason = ALWAYS
+        elif inside and sampler.collide(default_poses, a, b, 0):
+            reason = DEFAULT
+        elif not colliding.any() and not _descend(
+            sampler, a, b, q[np.argsort(near)[: settings.descents]], rng
+        ):
+            reason = NEVER
+        else:
+            reason = CHECKED
+        reports.append(
+            PairReport((a, b), reason, float(colliding.mean()), float((touching & ~colliding).mean()))
+        )
+    return tuple(reports)
+
+
+def allowed_pairs(reports: tuple[PairReport, ...]) -> frozenset[frozenset[str]]:
+    """The pairs that need no check."""
+    return frozenset(frozenset(report.links) for report in reports if report.reason != CHECKED)
+
+
+def _descend(
+    sampler: "_Sampler", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator
+) -> bool:
+    """Whether random descent on the distance between the meshes finds a collision of the links."""
+    for start in starts:
+        q, step = start, 0.1 * (sampler.upper - sampler.lower)
+        least = sampler.mesh_distance(sampler.poses(q[None]), a, b)
+        for _ in range(15):
+            around = np.clip(q + step * rng.normal(size=(8, len(q))), sampler.lower, sampler.upper)
+            poses = sampler.poses(around)
+            distances = [sampler.mesh_distance(poses, a, b, i) for i in range(len(around))]
+            i = int(np.argmin(distances))
+            if distances[i] <= 0:
+                return True
+            if distances[i] < least:
+                q, least = around[i], distances[i]
+            else:
+                step = step / 2
+    return False
+
+
+def _moving_pairs(robot: Robot) -> list[tuple[str, str]]:
+    links = [link for link in robot.link_names if link in robot.meshes]
+    return [
+        (a, b)
+        for i, a in enumerate(links)
+        for b in links[i + 1 :]
+        if robot.link_frame(a) != robot.link_frame(b)
+    ]
+
+
+def _adjacent(robot: Robot) -> set[frozenset[str]]:
+    """Links joined by a joint; links without geometry are passed through."""
+    solid: dict[str, str] = {robot.base: robot.base}
+    pairs = set()
+    for joint in robot.joints:
+        above = solid[joint.parent]
+        solid[joint.child] = joint.child if joint.child in robot.meshes else above
+        pairs.add(frozenset((above, joint.child)))
+    return pairs
+
+
+class _Sampler:
+    """Poses of all links for many values of all movable joints, and tests of pairs of links."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.joints = [joint for joint in robot.joints if joint.kind in MOVING_KINDS]
+        self.lower = np.array([joint.lower for joint in self.joints])
+        self.upper = np.array([joint.upper for joint in self.joints])
+        self.hulls = {link: [_coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
+        self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
+        self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
+
+    def random(self, count: int, rng: np.random.Generator) -> Float[ndarray, "n d"]:
+        return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
+
+    def poses(self, q: Float[ndarray, "n d"]) -> dict[str, Float[ndarray, "n 4 4"]]:
+        """T_base_link by link."""
+        column = {joint.name: i for i, joint in enumerate(self.joints)}
+        poses = {self.robot.base: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
+        for joint in self.robot.joints:
+            T = poses[joint.parent] @ joint.T_parent_joint
+            if joint.name in column:
+                T = T @ _motions(joint.axis, joint.kind == "prismatic", q[:, column[joint.name]])
+            poses[joint.child] = T
+        return poses
+
+    def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
+        """Signed distance between the covering spheres of two links [m]: at most that of their meshes."""
+        T_a_base = np.linalg.inv(poses[a])
+        T_a_b = T_a_base @ poses[b]
+        first, second = self.robot.spheres[a], self.robot.spheres[b]
+        near = np.full(len(T_a_b), np.inf)
+        for sphere in second:
+            center = T_a_b[:, :3, :3] @ sphere[:3] + T_a_b[:, :3, 3]
+            gaps = np.linalg.norm(center[:, None] - first[None, :, :3], axis=2) - first[:, 3] - sphere[3]
+            near = np.minimum(near, gaps.min(1))
+        return near
+
+    def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
+        """Whether the meshes of two links collide in configuration i."""
+        T_a, T_b = _coal_pose(poses[a][i]), _coal_pose(poses[b][i])
+        for first in self.hulls[a]:
+            for second in self.hulls[b]:
+                self.result.clear()
+                if coal.collide(first, T_a, second, T_b, self.request, self.result):
+                    return True
+        return False
+
+    def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
+        """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
+        T_a, T_b = _coal_pose(poses[a][i]), _coal_pose(poses[b][i])
+        least = np.inf
+        for first in self.hulls[a]:
+            for second in self.hulls[b]:
+                self.distance_result.clear()
+                distance = coal.distance(first, T_a, second, T_b, self.distance_request, self.distance_result)
+                least = min(least, distance)
+        return float(least)
+
+
+def _motions(axis: Float[ndarray, "3"], prismatic: bool, q: Float[ndarray, "n"]) -> Float[ndarray, "n 4 4"]:
+    """T_joint_child for many values of one joint."""
+    T = np.tile(np.eye(4), (len(q), 1, 1))
+    if prismatic:
+        T[:, :3, 3] = q[:, None] * axis
+        return T
+    cross = rotation_about(axis, np.pi / 2) - np.outer(axis, axis)  # Rodrigues: [axis]x
+    T[:, :3, :3] += np.sin(q)[:, None, None] * cross + (1 - np.cos(q))[:, None, None] * (cross @ cross)
+    return T
+
+
+def _coal_hull(mesh: ConvexMesh) -> "coal.Convex":
+    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    for vertex in mesh.vertices:
+        points.append(vertex)
+    for face in mesh.faces:
+        triangles.append(coal.Triangle(*map(int, face)))
+    return coal.Convex(points, triangles)
+
+
+def _coal_pose(T: Float[ndarray, "4 4"]) -> "coal.Transform3s":
+    return coal.Transform3s(np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]))

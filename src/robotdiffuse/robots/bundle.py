@@ -1,0 +1,213 @@
+"""A robot as a folder: robot.json (human-readable) and meshes.npz (convex collision meshes)."""
+
+import io
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
+from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+
+FORMAT = 1
+ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
+LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
+
+
+def write_bundle(robot: Robot, folder: str | Path, source: dict[str, str]) -> None:
+    """Write robot.json and meshes.npz into a folder, each whole or not at all; other files in it stay.
+
+    `source` says where the robot comes from (urdf, sha256, licence). Raises InputError if it cannot be written.
+    """
+    folder = Path(folder)
+    meshes = io.BytesIO()
+    np.savez_compressed(meshes, allow_pickle=False, **_pack(robot))
+    text = _dump(_to_json(robot, source)) + "\n"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _replace(folder / MESH_FILE, meshes.getvalue())
+        _replace(folder / ROBOT_FILE, text.encode())
+    except OSError as error:
+        raise InputError(f"cannot write the robot folder {folder}: {error.strerror}") from None
+
+
+def _replace(file: Path, content: bytes) -> None:
+    fresh = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        fresh.write_bytes(content)
+        os.replace(fresh, file)
+    finally:
+        fresh.unlink(missing_ok=True)
+
+
+def read_bundle(folder: str | Path) -> Robot:
+    """The robot in a folder; raises InputError naming the file if one is missing or damaged."""
+    data = _read_json(Path(folder) / ROBOT_FILE)
+    meshes = _unpack(Path(folder) / MESH_FILE)
+    try:
+        robot = _from_json(data, meshes)
+        robot.frame_offsets  # noqa: B018  (walks the tree: fails if a joint has no parent)
+        if robot.dof == 0 or not set(robot.spheres) <= set(robot.link_names):
+            raise ValueError("no planned joints, or spheres of an unknown link")
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InputError(f"{Path(folder) / ROBOT_FILE} is damaged: {type(error).__name__}: {error}") from None
+    return robot
+
+
+def read_source(folder: str | Path) -> dict[str, str]:
+    """Where the robot in a folder comes from: urdf, sha256, licence."""
+    source = _read_json(Path(folder) / ROBOT_FILE).get("source", {})
+    return source if isinstance(source, dict) else {}
+
+
+def _to_json(robot: Robot, source: dict[str, str]) -> dict:
+    return {
+        "format": FORMAT,
+        "name": robot.name,
+        "source": source,
+        "units": "metres, radians, seconds; quaternions wxyz; spheres are x y z radius in the link's frame",
+        "base": robot.base,
+        "tip": robot.tip,
+        "locked": robot.locked,
+        "joints": [_joint_to_json(joint) for joint in robot.joints],
+        "spheres": {link: np.round(spheres, 6).tolist() for link, spheres in robot.spheres.items()},
+        "allowed_collisions": sorted(sorted(pair) for pair in robot.allowed_collisions),
+        "notes": list(robot.notes),
+    }
+
+
+def _joint_to_json(joint: Joint) -> dict:
+    T = joint.T_parent_joint
+    data = {
+        "name": joint.name,
+        "kind": joint.kind,
+        "parent": joint.parent,
+        "child": joint.child,
+        "xyz": T[:3, 3].tolist(),
+        "wxyz": quaternion_from_rotation(T[:3, :3]).tolist(),
+    }
+    if joint.kind in MOVING_KINDS:
+        data |= {"axis": joint.axis.tolist()} | {name: getattr(joint, name) for name in LIMITS}
+    return data
+
+
+def _dump(data: dict) -> str:
+    """JSON with one joint, sphere or pair to a line."""
+
+    def compact(value: object) -> str:
+        return json.dumps(value, allow_nan=False)
+
+    lines = []
+    for key, value in data.items():
+        if key == "spheres":
+            links = [
+                f"    {compact(link)}: [\n" + ",\n".join(f"      {compact(row)}" for row in rows) + "\n    ]"
+                for link, rows in value.items()
+            ]
+            text = "{\n" + ",\n".join(links) + "\n  }"
+        elif isinstance(value, list) and value:
+            text = "[\n" + ",\n".join(f"    {compact(item)}" for item in value) + "\n  ]"
+        else:
+            text = compact(value)
+        lines.append(f"  {compact(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}"
+
+
+def _read_json(file: Path) -> dict:
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror}") from None
+    except ValueError as error:
+        raise InputError(f"{file} is damaged: {error}") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise InputError(
+            f"{file} is not a robot of format {FORMAT}; make it again with: robotdiffuse robot add"
+        )
+    return data
+
+
+def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
+    return Robot(
+        name=str(data["name"]),
+        base=str(data["base"]),
+        tip=str(data["tip"]),
+        joints=tuple(_joint_from_json(joint) for joint in data["joints"]),
+        spheres={str(link): _array(rows, 4, f"spheres of {link}") for link, rows in data["spheres"].items()},
+        meshes=meshes,
+        allowed_collisions=frozenset(frozenset(map(str, pair)) for pair in data["allowed_collisions"]),
+        locked={str(name): float(value) for name, value in data["locked"].items()},
+        notes=tuple(map(str, data["notes"])),
+    )
+
+
+def _joint_from_json(data: dict) -> Joint:
+    name, kind = str(data["name"]), str(data["kind"])
+    xyz = _array([data["xyz"]], 3, f"joint {name}: xyz")[0]
+    wxyz = _array([data["wxyz"]], 4, f"joint {name}: wxyz")[0]
+    T = transform(xyz, rotation_from_quaternion(wxyz))
+    if kind == "fixed":
+        return Joint(name, kind, str(data["parent"]), str(data["child"]), T, np.array([0.0, 0.0, 1.0]))
+    if kind not in MOVING_KINDS:
+        raise ValueError(f"joint {name} is of kind {kind!r}")
+    axis = _array([data["axis"]], 3, f"joint {name}: axis")[0]
+    lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
+    if not lower <= upper or not min(velocity, acceleration, jerk) > 0:
+        raise ValueError(f"joint {name}: limits")
+    return Joint(
+        name,
+        kind,
+        str(data["parent"]),
+        str(data["child"]),
+        T,
+        axis,
+        lower,
+        upper,
+        velocity,
+        acceleration,
+        jerk,
+    )
+
+
+def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
+    array = np.asarray(rows, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != width or not np.isfinite(array).all():
+        raise ValueError(f"{what}: {width} finite numbers in each row expected")
+    return array
+
+
+def _pack(robot: Robot) -> dict[str, ndarray]:
+    """All meshes in four arrays: reading many small ones would take longer."""
+    parts = [(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes]
+    return {
+        "links": np.array([link for link, _ in parts], dtype=np.str_),
+        "sizes": np.array([(len(m.vertices), len(m.faces)) for _, m in parts], np.int64).reshape(-1, 2),
+        "vertices": np.concatenate([np.zeros((0, 3)), *(mesh.vertices for _, mesh in parts)]),
+        "faces": np.concatenate([np.zeros((0, 3), np.int64), *(mesh.faces for _, mesh in parts)]),
+    }
+
+
+def _unpack(file: Path) -> dict[str, tuple[ConvexMesh, ...]]:
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            links, sizes, vertices, faces = (archive[key] for key in ("links", "sizes", "vertices", "faces"))
+        ends = np.cumsum(sizes, axis=0)
+        if len(links) and (ends[-1] != (len(vertices), len(faces))).any():
+            raise ValueError("sizes do not add up")
+        meshes: dict[str, tuple[ConvexMesh, ...]] = {}
+        for link, (v, f), (v_end, f_end) in zip(links, sizes, ends, strict=True):
+            mesh = ConvexMesh(
+                np.asarray(vertices[v_end - v : v_end], np.float64),
+                np.asarray(faces[f_end - f : f_end], np.int64),
+            )
+            meshes[str(link)] = (*meshes.get(str(link), ()), mesh)
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}") from None
+    except (KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{file} is damaged: {error}") from None
+    return meshes

@@ -1,0 +1,289 @@
+"""Spheres that cover the convex collision meshes of a link, sticking out little.
+
+The surface is cut into small triangles. A sphere is convex, so it covers a triangle if and only if it holds
+its three corners: a set of spheres in which every small triangle lies within one sphere provably covers the
+surface, not just samples of it.
+
+A sphere with centre p and radius r sticks out of a convex mesh by exactly r - depth(p), where depth is the
+distance from p to the nearest face plane. For the cells given to one sphere, the centre that makes it stick
+out least is the minimum of max |corner - p| - depth(p), a convex function of p. Like Lloyd's algorithm, the
+fit alternates between giving each cell to the sphere that holds it with the least stick-out and moving each
+sphere to its best centre. It starts from a greedy set cover and drops spheres as long as the tolerance holds.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.robot import ConvexMesh
+
+
+@dataclass(frozen=True)
+class SphereSettings:
+    """How closely spheres follow the meshes of a link."""
+
+    tolerance: float | None = None
+    """How far a sphere may stick out of the mesh [m]; by default `relative` times the mesh's inradius,
+    between `finest` and `coarsest`."""
+    relative: float = 0.25
+    finest: float = 0.004
+    """[m]; for fingers, that work a few millimetres from obstacles."""
+    coarsest: float = 0.0145
+    """[m]"""
+    candidates: int = 1000
+    """Places inside the mesh that the greedy cover chooses from."""
+    rounds: int = 10
+    """Rounds of the alternation for each number of spheres."""
+
+    def __post_init__(self) -> None:
+        if self.tolerance is not None and not self.tolerance > 0:
+            raise InputError(f"sphere tolerance is {self.tolerance}; it must be positive")
+        if not 0 < self.finest <= self.coarsest:
+            raise InputError(
+                f"sphere tolerances: finest {self.finest}, coarsest {self.coarsest}; 0 < finest <= coarsest"
+            )
+
+    def for_meshes(self, meshes: tuple[ConvexMesh, ...]) -> float:
+        """The tolerance for a link [m]."""
+        if self.tolerance is not None:
+            return self.tolerance
+        inside = _Body(meshes).depth(_grid(meshes, 0.005))
+        return float(np.clip(self.relative * inside.max(), self.finest, self.coarsest))
+
+
+def fit_spheres(
+    meshes: tuple[ConvexMesh, ...], settings: SphereSettings, rng: np.random.Generator
+) -> Float[ndarray, "n 4"]:
+    """Spheres [x y z radius, m] that cover the union of convex meshes and stick out by the tolerance at most."""
+    tolerance = settings.for_meshes(meshes)
+    body = _Body(meshes)
+    # a sphere that sticks out by e of a flat face covers a disc of radius sqrt(2 r e); cells are a fraction of it
+    disc = np.sqrt(2 * tolerance * body.depth(_grid(meshes, tolerance)).max())
+    cells = _Cells.of(meshes, disc / 4)
+    places = _inside_points(body, meshes, settings.candidates, rng)
+    needed = cells.stick_out(body, places)
+    centers = places[_greedy_cover(needed <= np.maximum(tolerance, needed.min(1, keepdims=True)))]
+    centers = _relax(body, cells, centers, 2 * settings.rounds)
+    while (needed := cells.stick_out(body, centers).min(1)).max() > tolerance:
+        extra = cells.points[cells.corners[needed.argmax()]].mean(0)
+        centers = _relax(body, cells, np.concatenate([centers, extra[None]]), settings.rounds)
+    while len(centers) > 1:
+        fewer = _relax(body, cells, _without_least(body, cells, centers), settings.rounds)
+        if cells.stick_out(body, fewer).min(1).max() > tolerance:
+            break
+        centers = fewer
+    cells = _Cells.of(meshes, disc / 10)
+    spheres = _with_radii(body, cells, _relax(body, cells, centers, settings.rounds // 2))
+    return _without_holes(body, _grid(meshes, tolerance / 2), spheres, tolerance)
+
+
+def stick_out(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n"]:
+    """How far each sphere reaches out of the meshes [m] (an upper bound where meshes overlap)."""
+    return spheres[:, 3] - _Body(meshes).depth(spheres[:, :3])
+
+
+def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], finest: float = 2e-5) -> bool:
+    """Whether the spheres provably cover the surface of the union of the meshes.
+
+    Triangles that no one sphere holds are cut in four, until they are held or smaller than `finest` [m].
+    """
+    triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    single = [_Body((mesh,)) for mesh in meshes]
+    while len(triangles):
+        corners = triangles.reshape(-1, 3)
+        gaps = _distances(corners, spheres[:, :3]) - spheres[:, 3]
+        is_open = (gaps.reshape(len(triangles), 3, -1).max(1) > 0).all(1)
+        if len(meshes) > 1:
+            hidden = [(body.depth(corners).reshape(-1, 3) > 1e-9).all(1) for body in single]
+            is_open &= ~np.any(hidden, axis=0)
+        triangles = triangles[is_open]
+        if len(triangles) and np.linalg.norm(np.ptp(triangles, axis=1), axis=1).min() < finest:
+            return False
+        a, b, c = np.moveaxis(triangles, 1, 0)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        triangles = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
+    return True
+
+
+class _Body:
+    """A union of convex meshes as face planes."""
+
+    def __init__(self, meshes: tuple[ConvexMesh, ...]) -> None:
+        self.planes = [_planes(mesh) for mesh in meshes]
+
+    def depth(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+        """Distance from each point inside to the nearest face plane [m]; negative outside."""
+        depths = [-(points @ normals - offsets).max(1) for normals, offsets in self.planes]
+        return depths[0] if len(depths) == 1 else np.max(depths, axis=0)
+
+
+def _planes(mesh: ConvexMesh) -> tuple[Float[ndarray, "3 f"], Float[ndarray, "f"]]:
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    size = np.linalg.norm(normals, axis=1)
+    normals = np.unique(np.round(normals[size > 1e-14] / size[size > 1e-14, None], 9), axis=0)
+    # the farthest vertex, not the face's own: rounding must not put a plane inside the mesh
+    return np.ascontiguousarray(normals.T), (mesh.vertices @ normals.T).max(0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Small triangles of the surface of the union of meshes."""
+
+    points: Float[ndarray, "p 3"]
+    corners: Int[ndarray, "c 3"]
+    """Indices into points."""
+    sharp: Bool[ndarray, "p"]
+    """Vertices of the meshes; all other points lie between neighbours on a face or an edge."""
+
+    @staticmethod
+    def of(meshes: tuple[ConvexMesh, ...], size: float) -> "_Cells":
+        """Triangles with edges of at most this size [m], without those inside another mesh."""
+        points, corners, sharp, count = [], [], [], 0
+        for k, mesh in enumerate(meshes):
+            p, f = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, size, max_iter=30)
+            p, f = np.asarray(p), np.asarray(f)
+            hidden = np.zeros(len(f), dtype=bool)
+            for other in meshes[:k] + meshes[k + 1 :]:
+                hidden |= (_Body((other,)).depth(p) > 1e-9)[f].all(1)
+            used, index = np.unique(f[~hidden], return_inverse=True)
+            p, f = p[used], index.reshape(-1, 3)
+            is_vertex = (_distances(p, mesh.vertices) < 1e-9).any(1)
+            # where triangles were left out, any point may be a corner of what is left
+            sharp.append(is_vertex | hidden.any())
+            points.append(p)
+            corners.append(f + count)
+            count += len(p)
+        return _Cells(np.concatenate(points), np.concatenate(corners), np.concatenate(sharp))
+
+    def outlines(self, owner: Int[ndarray, "c"], count: int) -> list[Float[ndarray, "k 3"]]:
+        """For each owner, points whose convex hull holds all its cells."""
+        total = np.bincount(self.corners.ravel(), minlength=len(self.points))
+        lines = []
+        for i in range(count):
+            mine = np.bincount(self.corners[owner == i].ravel(), minlength=len(self.points))
+            lines.append(self.points[(mine > 0) & ((mine < total) | self.sharp)])
+        return lines
+
+    def farthest(self, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "c n"]:
+        """Radius that each centre needs to hold each cell [m]."""
+        distance = _distances(self.points, centers)
+        a, b, c = self.corners.T
+        return np.maximum(np.maximum(distance[a], distance[b]), distance[c])
+
+    def stick_out(self, body: _Body, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "c n"]:
+        """How far a sphere at each centre would reach out of the meshes to hold each cell [m]."""
+        return self.farthest(centers) - body.depth(centers)
+
+
+def _greedy_cover(holds: Bool[ndarray, "c n"]) -> Int[ndarray, "k"]:
+    left = holds
+    chosen: list[int] = []
+    while len(left):
+        chosen.append(int(left.sum(0).argmax()))
+        left = left[~left[:, chosen[-1]]]
+    return np.array(chosen)
+
+
+def _relax(body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int) -> Float[ndarray, "n 3"]:
+    """Alternate between giving cells to spheres and moving the spheres; the best centres met."""
+    step, best, best_value = 0.004, centers, np.inf
+    for _ in range(rounds):
+        needed = cells.stick_out(body, centers)
+        value = float(needed.min(1).max())
+        if value < best_value:
+            best, best_value = centers, value
+        outlines = cells.outlines(needed.argmin(1), len(centers))
+        centers = np.stack(
+            [_best_center(body, own, p, step) for own, p in zip(outlines, centers, strict=True)]
+        )
+        step = max(0.8 * step, 0.0005)
+    value = float(cells.stick_out(body, centers).min(1).max())
+    return centers if value < best_value else best
+
+
+def _best_center(
+    body: _Body, own: Float[ndarray, "k 3"], center: Float[ndarray, "3"], step: float
+) -> Float[ndarray, "3"]:
+    """Centre of least stick-out for a sphere that holds these points, by pattern search."""
+    if not len(own):
+        return center
+
+    def value(centers: ndarray) -> ndarray:
+        return _distances(centers, own).max(1) - body.depth(centers)
+
+    least = value(center[None])[0]
+    while step > 2e-4:
+        around = center + step * DIRECTIONS
+        values = value(around)
+        i = int(values.argmin())
+        if values[i] < least - 1e-7:
+            center, least = around[i], values[i]
+        else:
+            step /= 2
+    return center
+
+
+def _without_least(body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+    """Drop the sphere whose cells the others take over with the least stick-out."""
+    needed = cells.stick_out(body, centers)
+    second = np.partition(needed, 1, axis=1)[:, 1]
+    owner = needed.argmin(1)
+    loss = [second[owner == i].max(initial=0.0) for i in range(len(centers))]
+    return np.delete(centers, int(np.argmin(loss)), axis=0)
+
+
+def _with_radii(body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
+    """Least radii with which each sphere holds its own cells; spheres without any are dropped."""
+    radius = cells.farthest(centers)
+    own = np.eye(len(centers), dtype=bool)[(radius - body.depth(centers)).argmin(1)]
+    radii = np.where(own, radius, 0.0).max(0) + 1e-6
+    return np.concatenate([centers, radii[:, None]], axis=1)[own.any(0)]
+
+
+def _without_holes(
+    body: _Body, grid: Float[ndarray, "g 3"], spheres: Float[ndarray, "n 4"], hole: float
+) -> Float[ndarray, "m 4"]:
+    """Fill holes inside the meshes, where a small obstacle could hide: spheres at the emptiest grid points."""
+    inside = body.depth(grid)
+    grid, inside = grid[inside > 0], inside[inside > 0]
+    while len(grid):
+        gap = (_distances(grid, spheres[:, :3]) - spheres[:, 3]).min(1)
+        worst = int(gap.argmax())
+        if gap[worst] < hole:
+            break
+        spheres = np.concatenate([spheres, np.append(grid[worst], inside[worst])[None]])
+    return spheres
+
+
+def _distances(a: Float[ndarray, "n 3"], b: Float[ndarray, "m 3"]) -> Float[ndarray, "n m"]:
+    squares = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
+    return np.sqrt(np.maximum(squares, 0.0))
+
+
+def _grid(meshes: tuple[ConvexMesh, ...], spacing: float) -> Float[ndarray, "n 3"]:
+    corners = np.concatenate([mesh.vertices for mesh in meshes])
+    axes = [
+        np.arange(lo, hi, spacing) + spacing / 2
+        for lo, hi in zip(corners.min(0), corners.max(0), strict=True)
+    ]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _inside_points(
+    body: _Body, meshes: tuple[ConvexMesh, ...], count: int, rng: np.random.Generator
+) -> Float[ndarray, "n 3"]:
+    corners = np.concatenate([mesh.vertices for mesh in meshes])
+    points = rng.uniform(corners.min(0), corners.max(0), (20 * count, 3))
+    return points[body.depth(points) > 0][:count]
+
+
+DIRECTIONS = np.array(
+    [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=float
+)
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)

@@ -1,0 +1,315 @@
+"""Reading a serial arm from a URDF file."""
+
+import hashlib
+import math
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import ConvexHull, QhullError
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
+from robotdiffuse.transforms import rotation_from_rpy, transform
+
+KINDS = (*MOVING_KINDS, "fixed")
+DEFAULT_VELOCITY = 1.0
+"""For movable joints whose URDF gives none [rad/s] or [m/s]."""
+ACCELERATION_PER_VELOCITY = 4.0
+"""URDF has no acceleration limit: full speed after a quarter of a second [1/s]."""
+JERK_PER_ACCELERATION = 10.0
+"""Nor one for jerk: full acceleration after a tenth of a second [1/s]."""
+GRIPPER_DEPTH = 3
+"""A branching is a gripper's if no path below it has more movable joints than this."""
+HULL_NOTE = 1.05
+"""Hulls larger than their mesh by more than this factor are noted."""
+
+
+def read_urdf(
+    path: str | Path,
+    base: str | None = None,
+    tip: str | None = None,
+    locked: dict[str, float] | None = None,
+) -> Robot:
+    """A robot from a URDF file, with convex collision meshes and without spheres.
+
+    `base` is the root of the tree by default. The default tip: from the base, follow the subtree with the
+    most movable joints in a row, as far as the link where the gripper branches off (two or more subtrees
+    with movable joints, none with more than three in a row); without a gripper, on to the deepest link. So
+    it is panda_hand for a Panda with fingers. Movable joints off the chain from base to tip are locked, at
+    zero clipped into their limits unless `locked` names another value; joints on the chain may be locked too.
+
+    Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity and 10 / s times the
+    acceleration (see limits.py to set them). Collision elements become convex hulls in the link's frame;
+    cylinders and spheres become polyhedra around them. Mimic joints count as independent, with a note.
+
+    Raises InputError, one line that names the file, for anything missing or contradictory in it.
+    """
+    tree = _Tree(Path(path))
+    base = base or tree.root
+    if base not in tree.links:
+        raise unknown_name(f"base link in {tree.path.name}", base, tree.links)
+    joints = tree.below(base)
+    names = [base, *(joint.child for joint in joints)]
+    if tip is None:
+        tip = _default_tip(base, joints)
+    elif tip not in names:
+        raise unknown_name(f"tip link below {base} in {tree.path.name}", tip, names)
+    meshes = {link: tree.meshes(link) for link in names}
+    robot = Robot(
+        name=tree.name,
+        base=base,
+        tip=tip,
+        joints=tuple(joints),
+        meshes={link: parts for link, parts in meshes.items() if parts},
+        notes=tuple(tree.notes),
+    )
+    on_chain = {joint.name for joint in robot.planned_joints if joint.lower < joint.upper}
+    rest = {
+        joint.name: float(np.clip(0.0, joint.lower, joint.upper))
+        for joint in joints
+        if joint.kind in MOVING_KINDS and joint.name not in on_chain
+    }
+    robot = replace(robot, locked=rest).with_locked(locked or {})
+    if robot.dof == 0:
+        raise InputError(
+            f"{tree.path}: no movable joint between {base} and {tip}; choose another base or tip"
+        )
+    return robot
+
+
+def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
+    """Convex hull with outward faces; a flat set of points is given a hair of thickness."""
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        hull = ConvexHull(points, qhull_options="QJ")
+    used, index = np.unique(hull.simplices, return_inverse=True)
+    vertices, faces = points[used], index.reshape(hull.simplices.shape)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    inwards = np.einsum("fd,fd->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return ConvexMesh(vertices, faces)
+
+
+def content_hash(path: str | Path) -> str:
+    """SHA-256 of a URDF file and of the collision meshes it names: equal if the robot is."""
+    tree = _Tree(Path(path))
+    digest = hashlib.sha256(tree.path.read_bytes())
+    for element in tree.links.values():
+        for mesh in element.findall("collision/geometry/mesh"):
+            digest.update(tree.resolve(mesh.get("filename", "")).read_bytes())
+    return digest.hexdigest()
+
+
+def _default_tip(base: str, joints: list[Joint]) -> str:
+    children: dict[str, list[Joint]] = {}
+    for joint in joints:
+        children.setdefault(joint.parent, []).append(joint)
+    moving: dict[str, int] = {}
+    depth: dict[str, int] = {}
+    for joint in reversed(joints):
+        child, parent = joint.child, joint.parent
+        steps = int(joint.kind in MOVING_KINDS)
+        moving[parent] = max(moving.get(parent, 0), moving.get(child, 0) + steps)
+        depth[parent] = max(depth.get(parent, 0), depth.get(child, 0) + 1)
+    link = base
+    while link in children:
+        ways = {j.child: moving.get(j.child, 0) + (j.kind in MOVING_KINDS) for j in children[link]}
+        if sum(way > 0 for way in ways.values()) > 1 and max(ways.values()) <= GRIPPER_DEPTH:
+            break
+        link = max(ways, key=lambda child: (ways[child], depth.get(child, 0)))
+    return link
+
+
+@dataclass
+class _Tree:
+    """The links and joints of one URDF file, checked as they are read."""
+
+    path: Path
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        try:
+            root = ET.parse(self.path).getroot()
+        except OSError as error:
+            raise InputError(f"cannot read the URDF {self.path}: {error.strerror}") from None
+        except ET.ParseError as error:
+            raise InputError(f"{self.path} is not well-formed XML: {error}") from None
+        if root.tag != "robot":
+            raise InputError(f"{self.path} is not a URDF: its root element is <{root.tag}>, not <robot>")
+        self.name = root.get("name") or self.path.stem
+        self.links = {self._name(link, "link"): link for link in root.findall("link")}
+        self.elements = {self._name(joint, "joint"): joint for joint in root.findall("joint")}
+        parents: dict[str, str] = {}
+        self.children: dict[str, list[str]] = {}
+        for name, element in self.elements.items():
+            parent, child = self._end(name, element, "parent"), self._end(name, element, "child")
+            if child in parents:
+                raise InputError(
+                    f"{self.path}: link {child} has two parent joints ({parents[child]}, {name})"
+                )
+            parents[child] = name
+            self.children.setdefault(parent, []).append(name)
+        roots = [link for link in self.links if link not in parents]
+        if len(roots) != 1:
+            raise InputError(f"{self.path}: a URDF has one root link, this one has {len(roots)}: {roots[:5]}")
+        self.root = roots[0]
+
+    def _name(self, element: ET.Element, what: str) -> str:
+        name = element.get("name")
+        if not name:
+            raise InputError(f"{self.path}: a <{what}> has no name")
+        return name
+
+    def _end(self, name: str, element: ET.Element, what: str) -> str:
+        end = element.find(what)
+        link = "" if end is None else end.get("link", "")
+        if link not in self.links:
+            raise InputError(f"{self.path}: joint {name}: its {what} link {link!r} is not in the file")
+        return link
+
+    def _numbers(self, text: str, count: int, what: str) -> Float[ndarray, "n"]:
+        try:
+            values = np.array([float(word) for word in text.split()])
+        except ValueError:
+            values = np.zeros(0)
+        if len(values) != count or not np.isfinite(values).all():
+            raise InputError(f"{self.path}: {what} is {text!r}; it must be {count} finite number(s)")
+        return values
+
+    def _origin(self, element: ET.Element, what: str) -> Float[ndarray, "4 4"]:
+        origin = element.find("origin")
+        if origin is None:
+            return np.eye(4)
+        rpy = self._numbers(origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
+        xyz = self._numbers(origin.get("xyz", "0 0 0"), 3, f"{what}: origin xyz")
+        return transform(xyz, rotation_from_rpy(*map(float, rpy)))
+
+    def below(self, link: str) -> list[Joint]:
+        """Joints below a link, parents before children."""
+        joints: list[Joint] = []
+        for name in self.children.get(link, []):
+            joints.append(self._joint(name))
+            joints += self.below(joints[-1].child)
+        return joints
+
+    def _joint(self, name: str) -> Joint:
+        element = self.elements[name]
+        what = f"joint {name}"
+        kind = element.get("type", "")
+        if kind not in KINDS:
+            raise InputError(f"{self.path}: {what} has type {kind!r}; supported: {', '.join(KINDS)}")
+        axis_element = element.find("axis")
+        axis = np.array([1.0, 0.0, 0.0])
+        if axis_element is not None and kind != "fixed":
+            axis = self._numbers(axis_element.get("xyz", "1 0 0"), 3, f"{what}: axis")
+            if np.linalg.norm(axis) < 1e-6:
+                raise InputError(f"{self.path}: {what}: its axis is zero")
+            axis = axis / np.linalg.norm(axis)
+        if element.find("mimic") is not None:
+            self.notes.append(f"{what} mimics another one; taken as independent")
+        joint = Joint(
+            name=name,
+            kind=kind,
+            parent=self._end(name, element, "parent"),
+            child=self._end(name, element, "child"),
+            T_parent_joint=self._origin(element, what),
+            axis=axis,
+        )
+        return joint if kind == "fixed" else self._with_limits(joint, element.find("limit"))
+
+    def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
+        given: dict[str, float] = {}
+        for what in ("lower", "upper", "velocity"):
+            if limit is not None and limit.get(what) is not None:
+                text = limit.get(what, "")
+                given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit")[0])
+        if joint.kind == "continuous":
+            given["lower"], given["upper"] = -math.pi, math.pi
+        if "lower" not in given and "upper" not in given:
+            raise InputError(
+                f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
+            )
+        lower, upper = given.get("lower", 0.0), given.get("upper", 0.0)
+        if lower > upper:
+            raise InputError(f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}")
+        velocity = given.get("velocity", 0.0)
+        if velocity <= 0:
+            velocity = DEFAULT_VELOCITY
+            self.notes.append(f"joint {joint.name} has no velocity limit; {velocity:g} taken")
+        acceleration = ACCELERATION_PER_VELOCITY * velocity
+        jerk = JERK_PER_ACCELERATION * acceleration
+        return replace(
+            joint, lower=lower, upper=upper, velocity=velocity, acceleration=acceleration, jerk=jerk
+        )
+
+    def meshes(self, link: str) -> tuple[ConvexMesh, ...]:
+        """Hulls of the link's collision elements, in its frame."""
+        parts = []
+        for element in self.links[link].findall("collision"):
+            geometry = element.find("geometry")
+            shape = next(iter(geometry), None) if geometry is not None else None
+            if shape is None:
+                raise InputError(f"{self.path}: link {link}: a <collision> has no geometry")
+            points = self._points(shape, link)
+            T = self._origin(element, f"link {link}: collision")
+            parts.append(convex_hull(points @ T[:3, :3].T + T[:3, 3]))
+        return tuple(parts)
+
+    def _points(self, shape: ET.Element, link: str) -> Float[ndarray, "n 3"]:
+        def positive(name: str, count: int) -> Float[ndarray, "n"]:
+            what = f"link {link}: {shape.tag} {name}"
+            values = self._numbers(shape.get(name, ""), count, what)
+            if (values <= 0).any():
+                raise InputError(f"{self.path}: {what} is {shape.get(name)!r}; it must be positive")
+            return values
+
+        if shape.tag == "box":
+            return np.array(trimesh.creation.box(positive("size", 3)).vertices)
+        if shape.tag == "sphere":
+            ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+            inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
+            return np.array(ball.vertices) * positive("radius", 1) / inner
+        if shape.tag == "cylinder":
+            angle = np.arange(32) * np.pi / 16
+            ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            ring = ring * positive("radius", 1) / np.cos(np.pi / 32)
+            half = float(positive("length", 1)[0]) / 2
+            return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
+        if shape.tag == "mesh":
+            return self._mesh_points(shape, link)
+        raise InputError(f"{self.path}: link {link}: collision shape <{shape.tag}> is not known")
+
+    def _mesh_points(self, shape: ET.Element, link: str) -> Float[ndarray, "n 3"]:
+        file = self.resolve(shape.get("filename", ""))
+        try:
+            mesh = trimesh.load(file, force="mesh")
+        except Exception as error:  # trimesh's readers raise whatever they meet
+            raise InputError(f"{self.path}: link {link}: cannot read {file}: {error}") from None
+        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.vertices) < 4:
+            raise InputError(f"{self.path}: link {link}: {file} holds no triangle mesh")
+        hull = convex_hull(np.array(mesh.vertices, dtype=np.float64))
+        volume = trimesh.Trimesh(hull.vertices, hull.faces, process=False).volume
+        if not mesh.is_watertight or volume > HULL_NOTE * mesh.volume:
+            self.notes.append(f"link {link}: {file.name} is not convex; its convex hull is taken")
+        scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"link {link}: mesh scale")
+        return hull.vertices * scale
+
+    def resolve(self, filename: str) -> Path:
+        """The file of a package://, file:// or relative name; packages are looked for upwards of the URDF."""
+        start = self.path.resolve().parent
+        name = filename.removeprefix("file://")
+        package = filename.startswith("package://")
+        if package:
+            name = filename.removeprefix("package://")
+        tails = [Path(name), Path(*Path(name).parts[1:])] if package else [Path(name)]
+        for folder in (start, *start.parents) if package else (start,):
+            for tail in tails:
+                if (folder / tail).is_file():
+                    return folder / tail
+        raise InputError(f"{self.path}: mesh file {filename!r} is not there (looked from {start} upwards)")
