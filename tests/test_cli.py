@@ -47,8 +47,8 @@ def test_plan_writes_files_that_view_and_verify_read(
 ) -> None:
     problem = write(tmp_path)
     status = run(
-        "plan", problem, "--planner", "rrt_connect", "--time-limit", 5, "--seed", 1, "--out", "r.json", "--out",
-        "r.csv", "--out", "replay.html",
+        "plan", problem, "--planner", "rrt_connect", "--time-limit", 5, "--seed", 1,
+        "--out", "r.json", "--out", "r.csv", "--out", "replay.html",
     )  # fmt: skip
     printed = capsys.readouterr().out
     assert status == 0 and "solved" in printed and "rrt_connect" in printed
@@ -151,9 +151,9 @@ BAD_CALL = {
     "no time": (["plan", "problem.json", "--time-limit", "0"], "'0' is not a positive number"),
     "endless time": (["plan", "problem.json", "--time-limit", "inf"], "'inf' is not a positive number"),
     "negative seed": (["plan", "problem.json", "--seed", "-1"], "-1"),
-    "unknown ending": (["plan", "problem.json", "--out", "r.xml"], "unknown ending '.xml'; known: .json, .csv"),
+    "unknown ending": (["plan", "problem.json", "--out", "r.xml"], "unknown ending '.xml'; known: .json"),
     "missing folder": (["plan", "problem.json", "--out", "no/r.json"], "the folder no does not exist"),
-    "index out of range": (["plan", "problem.json", "--index", "1"], "index 1"),
+    "index out of range": (["plan", "problem.json", "--index", "1"], "index is 1"),
     "unknown option": (["plan", "problem.json", "--fast"], "--fast"),
     "not a result": (["view", "problem.json"], "is not a result file"),
     "unknown robot": (["robot", "info", "pandaa"], "pandaa"),

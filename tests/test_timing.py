@@ -186,7 +186,7 @@ def test_blend_reaches_the_deviation_and_is_twice_differentiable() -> None:
 
 def test_refusals() -> None:
     robot = arm((2.0, 0.0), (8.0, 8.0))
-    with pytest.raises(InputError, match="velocity limit of j1 is 0.0"):
+    with pytest.raises(InputError, match=r"velocity limit of j1 is 0\.0"):
         time_parameterize(robot, path(robot, [[0.0, 0.0], [1.0, 1.0]]), always)
     with pytest.raises(InputError, match=r"timing\.velocity_scale is 1.5"):
         TimingSettings(velocity_scale=1.5)

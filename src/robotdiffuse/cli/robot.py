@@ -62,7 +62,8 @@ def run_add(arguments: argparse.Namespace) -> int:
 
     from robotdiffuse.robots.add import add_robot
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("reading")
         report = add_robot(
             arguments.urdf,
