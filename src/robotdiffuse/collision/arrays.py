@@ -3,6 +3,7 @@
 The arrays of a scene have the same types whatever the scene holds, so that no obstacle causes a compilation.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,6 @@ from scipy.spatial import cKDTree
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere, pose
-from robotdiffuse.transforms import rotation_from_quaternion
 
 MESH_SPACING = 0.02
 """Triangles of mesh obstacles are divided until no edge is longer [m]; each piece becomes a covering point."""
@@ -20,7 +20,7 @@ THINNING = 0.5
 """Edge of the thinning voxels of a point cloud, as a multiple of its point radius."""
 MAX_POINTS = 400_000
 """Mesh obstacles are divided more coarsely rather than into more points than this."""
-GRID_BAND = 0.12
+GRID_BAND = 0.2
 """Distances to points are exact up to this [m]; farther ones count as this, a lower bound."""
 
 
@@ -70,6 +70,7 @@ def robot_groups(robot: Robot) -> tuple[str, ...]:
     return tuple(sorted(links, key=lambda link: robot.link_frame(link) > 0))
 
 
+@lru_cache(maxsize=16)
 def compile_robot(robot: Robot) -> RobotArrays:
     """The arrays of a robot with its joints locked as they are."""
     groups = robot_groups(robot)
@@ -95,6 +96,7 @@ def compile_robot(robot: Robot) -> RobotArrays:
     )
 
 
+@lru_cache(maxsize=16)
 def reach(robot: Robot) -> float:
     """An upper bound of the distance of any sphere's surface from the base's origin [m]."""
     lengths = np.linalg.norm(robot.frame_offsets[:, :3, 3], axis=1)

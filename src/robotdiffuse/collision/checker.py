@@ -34,7 +34,7 @@ class CollisionChecker:
         return lanes.free_many(self.robot_arrays, self.scene_arrays, _float32(q), self.padding)
 
     def link_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n links"]:
-        """Signed distance of each moving link to the scene [m], at most 1 m; near point clouds at most 0.12 m."""
+        """Signed distance of each moving link to the scene [m], at most 1 m; near point clouds at most 0.2 m less a sphere."""
         found = distance.link_clearances(self.robot_arrays, self.scene_arrays, _float32(q), distance.CAP)
         return found - self.padding
 

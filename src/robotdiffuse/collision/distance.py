@@ -154,7 +154,7 @@ def _points(scene, x, y, z, limit):
     return best, bx, by, bz
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@njit(inline="always", _nrt=False)
 def scene_distance(scene, x, y, z, limit):
     """Signed distance of a point to the nearest obstacle if below `limit` (else `limit`), and its gradient."""
     best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
@@ -181,7 +181,7 @@ def scene_distance(scene, x, y, z, limit):
     return best, bx, by, bz
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@njit(inline="always", _nrt=False)
 def link_clearance(robot, scene, g, frame, limit):
     """Least signed distance of the spheres of group g to the scene if below `limit`, else `limit`."""
     best = limit
@@ -220,7 +220,7 @@ def pair_clearance(robot, p, frames, limit):
     return best
 
 
-@njit(cache=True, nogil=True)
+@njit(fastmath=True, cache=True, nogil=True)
 def link_clearances(robot, scene, q, limit):
     """[n, moving groups] signed distances to the scene, at most `limit`."""
     first = np.searchsorted(robot.frame, 1)
@@ -245,7 +245,7 @@ def pair_clearances(robot, q, limit):
     return out
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@njit(inline="always", _nrt=False)
 def _pull(robot, frames, frame, x, y, z, fx, fy, fz, sign, grad):
     """Adds sign * J^T f of a point at x of a frame to grad."""
     for j in range(frame):

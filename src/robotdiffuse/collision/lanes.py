@@ -201,7 +201,7 @@ def point_touches(scene, x, y, z, radius):
     return _touches_points_near(scene, x, y, z, radius)
 
 
-GRID_BAND_F = 0.12
+GRID_BAND_F = 0.2
 
 
 @njit(cache=True, _nrt=False)
@@ -400,27 +400,3 @@ def free_many(robot, scene, q, padding):
         for i in range(min(W, n - start)):
             out[start + i] = hits[i] == 0
     return out
-
-
-@njit(cache=True, nogil=True, _nrt=False)
-def motion_free(robot, scene, a, b, resolution, padding, block, work):
-    """Whether the straight motion from a to b (both excluded from no check) is free at the resolution.
-
-    Checks at most `resolution` apart in joint space [rad]. Each block of 16 takes configurations spread over
-    the whole motion, so that a collision anywhere tends to show in the first block (VAMP's rake).
-    """
-    dof = len(a)
-    distance = _ZERO
-    for j in range(dof):
-        distance += (b[j] - a[j]) * (b[j] - a[j])
-    blocks = max(int(np.ceil(np.sqrt(distance) / resolution / W)), 1)
-    step = np.float32(1.0) / np.float32(blocks * W)
-    for k in range(blocks):
-        # block 0 holds the end b; the start a is the end of the motion before, or was checked by itself
-        for i in range(W):
-            t = np.float32(i * blocks + (blocks - k)) * step
-            for j in range(dof):
-                block[j, i] = a[j] + t * (b[j] - a[j])
-        if block_hits(robot, scene, block, padding, True, work):
-            return False
-    return True

@@ -1,0 +1,193 @@
+"""RRT-Connect with shortcutting: the fast classical planner, and the one that answers when learning fails."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError
+from robotdiffuse.planners import rrt_connect_kernel as kernel
+from robotdiffuse.planners.base import Call, usable_goals
+from robotdiffuse.problem import Problem
+from robotdiffuse.robots.reach import motion_radii
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.types import PlanResult
+
+ITERATIONS = 2_000
+"""Iterations between two looks at the clock."""
+RETREAT_STEP = 0.01
+"""Step of the way out of contact of the covering spheres [rad]."""
+RETREAT_STEPS = 100
+
+
+@dataclass(frozen=True)
+class RRTConnectSettings:
+    reach: float = 1.5
+    """Longest extension of a tree [rad, joint-space L2]."""
+    resolution: float = 0.04
+    """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
+    covers the rest, and a path that it refuses is searched again at half the distance."""
+    shortcuts: int = 60
+    """Attempts to shorten each path found."""
+    optimize_time: float = 0.0
+    """Time spent on restarts and more shortcuts after the first path [s]; the shortest path is kept."""
+    capacity: int = 20_000
+    """Most nodes of a tree; a full pair of trees is started anew."""
+
+    def __post_init__(self) -> None:
+        for name in ("reach", "resolution", "capacity"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must be positive")
+        for name in ("shortcuts", "optimize_time"):
+            if getattr(self, name) < 0:
+                raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must not be negative")
+
+
+def search_space(checker: CollisionChecker, resolution: float, padding: float = 0.0) -> kernel.Space:
+    """What the compiled search needs; `resolution` and `padding` [m] as in its docstring."""
+    robot = checker.robot
+    return kernel.Space(
+        checker.robot_arrays,
+        checker.scene_arrays,
+        robot.lower.astype(np.float32),
+        robot.upper.astype(np.float32),
+        levers(robot),
+        np.float32(resolution),
+        checker.padding + np.float32(padding),
+    )
+
+
+def levers(robot: Robot) -> Float[ndarray, "dof"]:
+    """Largest distance of any point of the arm from each joint's axis [m]."""
+    return motion_radii(robot).max(axis=0, initial=0.0).astype(np.float32)
+
+
+def random_state(seed: int, attempt: int = 0) -> ndarray:
+    """State of the compiled random numbers, well mixed."""
+    return np.random.SeedSequence([seed, attempt]).generate_state(1, np.uint64) | np.uint64(1)
+
+
+def retreat(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> Float[ndarray, "dof"] | None:
+    """A configuration nearby that the covering spheres call free, down the gradient of the collision cost.
+
+    For a start or goal that the exact meshes call free while the spheres, which stick out, do not. None if no
+    free configuration was found within 1 rad. The judge decides on the motion there.
+    """
+    robot, at = checker.robot, q.copy()
+    for _ in range(RETREAT_STEPS):
+        if checker.free(at[None])[0]:
+            return at
+        gradient = checker.cost_gradients(at[None], margin=0.005)[1][0].astype(np.float64)
+        norm = np.linalg.norm(gradient)
+        if norm < 1e-9:
+            return None
+        at = np.clip(at - RETREAT_STEP * gradient / norm, robot.lower, robot.upper)
+    return None
+
+
+class Ends:
+    """Start and goals that the spheres call free, each with the contact-near configuration that it stands for."""
+
+    def __init__(self, checker: CollisionChecker, start: ndarray, goals: ndarray) -> None:
+        self.start, self.start_lead = start, retreat(checker, start)
+        leads = [(retreat(checker, goal), goal) for goal in goals]
+        self.goals = [goal for lead, goal in leads if lead is not None]
+        self.goal_leads = [lead for lead, _ in leads if lead is not None]
+
+    @property
+    def reachable(self) -> bool:
+        """Whether a search can begin and end."""
+        return self.start_lead is not None and bool(self.goals)
+
+    def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+        """The path with its exact ends in float64 in place of, or before and after, those of the search."""
+        assert self.start_lead is not None
+        path = path.astype(np.float64)
+        errors = [np.abs(path[-1] - lead).max() for lead in self.goal_leads]
+        i = int(np.argmin(errors))
+        rows = [self.start[None], path[1:-1], self.goals[i][None]]
+        if self.goal_leads[i] is not self.goals[i] and not np.array_equal(self.goal_leads[i], self.goals[i]):
+            rows.insert(2, self.goal_leads[i][None])
+        if not np.array_equal(self.start_lead, self.start):
+            rows.insert(1, self.start_lead[None])
+        return np.concatenate(rows)
+
+
+class RRTConnect:
+    """Two trees grown towards each other (Kuffner and LaValle, 2000), then shortcuts."""
+
+    name = "rrt_connect"
+
+    def __init__(self, settings: RRTConnectSettings | None = None) -> None:
+        self.settings = settings or RRTConnectSettings()
+
+    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+        """See `planners.base.Planner`."""
+        call = Call(self.name, problem, time_limit, seed)
+        checker = CollisionChecker(problem.robot, problem.scene)
+        goals = usable_goals(call, checker, np.random.default_rng(seed))
+        if isinstance(goals, PlanResult):
+            return goals
+        return self.search(call, checker, goals)
+
+    def search(self, call: Call, checker: CollisionChecker, goals: Float[ndarray, "k dof"]) -> PlanResult:
+        """Search until a path passes the judge or time runs out; for planners that have begun a call."""
+        settings = self.settings
+        ends = Ends(checker, call.problem.start, goals)
+        if not ends.reachable:
+            return call.timeout("the start or every goal touches an obstacle too closely to search from")
+        attempt = 0
+        while attempt == 0 or call.remaining > 0:
+            path = self._shortest(call, checker, ends, settings, attempt)
+            if path is None:
+                break
+            result = call.finish(ends.complete(path), self.name)
+            if result is not None:
+                return result
+            # the judge found contact between two checks: look twice as closely
+            settings = replace(settings, resolution=max(settings.resolution / 2, 0.002))
+            attempt += 1
+        return call.timeout()
+
+    def _shortest(
+        self, call: Call, checker: CollisionChecker, ends: Ends, settings: RRTConnectSettings, attempt: int
+    ) -> Float[ndarray, "n dof"] | None:
+        space = search_space(checker, settings.resolution)
+        state = random_state(call.seed, attempt)
+        assert ends.start_lead is not None
+        start = ends.start_lead.astype(np.float32)
+        goals = np.array(ends.goal_leads, np.float32)
+        best = self._first(call, space, start, goals, settings, state, call.time_limit)
+        if best is None:
+            return None
+        until = min(call.elapsed + settings.optimize_time, call.time_limit)
+        while call.elapsed < until:
+            other = self._first(call, space, start, goals, settings, state, until)
+            if other is not None:
+                if kernel.path_length(other) < kernel.path_length(best):
+                    best, other = other, best
+                best = kernel.shortcut(space, best, settings.shortcuts, state)
+        return best
+
+    def _first(
+        self,
+        call: Call,
+        space: kernel.Space,
+        start: ndarray,
+        goals: ndarray,
+        settings: RRTConnectSettings,
+        state: ndarray,
+        until: float,
+    ) -> Float[ndarray, "n dof"] | None:
+        reach = np.float32(settings.reach)
+        capacity = settings.capacity + len(goals)
+        while True:
+            trees = kernel.make_trees(start, goals, capacity)
+            while trees.sizes.max() < capacity:
+                path = kernel.search(space, trees, reach, ITERATIONS, state)
+                if len(path):
+                    return kernel.shortcut(space, path, settings.shortcuts, state)
+                if call.elapsed > until:
+                    return None
