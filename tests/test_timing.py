@@ -1,6 +1,5 @@
 """Timing: limits, rest at both ends, geometry that stays on verified ground."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -33,8 +32,12 @@ def path(robot: Robot, positions: object) -> Path:
     return Path(robot.joint_names, np.asarray(positions, dtype=np.float64))
 
 
-def always(_: Path) -> bool:
+def always(_: object) -> bool:
     return True
+
+
+def never(_: object) -> bool:
+    return False
 
 
 def distance_to_polyline(points: np.ndarray, waypoints: np.ndarray) -> np.ndarray:
@@ -89,14 +92,14 @@ def test_limits_rest_and_geometry(
     robot = arm()
     p = path(robot, q)
     valid = (lambda _: rng.random() < 0.5) if seed % 2 else always
-    check(robot, p, time_parameterize(robot, p, valid, settings), settings)
+    check(robot, p, time_parameterize(robot, p, valid, valid, settings), settings)
 
 
 @given(seed=st.integers(0, 2**32 - 1))
 def test_velocities_and_accelerations_are_the_derivatives(seed: int) -> None:
     robot = arm()
     p = path(robot, np.cumsum(np.random.default_rng(seed).normal(0, 0.5, (6, 7)), axis=0))
-    t = time_parameterize(robot, p, always, TimingSettings(sample_time=0.001))
+    t = time_parameterize(robot, p, always, always, TimingSettings(sample_time=0.001))
     dt = np.diff(t.times)[:-1]
     middle = 0.5 * (t.velocities[:-2] + t.velocities[1:-1])
     assert np.abs(np.diff(t.positions[:-1], axis=0) / dt[:, None] - middle).max() < 0.01
@@ -109,7 +112,7 @@ def test_one_joint_against_the_closed_form() -> None:
     """Bang-bang: 2 sqrt(d / a) below the velocity limit, d / v + v / a above it."""
     robot = arm((2.0,), (8.0,))
     for d, expected in ((0.125, 2 * np.sqrt(0.125 / 8)), (3.0, 3.0 / 2 + 2.0 / 8)):
-        t = time_parameterize(robot, path(robot, [[0.0], [d]]), always)
+        t = time_parameterize(robot, path(robot, [[0.0], [d]]), always, always)
         assert t.duration == pytest.approx(expected, rel=0.01)
 
 
@@ -117,7 +120,7 @@ def test_halved_scales_are_slower_by_their_factor() -> None:
     robot = arm((2.0,), (8.0,))
     p = path(robot, [[0.0], [0.1]])
     fast, slow = (
-        time_parameterize(robot, p, always, TimingSettings(acceleration_scale=a)).duration
+        time_parameterize(robot, p, always, always, TimingSettings(acceleration_scale=a)).duration
         for a in (1.0, 0.25)
     )
     assert slow == pytest.approx(2 * fast, rel=1e-3)
@@ -126,7 +129,7 @@ def test_halved_scales_are_slower_by_their_factor() -> None:
 def test_path_of_length_zero_is_two_rows_at_rest() -> None:
     robot = arm()
     for rows in (1, 2, 5):
-        t = time_parameterize(robot, path(robot, np.full((rows, 7), 0.3)), always)
+        t = time_parameterize(robot, path(robot, np.full((rows, 7), 0.3)), always, always)
         assert t.times.tolist() == [0.0, 0.01]
         assert (t.positions == 0.3).all() and not t.velocities.any() and not t.accelerations.any()
 
@@ -141,8 +144,8 @@ def corner(robot: Robot) -> Path:
 def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:
     robot = arm()
     p = corner(robot)
-    rounded = time_parameterize(robot, p, always)
-    stopped = time_parameterize(robot, p, lambda _: False)
+    rounded = time_parameterize(robot, p, always, always)
+    stopped = time_parameterize(robot, p, never, never)
     assert rounded.duration < 0.9 * stopped.duration
     nearest = np.linalg.norm(stopped.positions - p.positions[1], axis=1).argmin()
     assert np.array_equal(stopped.positions[nearest], p.positions[1])
@@ -162,12 +165,12 @@ def test_only_the_corner_that_fails_is_tightened() -> None:
     def cuts(positions: np.ndarray, k: int) -> float:
         return float(np.linalg.norm(positions - q[k], axis=1).min())
 
-    def valid(piece: Path) -> bool:
+    def valid(piece: Path | Trajectory) -> bool:
         near = np.linalg.norm(piece.positions - q[1], axis=1) < 0.4
         return not near.any() or distance_to_polyline(piece.positions[near], q).max() < 0.03
 
-    t = time_parameterize(robot, p, valid)
-    assert valid(replace(p, positions=t.positions))
+    t = time_parameterize(robot, p, valid, valid)
+    assert valid(t)
     assert cuts(t.positions, 1) < 0.03
     assert cuts(t.positions, 2) > 0.09
 
@@ -187,7 +190,7 @@ def test_blend_reaches_the_deviation_and_is_twice_differentiable() -> None:
 def test_refusals() -> None:
     robot = arm((2.0, 0.0), (8.0, 8.0))
     with pytest.raises(InputError, match=r"velocity limit of j1 is 0\.0"):
-        time_parameterize(robot, path(robot, [[0.0, 0.0], [1.0, 1.0]]), always)
+        time_parameterize(robot, path(robot, [[0.0, 0.0], [1.0, 1.0]]), always, always)
     with pytest.raises(InputError, match=r"timing\.velocity_scale is 1.5"):
         TimingSettings(velocity_scale=1.5)
     with pytest.raises(InputError, match=r"timing\.acceleration_scale is 0.0"):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
@@ -13,10 +13,8 @@ from robotdiffuse.paths.blending import BlendedPolyline, half_widths
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, Trajectory
 
-SHRINK = 0.25
-"""Factor on the deviation of a corner whose rounding was not valid."""
-ROUNDS = 3
-"""How often a corner shrinks before the motion stops at it instead."""
+SHRINKS = (0.25, 0.25, 0.0)
+"""Factors on the deviation of a corner each time that its rounding is refused; 0: the motion stops there."""
 SAME = 1e-6
 """Waypoints nearer to each other than this are one [rad]."""
 
@@ -50,14 +48,18 @@ DEFAULT = TimingSettings()
 
 
 def time_parameterize(
-    robot: Robot, path: Path, valid: Callable[[Path], bool], settings: TimingSettings = DEFAULT
+    robot: Robot,
+    path: Path,
+    valid: Callable[[Trajectory], bool],
+    free: Callable[[Path], bool],
+    settings: TimingSettings = DEFAULT,
 ) -> Trajectory:
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
 
-    Corners of the path are rounded so that the motion need not stop there. The rounded geometry is put to
-    `valid`; where it fails, the corner is rounded less, and in the end the motion stops at it. With all
-    corners stopped at, the rows lie on the path itself, so that a valid path always has a trajectory.
-    `valid` gets whole trajectories and pieces of them, joined by straight lines from row to row.
+    Corners of the path are rounded so that the motion need not stop there. `valid` judges the whole motion.
+    Where it refuses, `free` is asked about the corners, one by one, and those that fail are rounded less; in
+    the end the motion stops at them. With stops at all corners the rows lie on the path itself, so that a
+    path that is free always has a trajectory; that one is returned without asking.
 
     Times start at 0 and strictly increase; the first and last rows are the first and last waypoint exactly.
     A path of length zero becomes two equal rows at rest.
@@ -69,11 +71,15 @@ def time_parameterize(
     if len(waypoints) == 1:
         return _at_rest(path, settings)
     deviations = np.full(len(waypoints) - 2, settings.corner_deviation)
-    for _ in range(ROUNDS):
+    for shrink in SHRINKS:
         trajectory = _timed(robot, path, waypoints, deviations, settings)
-        if not deviations.any() or valid(replace(path, positions=trajectory.positions)):
+        if not deviations.any() or valid(trajectory):
             return trajectory
-        deviations = _shrunk(path, waypoints, deviations, valid)
+        bad = _bad_corners(path, waypoints, deviations, free)
+        deviations = np.where(bad, shrink * deviations, deviations)
+    trajectory = _timed(robot, path, waypoints, deviations, settings)
+    if not deviations.any() or valid(trajectory):
+        return trajectory
     return _timed(robot, path, waypoints, np.zeros(len(waypoints) - 2), settings)
 
 
@@ -101,24 +107,24 @@ def _at_rest(path: Path, settings: TimingSettings) -> Trajectory:
     return Trajectory(path.joint_names, np.array([0.0, settings.sample_time]), positions, still, still)
 
 
-def _shrunk(
+def _bad_corners(
     path: Path,
     waypoints: Float[ndarray, "n dof"],
     deviations: Float[ndarray, "corners"],
-    valid: Callable[[Path], bool],
-) -> Float[ndarray, "corners"]:
-    """Smaller deviations for the corners that are not valid on their own; for all, if each of them is."""
+    free: Callable[[Path], bool],
+) -> Bool[ndarray, "corners"]:
+    """The corners that are not free on their own; all of them, if each is."""
     widths = half_widths(waypoints, deviations)
     line = BlendedPolyline(waypoints, widths)
     u = np.linspace(-1, 1, 17)
     bad = np.array(
         [
-            d > 0 and not valid(replace(path, positions=line(line.knots[i + 1] + d * u, 0)))
+            d > 0 and not free(replace(path, positions=line(line.knots[i + 1] + d * u, 0)))
             for i, d in enumerate(widths)
         ],
         dtype=bool,
     )
-    return np.where(bad, SHRINK * deviations, deviations) if bad.any() else SHRINK * deviations
+    return bad if bad.any() else np.ones(len(bad), dtype=bool)
 
 
 def _timed(

@@ -13,8 +13,8 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
-from robotdiffuse.types import Path, PlanResult, Status
-from robotdiffuse.verify import VerifySettings, verifier, verify_trajectory
+from robotdiffuse.types import Path, PlanResult, Status, Trajectory
+from robotdiffuse.verify import Report, Verifier, VerifySettings, verifier
 
 GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""
@@ -83,8 +83,9 @@ class Call:
         if not report.valid or report.min_clearance is None:
             return None
         planning_time = self.elapsed
-        trajectory = time_parameterize(problem.robot, path, judge.collision_free)
-        timed = verify_trajectory(problem, trajectory)
+        motion = _TimedMotion(judge)
+        trajectory = time_parameterize(problem.robot, path, motion.valid, judge.collision_free)
+        timed = motion.report(trajectory)
         if not timed.valid or timed.min_clearance is None:
             return None
         return PlanResult(
@@ -100,6 +101,22 @@ class Call:
             min_clearance=min(report.min_clearance, timed.min_clearance),
             notes=problem.notes,
         )
+
+
+class _TimedMotion:
+    """Judges trajectories and remembers the last verdict: the one that is kept was mostly just judged."""
+
+    def __init__(self, judge: Verifier) -> None:
+        self.judge = judge
+        self.last: tuple[Trajectory, Report] | None = None
+
+    def report(self, trajectory: Trajectory) -> Report:
+        if self.last is None or self.last[0] is not trajectory:
+            self.last = trajectory, self.judge.trajectory(trajectory)
+        return self.last[1]
+
+    def valid(self, trajectory: Trajectory) -> bool:
+        return self.report(trajectory).valid
 
 
 def usable_goals(
