@@ -95,6 +95,13 @@ def test_degenerate_point_clouds(points: np.ndarray) -> None:
     assert exact.link_distances(Q0)[0].distance == pytest.approx(right, abs=1e-6)
 
 
+def test_a_link_deep_in_a_point_cloud() -> None:
+    """Depth at the deepest point: the middle of the box, less far from the side than from the top."""
+    points = np.stack([np.full(21, 0.25), np.linspace(-0.02, 0.02, 21), np.zeros(21)], axis=1)
+    exact = ExactCollision(box_arm(), Scene([PointCloud(points, 0.01)]))
+    assert exact.link_distances(Q0)[0].distance == pytest.approx(-HALF_WIDTH - 0.01, abs=1e-5)
+
+
 def test_an_empty_point_cloud_is_an_empty_scene() -> None:
     exact = ExactCollision(box_arm(), Scene([PointCloud(np.zeros((0, 3)))]))
     assert exact.link_distances(Q0)[0] == ("l1", None, np.inf)

@@ -17,7 +17,14 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
 from robotdiffuse.transforms import rotation_about, transform
 from robotdiffuse.types import Path, Trajectory
-from robotdiffuse.verify import Report, VerifySettings, Violation, verify, verify_trajectory
+from robotdiffuse.verify import (
+    Report,
+    VerifySettings,
+    Violation,
+    verifier,
+    verify,
+    verify_trajectory,
+)
 
 Z = np.array([0.0, 0.0, 1.0])
 
@@ -315,6 +322,14 @@ def test_trajectories_that_jump_or_run_backwards() -> None:
     object.__setattr__(good, "velocities", good.velocities[1:])
     with pytest.raises(InputError, match=r"trajectory\.velocities has 100 rows; positions has 101"):
         verify_trajectory(problem, good)
+
+
+def test_collision_alone_can_be_asked_for() -> None:
+    """Neither limits nor the ends matter then."""
+    problem, path = problem_and_path(np.array([[-0.6, 0, 0], [0.6, 0, 0], [0.6, 2.9, 0]]))
+    assert verifier(problem, VerifySettings()).collision_free(path)
+    blocked = replace(problem, scene=Scene([Sphere(vector(1.2, 0, 0), 0.05)]))
+    assert not verifier(blocked, VerifySettings()).collision_free(path)
 
 
 def test_settings_are_checked() -> None:

@@ -26,6 +26,8 @@ CHUNK = 8192
 """Configurations that `collides` treats at once; bounds its memory."""
 BEYOND = 1e-6
 """A positive distance [m]: `collides` need not know any that is larger."""
+MOST_CONTACTS = 200
+"""Triangles or points of one obstacle that the depth of a link is looked for at; 1,000 take 5 ms."""
 
 
 class Check(NamedTuple):
@@ -167,6 +169,12 @@ def _obstacle(shape: Shape) -> _Obstacle | None:
     return _Obstacle(shape.name, geometry, _transform3(T), False, 0.0, T, half, rounding)
 
 
+@lru_cache(maxsize=16)
+def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
+    """Kept for a few scenes: the tree over 100,000 points takes half a second."""
+    return tuple(o for o in map(_obstacle, scene.shapes) if o is not None)
+
+
 @dataclass(frozen=True)
 class _Candidates:
     """What a check consists of: pairs of a piece with an obstacle, or of two pieces."""
@@ -193,7 +201,7 @@ class ExactCollision:
     def __init__(self, robot: Robot, scene: Scene) -> None:
         self.robot = robot
         self._pieces = _pieces(robot)
-        self._obstacles = [o for o in map(_obstacle, scene.shapes) if o is not None]
+        self._obstacles = _obstacles(scene)
         links = list(self._pieces)
         self.links = tuple(link for link in links if robot.link_frame(link) > 0)
         self.pairs = tuple(
@@ -206,9 +214,9 @@ class ExactCollision:
         self.checks = (*(Check(link, None) for link in self.links), *(Check(a, b) for a, b in self.pairs))
         self._request = coal.DistanceRequest()
         self._request.enable_signed_distance = True
-        self._contacts = coal.CollisionRequest()
-        self._contacts.enable_contact = True
-        self._contacts.num_max_contacts = 1000
+        self._first_contact, self._contacts = coal.CollisionRequest(), coal.CollisionRequest()
+        self._first_contact.enable_contact = self._contacts.enable_contact = True
+        self._contacts.num_max_contacts = MOST_CONTACTS
         self._collide = coal.CollisionRequest()
 
     @cached_property
@@ -258,14 +266,19 @@ class ExactCollision:
             gap = np.linalg.norm(np.maximum(outside, 0), axis=-1) + np.minimum(outside.max(axis=-1), 0)
             return (gap - rounding - radii[:, None]).reshape(len(frames), len(firsts) * len(middle))
 
-        return _Candidates(firsts, tuple(self._obstacles), lower_scene)
+        return _Candidates(firsts, self._obstacles, lower_scene)
 
     def _place(self, piece: _Piece, frames: ndarray) -> coal.Transform3s:
         T = frames[piece.frame]
         return _transform3(T if piece.T_frame_piece is None else T @ piece.T_frame_piece)
 
-    def _signed(self, piece: _Piece, other: _Piece | _Obstacle, frames: ndarray, cutoff: float) -> float:
-        """Signed distance of two geometries; for a surface, any value of at least `cutoff` if beyond it."""
+    def _signed(
+        self, piece: _Piece, other: _Piece | _Obstacle, frames: ndarray, cutoff: float, depth: bool
+    ) -> float:
+        """Signed distance of two geometries; for a surface, any value of at least `cutoff` if beyond it.
+
+        Without `depth`, one of a surface may be understated below zero, but its sign is right.
+        """
         T_piece = self._place(piece, frames)
         result = coal.DistanceResult()
         if isinstance(other, _Piece):
@@ -273,15 +286,15 @@ class ExactCollision:
             return coal.distance(piece.geometry, T_piece, other.geometry, T_other, self._request, result)
         if not other.surface:
             return coal.distance(piece.geometry, T_piece, other.geometry, other.T, self._request, result)
+        # The distance to a pierced surface is slow and stops at any one triangle, so contacts come first.
+        request, hits = self._contacts if depth else self._first_contact, coal.CollisionResult()
+        coal.collide(piece.geometry, T_piece, other.geometry, other.T, request, hits)
+        if hits.isCollision():
+            depths = [hits.getContact(i).penetration_depth for i in range(hits.numContacts())]
+            return min([0.0, *depths]) - other.inflation
         if np.isfinite(cutoff):
             result.min_distance = cutoff + other.inflation
         distance = coal.distance(piece.geometry, T_piece, other.geometry, other.T, self._request, result)
-        if distance <= 0:
-            # The distance to a surface stops at the first triangle that touches; the contacts hold the depth.
-            hits = coal.CollisionResult()
-            coal.collide(piece.geometry, T_piece, other.geometry, other.T, self._contacts, hits)
-            depths = [hits.getContact(i).penetration_depth for i in range(hits.numContacts())]
-            distance = min([distance, *depths])
         return distance - other.inflation
 
     def nearest(
@@ -294,8 +307,8 @@ class ExactCollision:
         """Signed distance of one check (an index into `checks`) at each configuration, up to its cutoff.
 
         Distances beyond the cutoff come back as the cutoff. Rows are treated in order, and none after the
-        first that is at most `stop`: those are NaN. Also returns the name of the nearest obstacle or link,
-        None beyond the cutoff.
+        first that is at most `stop`: those are NaN, and the depth of that one may be understated. Returns too
+        the name of the nearest obstacle or link, None beyond the cutoff.
         """
         frames = forward_frames(self.robot, q)
         bounds: list[ndarray] = [np.empty(0)] * len(q)
@@ -309,10 +322,10 @@ class ExactCollision:
             lower, candidates = bounds[i], self._candidates[check]
             near = np.flatnonzero(lower < best)
             for candidate in near[np.argsort(lower[near])].tolist():
-                if lower[candidate] >= best:
+                if lower[candidate] >= best or best <= stop:
                     break
                 piece, other = candidates.pair(candidate)
-                distance = self._signed(piece, other, frames[i], best)
+                distance = self._signed(piece, other, frames[i], best, depth=stop == -np.inf)
                 if distance < best:
                     best = distance
                     names[i] = other.name if isinstance(other, _Obstacle) else self.checks[check].other
@@ -355,7 +368,7 @@ class ExactCollision:
                     continue
                 piece, other = candidates.pair(column)
                 if isinstance(other, _Obstacle) and other.inflation > 0:
-                    hit[row] = self._signed(piece, other, frames[row], BEYOND) <= 0
+                    hit[row] = self._signed(piece, other, frames[row], BEYOND, depth=False) <= 0
                     continue
                 T_other = self._place(other, frames[row]) if isinstance(other, _Piece) else other.T
                 T_piece = self._place(piece, frames[row])
