@@ -10,9 +10,9 @@ from numba import njit
 REVOLUTE, PRISMATIC, CONTINUOUS = 0, 1, 2
 TURN = 2 * np.pi
 
-FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-2, 1e-9, 1e3
-RELAX, TIGHTEN = 0.1, 4.0
-CHECK_EVERY = 6
+FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 1.0, 1e-9, 1e3
+RELAX, TIGHTEN = 0.3, 4.0
+CHECK_EVERY = 8
 """Iterations between two looks at the progress; a seed that has not halved its error by then is given up."""
 PROGRESS = 0.5
 
