@@ -1,0 +1,143 @@
+"""Settings of the two training runs, and settings as JSON."""
+
+import dataclasses
+import typing
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.diffusion import ScheduleSettings
+from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
+
+Settings = TypeVar("Settings")
+
+
+def settings_to_json(settings: object) -> dict[str, Any]:
+    """A settings dataclass as plain JSON values."""
+    return dataclasses.asdict(typing.cast(Any, settings))
+
+
+def settings_from_json(kind: type[Settings], values: object, where: str) -> Settings:
+    """The settings dataclass of this kind.
+
+    Fields may be numbers, text, tuples of them, or settings again. Raises InputError for a field that is
+    unknown, missing or of the wrong type; `where` names the origin in the message.
+    """
+    if not isinstance(values, dict):
+        raise InputError(f"{where} is {values!r}; it must be a table of settings")
+    fields = {f.name: f for f in dataclasses.fields(typing.cast(Any, kind))}
+    hints = typing.get_type_hints(kind)
+    for name in values:
+        if name not in fields:
+            raise InputError(f"{where}.{name} is not a setting; known: {', '.join(fields)}")
+    found: dict[str, Any] = {}
+    for name, entry in fields.items():
+        hint = hints[name]
+        if name not in values:
+            if entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING:
+                raise InputError(f"{where}.{name} is missing")
+        elif dataclasses.is_dataclass(hint):
+            found[name] = settings_from_json(typing.cast(type, hint), values[name], f"{where}.{name}")
+        else:
+            found[name] = _value(hint, values[name], f"{where}.{name}")
+    return kind(**found)
+
+
+def _value(hint: Any, value: object, where: str) -> Any:
+    if typing.get_origin(hint) is tuple:
+        if not isinstance(value, list | tuple):
+            raise InputError(f"{where} is {value!r}; it must be a list")
+        return tuple(_value(typing.get_args(hint)[0], entry, where) for entry in value)
+    options = typing.get_args(hint) or (hint,)
+    if float in options and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if not any(type(value) is option for option in options):
+        wanted = " or ".join(getattr(option, "__name__", str(option)) for option in options)
+        raise InputError(f"{where} is {value!r}; it must be of type {wanted}")
+    return value
+
+
+def _length(samples: int | None, minutes: float | None) -> None:
+    if (samples is None) == (minutes is None):
+        raise InputError(f"samples is {samples} and minutes is {minutes}; give exactly one of them")
+    if (samples or minutes or 0) <= 0:
+        raise InputError(f"samples is {samples} and minutes is {minutes}; the one given must be positive")
+
+
+@dataclass(frozen=True)
+class EncoderTraining:
+    """Training of the point cloud auto-encoder alone; it is frozen afterwards (paper, eq. l_AE)."""
+
+    minutes: float | None = 5.0
+    """Length of the run in wall time [min]; the learning rate reaches 0 at its end. None: by `samples`."""
+    samples: int | None = None
+    """Length of the run in clouds. Runs of a given length are reproducible, timed ones are not."""
+    seed: int = 0
+    batch: int = 32
+    """Clouds per step."""
+    learning_rate: float = 2e-3
+    """Peak, for AdamW."""
+    warmup_steps: int = 200
+    max_obstacles: int = 12
+    """Most obstacles in a training scene."""
+    points: int = 256
+    """Most points of a training cloud; each step takes between an eighth and all of them."""
+    distance_weight: float = 4.0
+    """Weight of the error of the reconstructed distance field beside the Chamfer distance, both in metres."""
+    regularization: float = 1e-7
+    """The paper's lambda: weight of the sum of squared weights."""
+    threads: int = 1
+    """Threads of PyTorch: one thread beside other work is several times faster than two."""
+    checkpoint_seconds: float = 60.0
+    encoder: PointAutoencoderSettings = field(default_factory=PointAutoencoderSettings)
+
+    def __post_init__(self) -> None:
+        _length(self.samples, self.minutes)
+
+
+@dataclass(frozen=True)
+class PlannerTraining:
+    """Training of the motion predictor on planned trajectories, with a frozen encoder."""
+
+    data: str
+    """Folder with shards (.npz) of `robotdiffuse data generate`."""
+    encoder: str
+    """Folder with a trained encoder."""
+    robot: str = "panda"
+    """Bundled name, or path to a URDF: the robot that the data are for."""
+    minutes: float | None = 70.0
+    """Length of the run in wall time [min]; the learning rate reaches 0 at its end. None: by `samples`."""
+    samples: int | None = None
+    """Length of the run in training samples. Runs of a given length are reproducible, timed ones are not."""
+    seed: int = 0
+    batch: int = 128
+    """Samples per step (paper: 64)."""
+    learning_rate: float = 6e-4
+    """Peak, for AdamW (paper: 3e-4)."""
+    warmup_steps: int = 500
+    weight_decay: float = 0.01
+    gradient_norm: float = 1.0
+    """Gradients are scaled down to this norm."""
+    average: float = 0.9995
+    """Decay of the moving average of the weights; the average is what is kept."""
+    weight_limit: float = 5.0
+    """Most that a noise level weighs in the loss, see NoiseSchedule.weight."""
+    point_weight: float = 0.0
+    """The paper's lambda_point: weight of the squared distance of the link origins, in units of 0.1 m."""
+    trivial_share: float = 0.1
+    """Share of the batch whose straight line is free. They teach to leave the line alone."""
+    smooth_noise: bool = True
+    """Noise with the covariance of the trajectories over the frames; otherwise white (the paper's)."""
+    bad_steps: int = 10
+    """So many steps in a row with a loss that is not finite take training back to the last checkpoint."""
+    threads: int = 1
+    """Threads of PyTorch: one thread beside other work is several times faster than two."""
+    checkpoint_seconds: float = 120.0
+    denoiser: TransformerSettings = field(default_factory=TransformerSettings)
+    schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+
+    def __post_init__(self) -> None:
+        _length(self.samples, self.minutes)
+        if not 0.0 <= self.trivial_share <= 1.0:
+            raise InputError(f"trivial_share is {self.trivial_share}; it must be between 0 and 1")

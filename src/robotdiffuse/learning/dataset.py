@@ -1,0 +1,254 @@
+"""Training data: shards of planned trajectories, and random scenes as packed arrays."""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path as FilePath
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int8
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import fingerprint, write_atomically
+from robotdiffuse.learning.encoders import PointAutoencoder
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.sampling import BOX, SPHERE, sample_surfaces_batch
+
+CODE_POINTS = 512
+"""Points of the cloud that each scene of the data is encoded from."""
+
+
+def random_scenes(
+    count: int, max_obstacles: int, rng: np.random.Generator
+) -> tuple[Int8[ndarray, "n k"], Float32[ndarray, "n k 10"]]:
+    """Packed scenes for the encoder, a third each: two large obstacles as in ROP, several of the sizes of
+    dense ROP, and any number of boxes and spheres of any size and orientation."""
+    family = rng.integers(0, 3, count)
+    number = np.where(family == 0, 2, rng.integers(0, max_obstacles + 1, count))
+    shape = (count, max_obstacles)
+    kinds = np.where(rng.random(shape) < 0.5, SPHERE, BOX).astype(np.int8)
+    kinds[np.arange(max_obstacles) >= number[:, None]] = 0
+    center = rng.uniform([-1.0, -1.0, 0.1], [1.0, 1.0, 1.0], (*shape, 3))
+    center[family == 2] *= rng.uniform([0.5, 0.5, 0.3], [1.0, 1.0, 1.2], (int((family == 2).sum()), 1, 3))
+    free = (family == 2)[:, None, None]
+    radius = np.where(family == 0, rng.uniform(0.18, 0.27, count), rng.uniform(0.06, 0.2, count))
+    radius = np.where(free[..., 0], rng.uniform(0.04, 0.3, shape), radius[:, None])
+    edge = np.where(family == 0, 0.2, rng.uniform(0.08, 0.3, count))[:, None, None]
+    size = np.where(free, np.exp(rng.uniform(np.log(0.03), np.log(0.9), (*shape, 3))), edge)
+    turned = free & (rng.random((*shape, 1)) < 0.5)
+    wxyz = np.where(turned, rng.standard_normal((*shape, 4)), np.array([1.0, 0.0, 0.0, 0.0]))
+    wxyz /= np.linalg.norm(wxyz, axis=-1, keepdims=True)
+    size = np.where((kinds == SPHERE)[..., None], radius[..., None], size)
+    params = np.concatenate([center, size, wxyz], -1).astype(np.float32)
+    params[kinds == 0] = 0.0
+    return kinds, params
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryData:
+    """Planned trajectories with their scenes, in memory."""
+
+    q: Float[ndarray, "n frames dof"]
+    """[rad], float32, evenly spaced along the path."""
+    kinds: Int8[ndarray, "n k"]
+    params: Float32[ndarray, "n k 10"]
+    trivial: Bool[ndarray, "n"]
+    """The straight line from start to goal is free too."""
+    codes: Float[ndarray, "n code"]
+    """z of each scene, float16."""
+    digest: str
+    """SHA-256 of the shards, the first 16 digits."""
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def split(self, held_out: int) -> "tuple[TrajectoryData, TrajectoryData]":
+        """All but the last rows, and the last rows."""
+        cut = len(self) - held_out
+        return self._rows(slice(None, cut)), self._rows(slice(cut, None))
+
+    def _rows(self, rows: slice) -> "TrajectoryData":
+        arrays = (self.q, self.kinds, self.params, self.trivial, self.codes)
+        return TrajectoryData(*(array[rows] for array in arrays), self.digest)
+
+
+def load_data(
+    folder: str, robot: Robot, encoder: PointAutoencoder, frames: int, report: Callable[[str], None]
+) -> TrajectoryData:
+    """All shards (*.npz) of a folder, with the codes of their scenes.
+
+    Codes are kept beside the shards, in files named by shard and encoder; where the folder cannot be written
+    they are made each time. `report` is told what is being done. Raises InputError, naming the file, if there
+    is no shard, or one is damaged or for another robot.
+    """
+    files = sorted(FilePath(folder).glob("*.npz"))
+    if not files:
+        raise InputError(
+            f"data folder {folder} holds no shard (*.npz); make some with: robotdiffuse data generate"
+        )
+    parts: list[tuple[ndarray, ...]] = []
+    digest = hashlib.sha256()
+    encoder_print = fingerprint(encoder)
+    widest = 0
+    for i, file in enumerate(files):
+        arrays, shard_print = _read_shard(file, robot.dof, frames)
+        digest.update(shard_print.encode())
+        codes = _cached_codes(file, arrays, encoder, f"{shard_print}-{encoder_print}")
+        parts.append((*arrays, codes))
+        widest = max(widest, arrays[1].shape[1])
+        report(f"data: {i + 1} of {len(files)} shards, {sum(len(part[0]) for part in parts):,} trajectories")
+    q, trivial, codes = (np.concatenate([part[i] for part in parts]) for i in (0, 3, 4))
+    kinds = np.concatenate([_widen(part[1], widest) for part in parts])
+    params = np.concatenate([_widen(part[2], widest) for part in parts])
+    return TrajectoryData(q, kinds, params, trivial, codes, digest.hexdigest()[:16])
+
+
+def _widen(array: ndarray, columns: int) -> ndarray:
+    missing = [(0, 0)] * array.ndim
+    missing[1] = (0, columns - array.shape[1])
+    return np.pad(array, missing)
+
+
+def _read_shard(
+    file: FilePath, dof: int, frames: int
+) -> tuple[tuple[ndarray, ndarray, ndarray, ndarray], str]:
+    try:
+        with np.load(file) as shard:
+            q, kinds, params = shard["q"], shard["kinds"], shard["params"]
+            trivial = shard["trivial"]
+        shard_print = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+    except KeyError as error:
+        raise InputError(
+            f"shard {file} has no array {error.args[0]}; it needs q, kinds, params, trivial"
+        ) from None
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
+        raise InputError(f"shard {file} is damaged: {error}") from None
+    if q.ndim != 3 or q.shape[1:] != (frames, dof):
+        raise InputError(
+            f"shard {file}: q has shape {q.shape}; it must be n x {frames} frames x {dof} joints"
+        )
+    n = len(q)
+    if kinds.shape[0] != n or params.shape != (*kinds.shape, 10) or trivial.shape != (n,):
+        raise InputError(
+            f"shard {file}: kinds {kinds.shape}, params {params.shape}, trivial {trivial.shape} do not fit"
+        )
+    if not (np.isfinite(q).all() and np.isfinite(params).all()):
+        raise InputError(f"shard {file} holds numbers that are not finite")
+    return (
+        q.astype(np.float32), kinds.astype(np.int8), params.astype(np.float32), trivial.astype(bool)
+    ), shard_print  # fmt: skip
+
+
+def _cached_codes(
+    file: FilePath, arrays: tuple[ndarray, ...], encoder: PointAutoencoder, key: str
+) -> Float[ndarray, "n code"]:
+    cache = file.parent / "codes" / f"{key}.npy"
+    if cache.is_file():
+        try:
+            codes = np.load(cache)
+            if len(codes) == len(arrays[0]):
+                return codes
+        except (OSError, ValueError, EOFError):
+            pass  # damaged: made again below
+    codes = encode_scenes(encoder, arrays[1], arrays[2], np.random.default_rng(int(key[:8], 16)))
+    try:
+        buffer = BytesIO()
+        np.save(buffer, codes)
+        write_atomically(cache, buffer.getvalue())
+    except InputError:
+        pass  # a read-only data folder: the codes are made again next time
+    return codes
+
+
+def encode_scenes(
+    encoder: PointAutoencoder,
+    kinds: Int8[ndarray, "n k"],
+    params: Float32[ndarray, "n k 10"],
+    rng: np.random.Generator,
+) -> Float[ndarray, "n code"]:
+    """z of each packed scene from a random cloud, as float16."""
+    codes = []
+    for i in range(0, len(kinds), 256):
+        part = slice(i, i + 256)
+        clouds = sample_surfaces_batch(kinds[part], params[part], CODE_POINTS, rng, encoder.settings.region)
+        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+            codes.append(encoder(torch.from_numpy(clouds)).numpy().astype(np.float16))
+    return np.concatenate(codes)
+
+
+def fast_bf16() -> bool:
+    """Whether this CPU multiplies bf16 matrices fast."""
+    return bool(torch.cpu._is_avx512_bf16_supported())
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Noisy trajectories and their clean ones; float32."""
+
+    features: Float[ndarray, "n frames features"]
+    level: Float[ndarray, "n"]
+    """t / T"""
+    condition: Float[ndarray, "n condition"]
+    clean: Float[ndarray, "n frames dof"]
+    """Scaled residuals."""
+    weight: Float[ndarray, "n"]
+    line: Float[ndarray, "n frames dof"]
+
+
+class Batches:
+    """Draws training batches: rows of the data, forwards or reversed (as good a path), at random levels."""
+
+    def __init__(
+        self,
+        data: TrajectoryData,
+        model: MotionModel,
+        clearances: Callable[[ndarray, ndarray, ndarray], ndarray],
+        trivial_share: float,
+        weight_limit: float,
+    ) -> None:
+        """clearances: (kinds [n, k], params [n, k, 10], q [n, frames, dof]) to [n, frames, links] [m]."""
+        self.data, self.model, self.clearances = data, model, clearances
+        self.weight_limit = weight_limit
+        self.trivial, self.hard = np.flatnonzero(data.trivial), np.flatnonzero(~data.trivial)
+        if not len(self.hard):
+            self.trivial_share = 1.0
+        else:
+            self.trivial_share = trivial_share if len(self.trivial) else 0.0
+
+    def draw(self, count: int, rng: np.random.Generator) -> Batch:
+        """A random batch."""
+        easy = rng.random(count) < self.trivial_share
+        rows = np.empty(count, np.int64)
+        for mask, pool in ((easy, self.trivial), (~easy, self.hard)):
+            rows[mask] = pool[rng.integers(0, max(len(pool), 1), int(mask.sum()))]
+        # One level from each of `count` equal parts of the range: less variance than independent draws.
+        parts = (np.arange(count) + rng.random(count)) / count
+        levels = 1 + (parts * self.model.schedule.steps).astype(np.int64)
+        return self.at(rows, np.minimum(levels, self.model.schedule.steps), rng)
+
+    def at(self, rows: ndarray, levels: ndarray, rng: np.random.Generator) -> Batch:
+        """These rows at these noise levels."""
+        data, model, schedule = self.data, self.model, self.model.schedule
+        kinds, params = data.kinds[rows], data.params[rows]
+        q = data.q[rows]
+        back = rng.random(len(rows)) < 0.5
+        q[back] = q[back, ::-1]
+        line = model.line(q[:, 0], q[:, -1])
+        clean = model.residual(q, line)
+        signal, noise = (
+            a[levels].astype(np.float32)[:, None, None] for a in (schedule.signal, schedule.noise)
+        )
+        noisy = signal * clean + noise * model.draw_noise(len(rows), rng)
+        return Batch(
+            features=model.features(noisy, line, lambda at: self.clearances(kinds, params, at)),
+            level=(levels / schedule.steps).astype(np.float32),
+            condition=model.condition(data.codes[rows].astype(np.float32), q[:, 0], q[:, -1]),
+            clean=clean,
+            weight=schedule.weight(levels, self.weight_limit).astype(np.float32),
+            line=line,
+        )

@@ -1,0 +1,224 @@
+"""MotionModel: encoder, denoiser and sampler put together; all that planning needs of the learned part."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+from torch import Tensor, nn
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.denoisers.transformer import Linear, TransformerSettings
+from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
+from robotdiffuse.learning.encoders import ENCODERS, PointAutoencoder, PointAutoencoderSettings
+from robotdiffuse.learning.normalizer import JointNormalizer
+from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.robots.robot import Robot
+
+MAX_POINTS = 2048
+"""Larger clouds are thinned to this many points by chance before they are encoded."""
+
+ClearanceFn = Callable[[ndarray], ndarray]
+"""Joint values [count, frames, dof] (float32) to clearances of the links, [count, frames, links] [m]."""
+GuideFn = Callable[[ndarray, float], ndarray]
+"""Predicted joint values [count, frames, dof] (float32), noise level in (0, 1]; to improved joint values."""
+
+
+@dataclass(frozen=True)
+class MotionModelConfig:
+    """What a checkpoint says about its model."""
+
+    robot: str
+    joint_names: tuple[str, ...]
+    lower: tuple[float, ...]
+    """Limits that the joint values are normalised by [rad]."""
+    upper: tuple[float, ...]
+    frame_offsets: tuple[tuple[tuple[float, ...], ...], ...]
+    """`Robot.frame_offsets`, to recognise a robot of the same name but other measures."""
+    links: tuple[str, ...]
+    """The links whose clearances the denoiser sees, in order."""
+    frames: int = 48
+    """Rows of a trajectory, evenly spaced along it (joint-space length)."""
+    clearance_low: float = -0.1
+    """Clearances are clipped to this range before the denoiser sees them [m]."""
+    clearance_high: float = 0.4
+    encoder: str = "point_autoencoder"
+    encoder_settings: PointAutoencoderSettings = field(default_factory=PointAutoencoderSettings)
+    denoiser: str = "transformer"
+    denoiser_settings: TransformerSettings = field(default_factory=TransformerSettings)
+    sampler: str = "ddim"
+    schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+
+    def check_robot(self, robot: Robot, where: str) -> None:
+        """Raises InputError unless the model was trained for this robot. `where` names the model."""
+        if robot.joint_names != self.joint_names:
+            raise InputError(
+                f"{where} was trained for {self.robot} with joints {', '.join(self.joint_names)}; "
+                f"the robot {robot.name} has {', '.join(robot.joint_names)}"
+            )
+        if not np.allclose(robot.frame_offsets, np.array(self.frame_offsets), atol=1e-3):
+            raise InputError(
+                f"{where} was trained for {self.robot}; the robot {robot.name} has other dimensions"
+            )
+
+
+class MotionModel(nn.Module):
+    """The diffusion model over trajectories.
+
+    A trajectory is its residual to the straight line from start to goal in normalised joint space, divided by
+    the standard deviation of the training residuals. Its first and last frame are zero: start and goal. The
+    paper's noise interpolation, which writes start and goal over the ends at each step, thus is a zero there.
+    """
+
+    residual_scale: Tensor
+    noise_factor: Tensor
+
+    def __init__(self, config: MotionModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.dof = len(config.joint_names)
+        self.normalizer = JointNormalizer(np.array(config.lower), np.array(config.upper))
+        self.schedule = NoiseSchedule(config.schedule)
+        self.encoder: PointAutoencoder = ENCODERS[config.encoder][0](config.encoder_settings)
+        condition = config.encoder_settings.code + 2 * self.dof
+        features = 2 * self.dof + len(config.links)
+        self.denoiser = DENOISERS[config.denoiser][0](
+            config.denoiser_settings, config.frames, self.dof, features, condition
+        )
+        self.register_buffer("residual_scale", torch.ones(self.dof))
+        self.register_buffer("noise_factor", torch.eye(config.frames))
+        self._line = np.linspace(0.0, 1.0, config.frames, dtype=np.float32)[:, None]
+
+    def for_inference(self) -> "MotionModel":
+        """Freeze, and keep the denoiser's matrices in bf16 where the CPU multiplies it fast. Returns self."""
+        self.requires_grad_(False).eval()
+        if torch.cpu._is_avx512_bf16_supported():
+            for module in self.denoiser.modules():
+                if isinstance(module, Linear):
+                    module.to(torch.bfloat16)
+        return self
+
+    def fit_statistics(self, q: Float[ndarray, "n frames dof"], smooth_noise: bool) -> None:
+        """Set the scale of the residuals, and the covariance of the noise, from trajectories [rad]."""
+        self.residual_scale.fill_(1.0)
+        residuals = self.residual(q, self.line(q[:, 0], q[:, -1]))
+        scale = np.maximum(np.sqrt((residuals[:, 1:-1] ** 2).mean((0, 1))), 1e-4)
+        self.residual_scale.copy_(torch.from_numpy(scale))
+        self.noise_factor.copy_(torch.from_numpy(noise_factor(residuals / scale, smooth_noise)))
+
+    @property
+    def _scale(self) -> ndarray:
+        return self.residual_scale.numpy()
+
+    def encode(
+        self, points: Float[ndarray, "n 3"], rng: np.random.Generator | None = None
+    ) -> Float[ndarray, "code"]:
+        """z of a point cloud of the obstacles' surfaces (base frame, [m]); no point at all is a scene too."""
+        points = np.asarray(points, np.float32).reshape(-1, 3)
+        points = points[self.config.encoder_settings.region.holds(points)]
+        if len(points) > MAX_POINTS:
+            rng = np.random.default_rng(0) if rng is None else rng
+            points = points[rng.choice(len(points), MAX_POINTS, replace=False)]
+        with torch.inference_mode():
+            return self.encoder(torch.from_numpy(points)[None])[0].numpy()
+
+    def line(
+        self, start: Float[ndarray, "*batch dof"], goal: Float[ndarray, "*batch dof"]
+    ) -> Float[ndarray, "*batch frames dof"]:
+        """The straight line from start to goal, normalised joint values."""
+        a = self.normalizer.to_unit(np.asarray(start, np.float32))[..., None, :]
+        b = self.normalizer.to_unit(np.asarray(goal, np.float32))[..., None, :]
+        return a + (b - a) * self._line
+
+    def residual(
+        self, q: Float[ndarray, "*batch frames dof"], line: Float[ndarray, "*#batch frames dof"]
+    ) -> Float[ndarray, "*batch frames dof"]:
+        """Scaled residual of joint values [rad]."""
+        x = (self.normalizer.to_unit(q.astype(np.float32, copy=False)) - line) / self._scale
+        return hold_ends(x)
+
+    def joints(
+        self, x: Float[ndarray, "*batch frames dof"], line: Float[ndarray, "*#batch frames dof"]
+    ) -> Float[ndarray, "*batch frames dof"]:
+        """Joint values [rad] of a scaled residual."""
+        return self.normalizer.from_unit(line + x * self._scale)
+
+    def features(
+        self,
+        x: Float[ndarray, "batch frames dof"],
+        line: Float[ndarray, "*batch1 frames dof"],
+        clearances: ClearanceFn,
+    ) -> Float[ndarray, "batch frames features"]:
+        """The denoiser's input for noisy residuals: residual, normalised joint values, link clearances."""
+        low, high = self.config.clearance_low, self.config.clearance_high
+        unit = line + x * self._scale
+        near = np.clip(clearances(self.normalizer.from_unit(unit)), low, high)
+        near = (near - (low + high) / 2) * (2 / (high - low))
+        return np.concatenate([x, unit, near.astype(np.float32, copy=False)], axis=-1)
+
+    def draw_noise(self, count: int, rng: np.random.Generator) -> Float[ndarray, "count frames dof"]:
+        """Standard noise of the forward process; zero at both ends."""
+        return self.noise_factor.numpy() @ rng.standard_normal(
+            (count, self.config.frames, self.dof), dtype=np.float32
+        )
+
+    def condition(
+        self,
+        code: Float[ndarray, "*batch code"],
+        start: Float[ndarray, "*batch dof"],
+        goal: Float[ndarray, "*batch dof"],
+    ) -> Float[ndarray, "*batch condition"]:
+        """C = [z, start, goal], normalised."""
+        ends = [self.normalizer.to_unit(np.asarray(q, np.float32)) for q in (start, goal)]
+        return np.concatenate([code, *ends], axis=-1)
+
+    def sample(
+        self,
+        code: Float[ndarray, "code"],
+        start: Float[ndarray, "dof"],
+        goal: Float[ndarray, "dof"],
+        count: int,
+        rng: np.random.Generator,
+        clearances: ClearanceFn,
+        steps: int = 6,
+        guide: GuideFn | None = None,
+        eta: float = 0.0,
+    ) -> Float[ndarray, "count frames dof"]:
+        """Trajectories from start to goal [rad] (float64, the ends exact), of a model from `load_model`.
+
+        code: z of the scene, from `encode`.
+        clearances: see ClearanceFn.
+        steps: calls of the denoiser.
+        guide: improves the predicted clean trajectories in the second half of the steps, the last included
+            (paper, section Motion Guided Generation); it need not keep the ends.
+        eta: share of fresh noise per step, see `ddim`.
+        """
+        line = self.line(start, goal)[None]
+        condition = torch.from_numpy(self.condition(code, start, goal)).expand(count, -1)
+        levels = self.config.schedule.steps
+        guided: Int[ndarray, "n"] = self.schedule.sampling_levels(steps)[steps // 2 : -1]
+
+        def predict(x: ndarray, level: int) -> ndarray:
+            inputs = torch.from_numpy(self.features(x, line, clearances))
+            clean = self.denoiser(inputs, torch.full((count,), level / levels), condition).numpy()
+            if guide is not None and level in guided:
+                clean = self.residual(guide(self.joints(hold_ends(clean), line), level / levels), line)
+            return hold_ends(clean)
+
+        with torch.inference_mode():
+            sampler = SAMPLERS[self.config.sampler]
+            x = sampler(predict, self.schedule, lambda: self.draw_noise(count, rng), steps, eta)
+        q = self.joints(x, line).astype(np.float64)
+        np.clip(q, self.config.lower, self.config.upper, out=q)
+        q[:, 0], q[:, -1] = start, goal
+        return q
+
+
+def hold_ends(x: Float[ndarray, "*batch frames dof"]) -> Float[ndarray, "*batch frames dof"]:
+    """Set the first and last frame of residuals to zero (noise interpolation), in place."""
+    x[..., 0, :] = 0.0
+    x[..., -1, :] = 0.0
+    return x

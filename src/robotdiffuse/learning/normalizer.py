@@ -1,0 +1,25 @@
+"""Joint values in units of the joint limits."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+
+
+class JointNormalizer:
+    """Maps lower limits to -1 and upper limits to 1, joint by joint."""
+
+    def __init__(self, lower: Float[ndarray, "dof"], upper: Float[ndarray, "dof"]) -> None:
+        """Limits [rad], [m] for prismatic joints. Raises InputError for an empty or infinite range."""
+        for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
+            if not (np.isfinite(low) and np.isfinite(high) and low < high):
+                raise InputError(f"limits of joint {i} are {low} and {high}; they must be finite and rising")
+        self.middle = ((upper + lower) / 2).astype(np.float32)
+        self.half_range = ((upper - lower) / 2).astype(np.float32)
+
+    def to_unit(self, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch dof"]:
+        return (q - self.middle) / self.half_range
+
+    def from_unit(self, x: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch dof"]:
+        return x * self.half_range + self.middle

@@ -1,0 +1,288 @@
+"""What both training runs share: optimiser, schedule, checkpoints, log, bad steps, interruption."""
+
+import csv
+import io
+import json
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from torch import Tensor, nn
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import read_tensors, write_atomically, write_tensors
+from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, settings_to_json
+
+FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder")
+"""Settings that may differ between the parts of one run."""
+LOG_EVERY = 50
+"""Steps per row of log.csv."""
+COLUMNS = ("step", "samples", "minutes", "learning_rate", "loss", "validation", "skipped")
+MAX_ROLLBACKS = 5
+
+LossFn = Callable[[np.random.Generator], Float[Tensor, ""]]
+"""Draws a batch and returns its loss."""
+
+
+@dataclass
+class Position:
+    """How far a run is."""
+
+    step: int = 0
+    samples: int = 0
+    seconds: float = 0.0
+    skipped: int = 0
+    rollbacks: int = 0
+
+
+class TrainingRun:
+    """Trains a module's parameters; picks up where an earlier run in the same folder stopped.
+
+    After a resumption everything is as if it had not been interrupted: weights, their average, moments of the
+    optimiser and the random state come from the checkpoint.
+    """
+
+    def __init__(
+        self,
+        module: nn.Module,
+        out: str,
+        settings: EncoderTraining | PlannerTraining,
+        *,
+        average: float,
+        weight_decay: float,
+        gradient_norm: float,
+        bad_steps: int,
+        identity: dict[str, str],
+    ) -> None:
+        """`identity`: what else must be the same when the run is resumed, e.g. the robot."""
+        self.module, self.settings, self.out = module, settings, FilePath(out)
+        self.parameters: dict[str, nn.Parameter] = {
+            n: p for n, p in module.named_parameters() if p.requires_grad
+        }
+        self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
+        self.average_decay, self.gradient_norm, self.bad_steps = average, gradient_norm, bad_steps
+        self.optimizer = torch.optim.AdamW(
+            self.parameters.values(), lr=0.0, betas=(0.9, 0.99), weight_decay=weight_decay, fused=True
+        )
+        self.rng = np.random.default_rng(settings.seed)
+        self.at = Position()
+        self.identity = identity
+        self.rows: list[dict[str, float | int | str]] = []
+        self._losses: list[float] = []
+        self._bad = 0
+        self._file = self.out / "training.safetensors"
+        self.resumed = self._file.is_file()
+        if self.resumed:
+            self._restore(check=True)
+
+    @property
+    def fraction(self) -> float:
+        """How much of the run is done, 0 to 1."""
+        if self.settings.samples is not None:
+            return min(1.0, self.at.samples / self.settings.samples)
+        return min(1.0, self.at.seconds / (60 * (self.settings.minutes or 1.0)))
+
+    def loop(
+        self,
+        loss: Callable[[np.random.Generator], Float[Tensor, ""]],
+        validate: Callable[[], float],
+        title: str,
+    ) -> None:
+        """Train to the end. Ctrl-C stores a checkpoint first, then raises KeyboardInterrupt."""
+        threads = torch.get_num_threads()
+        torch.set_num_threads(self.settings.threads)
+        try:
+            with _stop_requested() as stop, _progress() as progress:
+                task = progress.add_task(title, total=1.0, completed=self.fraction, rate="", loss="")
+                last = saved = time.monotonic()
+                while self.fraction < 1.0 and not stop.is_set():
+                    self.step(loss)
+                    now = time.monotonic()
+                    self.at.seconds += now - last
+                    rate, last = self.settings.batch / max(now - last, 1e-9), now
+                    if self.at.step % LOG_EVERY == 0:
+                        self._log(self.settings.learning_rate * self._lr(), "")
+                        text = f"{self.rows[-1]['loss']:.4f}" if self.rows else ""
+                        progress.update(task, completed=self.fraction, rate=f"{rate:,.0f}/s", loss=text)
+                    if now - saved > self.settings.checkpoint_seconds:
+                        self._checkpoint(validate, progress.console, title)
+                        saved = time.monotonic()
+                self._checkpoint(validate, progress.console, title)
+                if stop.is_set():
+                    raise KeyboardInterrupt
+        finally:
+            torch.set_num_threads(threads)
+
+    def step(self, loss: LossFn) -> None:
+        """One step of the optimiser; a loss or gradient that is not finite changes no weight."""
+        self.optimizer.param_groups[0]["lr"] = self.settings.learning_rate * self._lr()
+        self.optimizer.zero_grad(set_to_none=True)
+        value = loss(self.rng)
+        value.backward()
+        norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.gradient_norm)
+        self.at.step += 1
+        self.at.samples += self.settings.batch
+        if not (math.isfinite(value.item()) and math.isfinite(norm.item())):
+            self._skip()
+            return
+        self._bad = 0
+        self.optimizer.step()
+        self._losses.append(value.item())
+        with torch.no_grad():
+            decay = min(self.average_decay, self.at.step / (self.at.step + 10))
+            torch._foreach_lerp_(
+                list(self.average.values()), [p.detach() for p in self.parameters.values()], 1 - decay
+            )
+
+    def _lr(self) -> float:
+        warmup = min(1.0, (self.at.step + 1) / max(1, self.settings.warmup_steps))
+        return warmup * 0.5 * (1 + math.cos(math.pi * self.fraction))
+
+    def _skip(self) -> None:
+        self._bad += 1
+        self.at.skipped += 1
+        if self._bad < self.bad_steps:
+            return
+        at = self.at
+        if at.rollbacks >= MAX_ROLLBACKS or not self._file.is_file():
+            raise InputError(f"training in {self.out} diverged: the loss is not finite at step {at.step}")
+        random_state = self.rng.bit_generator.state  # kept, so that other batches follow this time
+        self._restore(check=False)
+        self.rng.bit_generator.state = random_state
+        self.at.skipped, self.at.rollbacks, self.at.seconds = at.skipped, at.rollbacks + 1, at.seconds
+        self._bad = 0
+
+    @contextmanager
+    def averaged(self) -> Iterator[None]:
+        """Within, the module has the average of its weights."""
+        kept = {name: p.detach().clone() for name, p in self.parameters.items()}
+        with torch.no_grad():
+            for name, p in self.parameters.items():
+                p.copy_(self.average[name])
+        try:
+            yield
+        finally:
+            with torch.no_grad():
+                for name, p in self.parameters.items():
+                    p.copy_(kept[name])
+
+    def _log(self, rate: float, validation: float | str) -> None:
+        loss = (
+            float(np.mean(self._losses)) if self._losses else self.rows[-1]["loss"] if self.rows else math.nan
+        )
+        self._losses.clear()
+        minutes = round(self.at.seconds / 60, 3)
+        row = (
+            self.at.step,
+            self.at.samples,
+            minutes,
+            f"{rate:.3g}",
+            f"{loss:.5g}",
+            validation,
+            self.at.skipped,
+        )
+        self.rows.append(dict(zip(COLUMNS, (*row[:4], float(row[4]), *row[5:]), strict=True)))
+
+    def _checkpoint(self, validate: Callable[[], float], console: Console, title: str) -> None:
+        with self.averaged():
+            validation = validate()
+        self._log(self.settings.learning_rate * self._lr(), f"{validation:.5g}")
+        self.save()
+        console.print(
+            f"{title}: {self.fraction:.1%}, {self.at.samples:,} samples in {self.at.seconds / 60:.1f} min, "
+            f"loss {self.rows[-1]['loss']:.4f}, validation {validation:.4f}, {self.at.skipped} steps skipped",
+            highlight=False,
+        )
+
+    def save(self) -> None:
+        """Write training.safetensors and log.csv, each whole or not at all."""
+        moments = self.optimizer.state
+        tensors: dict[str, Tensor] = {f"module.{name}": t for name, t in self.module.state_dict().items()}
+        tensors |= {f"average.{name}": t for name, t in self.average.items()}
+        for name, p in self.parameters.items():
+            for key, value in moments.get(p, {}).items():
+                tensors[f"optimizer.{key}.{name}"] = value
+        notes = {
+            "settings": settings_to_json(self.settings),
+            "identity": self.identity,
+            "at": asdict(self.at),
+            "random": self.rng.bit_generator.state,
+            "losses": self._losses,
+            "rows": self.rows,
+        }
+        write_tensors(self._file, tensors, notes)
+        text = io.StringIO()
+        writer = csv.DictWriter(text, COLUMNS)
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_atomically(self.out / "log.csv", text.getvalue().encode())
+
+    def _restore(self, check: bool) -> None:
+        tensors, notes = read_tensors(self._file)
+        try:
+            if check:
+                self._check_same(notes)
+            state = {k.removeprefix("module."): t for k, t in tensors.items() if k.startswith("module.")}
+            self.module.load_state_dict(state)
+            self.average = {name: tensors[f"average.{name}"] for name in self.parameters}
+            self.optimizer.state.clear()
+            for name, p in self.parameters.items():
+                found = {
+                    key: tensors[f"optimizer.{key}.{name}"]
+                    for key in ("step", "exp_avg", "exp_avg_sq")
+                    if f"optimizer.{key}.{name}" in tensors
+                }
+                if found:
+                    self.optimizer.state[p] = found
+            self.at = Position(**notes["at"])
+            self.rng.bit_generator.state = notes["random"]
+            self._losses, self.rows = list(notes["losses"]), list(notes["rows"])
+        except (KeyError, TypeError, RuntimeError) as error:
+            raise InputError(
+                f"{self._file} is no checkpoint of this run: {' '.join(str(error).split())[:200]}"
+            ) from None
+
+    def _check_same(self, notes: dict) -> None:
+        now, before = json.loads(json.dumps(settings_to_json(self.settings))), notes["settings"]
+        now, before = now | self.identity, before | notes["identity"]
+        for name, value in now.items():
+            if name not in FREE_SETTINGS and before.get(name) != value:
+                raise InputError(
+                    f"{self.out} holds a run with {name} = {before.get(name)!r}, now it is {value!r}; "
+                    "use another folder, or the same settings"
+                )
+
+
+@contextmanager
+def _stop_requested() -> Iterator[threading.Event]:
+    """An event that Ctrl-C or a request to end sets, so that a step is never torn."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+    before = {s: signal.signal(s, lambda *_: stop.set()) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for s, handler in before.items():
+            signal.signal(s, handler)
+
+
+@contextmanager
+def _progress() -> Iterator[Progress]:
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.1f} %"),
+        TextColumn("{task.fields[rate]}"), TextColumn("loss {task.fields[loss]}"), TimeRemainingColumn(),
+    )  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True, soft_wrap=True)) as progress:
+        yield progress
