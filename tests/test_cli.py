@@ -158,6 +158,7 @@ BAD_CALL = {
     "not a result": (["view", "problem.json"], "is not a result file"),
     "unknown robot": (["robot", "info", "pandaa"], "pandaa"),
     "missing urdf": (["robot", "add", "missing.urdf"], "missing.urdf"),
+    "no workers": (["data", "generate", "--out", "d", "--workers", "0"], "'0' is not an integer"),
     "train without out": (["train", "encoder"], "--out"),
     "train twice as long": (
         ["train", "encoder", "--out", "e", "--minutes", "1", "--samples", "9"], "not allowed with"
@@ -215,6 +216,18 @@ def test_robot_info(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("robot", "info", "panda") == 0
     printed = capsys.readouterr().out
     assert "panda_joint7" in printed and "2.8973" in printed and "spheres on" in printed
+
+
+def test_data_generate_is_resumed_and_refuses_other_settings(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ("data", "generate", "--out", "shards", "--problems", 20, "--workers", 1)
+    assert run(*command) == 0
+    first = capsys.readouterr().out
+    assert int(first.split()[0]) > 0 and run(*command) == 0
+    assert capsys.readouterr().out == first
+    assert run(*command, "--seed", 1) == 2
+    assert "other settings" in capsys.readouterr().err
 
 
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,12 +6,21 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli import plan, planners, robot, train, view
+from robotdiffuse.cli import data, plan, planners, robot, train, view
 from robotdiffuse.errors import InputError
 
 SOLVED, NO_PLAN, BAD_INPUT, STOPPED = 0, 1, 2, 130
 
-COMMANDS = (plan.add_plan, plan.add_demo, view.add_view, view.add_verify, planners.add, robot.add, train.add)
+COMMANDS = (
+    plan.add_plan,
+    plan.add_demo,
+    view.add_view,
+    view.add_verify,
+    planners.add,
+    robot.add,
+    data.add,
+    train.add,
+)
 """Each adds one command to the parser and sets its function as `run`."""
 
 

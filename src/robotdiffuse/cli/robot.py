@@ -95,17 +95,8 @@ def print_robot(robot: "Robot") -> None:
     from rich.table import Table
 
     console = Console()
-    joints = Table(
-        "joint",
-        "kind",
-        "lower",
-        "upper",
-        "velocity",
-        "acceleration",
-        "jerk",
-        title=robot.name,
-        title_justify="left",
-    )
+    headings = ("joint", "kind", "lower", "upper", "velocity", "accel.", "jerk")
+    joints = Table(*headings, title=robot.name, title_justify="left")
     for joint in robot.planned_joints:
         limits = (joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk)
         joints.add_row(escape(joint.name), joint.kind, *(f"{value:g}" for value in limits))
