@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.collision import distance, lanes
+from robotdiffuse.collision import distance, lane_clearance, lanes
 from robotdiffuse.collision.arrays import compile_robot, compile_scene, reach, robot_groups
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -33,10 +33,15 @@ class CollisionChecker:
         """Whether each configuration is free of collision."""
         return lanes.free_many(self.robot_arrays, self.scene_arrays, _float32(q), self.padding)
 
-    def link_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n links"]:
-        """Signed distance of each moving link to the scene [m], at most 1 m; near point clouds at most 0.2 m less a sphere."""
-        found = distance.link_clearances(self.robot_arrays, self.scene_arrays, _float32(q), distance.CAP)
-        return found - self.padding
+    def link_clearances(
+        self, q: Float[ndarray, "n dof"], limit: float = 1.0
+    ) -> Float[ndarray, "n links"]:
+        """Signed distance of each moving link to the scene [m], at most `limit`; the lower, the faster.
+
+        Towards point clouds and meshes at most 0.2 m less a sphere's radius.
+        """
+        limit = np.float32(limit)
+        return lane_clearance.link_clearances(self.robot_arrays, self.scene_arrays, _float32(q), limit) - self.padding
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
         """Distance between the links of each checked pair [m], at most 1 m."""

@@ -99,7 +99,7 @@ class ContinuousCollision:
         """Judge the motion along straight joint-space lines through the waypoints (at least one)."""
         motion = _Motion(q, self._levers)
         todo, best, certified = self._first_pieces(motion), CAP, CAP
-        hit: tuple[float, int, str] | None = None
+        hit: tuple[float, int] | None = None
         spheres = meshes = 0
         while len(todo.start):
             middle = (todo.start + todo.stop) / 2
@@ -110,14 +110,14 @@ class ContinuousCollision:
 
             rows, checks = np.nonzero((clearance <= MESH_BELOW) & (clearance - bound < self.tightness * best))
             cutoffs = np.minimum(bound[rows, checks] + best, CAP)
-            distances, names = self.exact.nearest(at[rows], checks, cutoffs, stop=self.contact)
+            distances, _ = self.exact.nearest(at[rows], checks, cutoffs, stop=self.contact)
             asked = int(np.isfinite(distances).sum())
             spheres, meshes = spheres + len(at), meshes + asked
             hit_row = None
             if asked and distances[asked - 1] <= self.contact:
                 asked -= 1
                 hit_row = int(rows[asked])
-                hit = (float(middle[hit_row]), int(checks[asked]), str(names[asked]))
+                hit = (float(middle[hit_row]), int(checks[asked]))
             clearance[rows[:asked], checks[:asked]] = distances[:asked]
             best = float(distances[:asked].min(initial=best))
 
@@ -154,18 +154,20 @@ class ContinuousCollision:
         clearances[:, self._ours] = np.concatenate(found, axis=1)[:, self._theirs] - FLOAT32_SLACK
         return clearances
 
-    def _contact(self, motion: "_Motion", at: float, check: int, other: str) -> Contact:
+    def _contact(self, motion: "_Motion", at: float, check: int) -> Contact:
+        """The contact of a check at a place, with its depth until the check comes free of that obstacle."""
         travelled = motion.travelled[:, check]
         begin = float(motion.travel(np.array([at]))[0, check])
         steps = begin + EPISODE_TRAVEL * np.arange(EPISODE_SAMPLES)
         steps = steps[steps <= travelled[-1]]
         samples = np.maximum(np.interp(steps, travelled, np.arange(len(travelled))), at)
         samples = np.concatenate([[at], samples])
-        checks, cutoffs = np.full(len(samples), check), np.full(len(samples), self.contact)
+        checks, cutoffs = np.full(len(samples), check), np.full(len(samples), 2 * self.contact)
         distances, names = self.exact.nearest(motion.configurations(samples), checks, cutoffs)
-        left = [i for i, name in enumerate(names) if name != other]
+        other = names[0]
+        left = [i for i, name in enumerate(names) if name != other or distances[i] > self.contact]
         episode = distances[: left[0] if left else len(samples)]
-        return Contact(self.exact.checks[check], other, at, max(0.0, -float(episode.min())))
+        return Contact(self.exact.checks[check], str(other), at, max(0.0, -float(episode.min(initial=0))))
 
 
 class _Motion:

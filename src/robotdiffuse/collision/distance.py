@@ -121,7 +121,7 @@ def _capsule(obstacle, x, y, z):
 
 
 @njit(cache=True, _nrt=False)
-def _points(scene, x, y, z, limit):
+def points_distance(scene, x, y, z, limit):
     """Distance to the nearest of the scene's points if below `limit`, else a lower bound of at least that."""
     points, first, frame, grid = scene.points, scene.cell_first, scene.grid_frame, scene.grid
     voxel, cell, largest = frame[3], frame[4], frame[5]
@@ -175,28 +175,10 @@ def scene_distance(scene, x, y, z, limit):
         if d < best:
             best, bx, by, bz = d, nx, ny, nz
     if len(scene.points):
-        d, nx, ny, nz = _points(scene, x, y, z, best)
+        d, nx, ny, nz = points_distance(scene, x, y, z, best)
         if d < best:
             best, bx, by, bz = d, nx, ny, nz
     return best, bx, by, bz
-
-
-@njit(inline="always", _nrt=False)
-def link_clearance(robot, scene, g, frame, limit):
-    """Least signed distance of the spheres of group g to the scene if below `limit`, else `limit`."""
-    best = limit
-    bound = robot.bounds[g]
-    x, y, z = placed(frame, bound[0], bound[1], bound[2])
-    d, _, _, _ = scene_distance(scene, x, y, z, best + bound[3])
-    if d - bound[3] >= best:
-        return best
-    for s in range(robot.first[g], robot.first[g + 1]):
-        x, y, z = placed(frame, robot.spheres[s, 0], robot.spheres[s, 1], robot.spheres[s, 2])
-        radius = robot.spheres[s, 3]
-        d, _, _, _ = scene_distance(scene, x, y, z, best + radius)
-        if d - radius < best:
-            best = d - radius
-    return best
 
 
 @njit(fastmath=True, cache=True, _nrt=False)
@@ -218,19 +200,6 @@ def pair_clearance(robot, p, frames, limit):
             if d < best:
                 best = d
     return best
-
-
-@njit(fastmath=True, cache=True, nogil=True)
-def link_clearances(robot, scene, q, limit):
-    """[n, moving groups] signed distances to the scene, at most `limit`."""
-    first = np.searchsorted(robot.frame, 1)
-    out = np.empty((len(q), len(robot.frame) - first), np.float32)
-    frames = np.empty((q.shape[1] + 1, 12), np.float32)
-    for i in range(len(q)):
-        frames_of(robot, q[i], frames)
-        for g in range(first, len(robot.frame)):
-            out[i, g - first] = link_clearance(robot, scene, g, frames[robot.frame[g]], limit)
-    return out
 
 
 @njit(cache=True, nogil=True)

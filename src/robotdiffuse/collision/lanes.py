@@ -74,7 +74,7 @@ def _slide(parent, child, offset, q):
 
 
 @njit(fastmath=True, cache=True, _nrt=False)
-def _place(frames, f, spheres, s, positions, p):
+def place(frames, f, spheres, s, positions, p):
     """Positions of a sphere's centre in 16 lanes, to row p."""
     x, y, z = spheres[s, 0], spheres[s, 1], spheres[s, 2]
     for i in range(W):
@@ -305,20 +305,20 @@ def make_workspace(robot, scene):
 def _place_group(robot, g, work):
     if not work.placed[g]:
         for s in range(robot.first[g], robot.first[g + 1]):
-            _place(work.frames, robot.frame[g], robot.spheres, s, work.positions, s)
+            place(work.frames, robot.frame[g], robot.spheres, s, work.positions, s)
         work.placed[g] = True
 
 
 @njit(inline="always", _nrt=False)
-def _place_frames(robot, q, work):
-    frames = work.frames
+def place_frames(robot, q, frames, centres):
+    """Frames of 16 configurations, and the centres of the bounding spheres of all groups."""
     for j in range(len(robot.offsets)):
         if robot.prismatic[j]:
             _slide(frames[j], frames[j + 1], robot.offsets[j], q[j])
         else:
             _turn(frames[j], frames[j + 1], robot.offsets[j], q[j])
     for g in range(len(robot.frame)):
-        _place(frames, robot.frame[g], robot.bounds, g, work.centres, g)
+        place(frames, robot.frame[g], robot.bounds, g, centres, g)
 
 
 @njit(inline="always", _nrt=False)
@@ -376,7 +376,7 @@ def block_hits(robot, scene, q, padding, stop_at_first, work):
     """
     work.hits[:] = 0
     work.placed[:] = False
-    _place_frames(robot, q, work)
+    place_frames(robot, q, work.frames, work.centres)
     any_hit = _hits_scene(robot, scene, padding, stop_at_first, work)
     if any_hit and (stop_at_first or _all_lanes_hit(work.hits)):
         return True

@@ -6,7 +6,7 @@ from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision.arrays import RobotArrays, SceneArrays, compile_scene
-from robotdiffuse.collision.distance import frames_of, link_clearance
+from robotdiffuse.collision.lane_clearance import clearances_into, make_clearance_workspace
 from robotdiffuse.scenes.scene import Scene
 
 SPHERE, BOX = 1, 2
@@ -40,11 +40,11 @@ def _unpack(kinds, params, spheres, boxes):
 def _packed_link_clearances(robot, empty, fixed_boxes, kinds, params, q, limit):
     first = np.searchsorted(robot.frame, 1)
     out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
-    frames = np.empty((q.shape[2] + 1, 12), np.float32)
     spheres = np.empty((kinds.shape[1], 4), np.float32)
     fixed = len(fixed_boxes)
     boxes = np.empty((kinds.shape[1] + fixed, 15), np.float32)
     boxes[:fixed] = fixed_boxes
+    work = make_clearance_workspace(robot, len(spheres) + len(boxes) + 1)
     for b in range(len(q)):
         n, m = _unpack(kinds[b], params[b], spheres, boxes[fixed:])
         scene = SceneArrays(
@@ -57,10 +57,7 @@ def _packed_link_clearances(robot, empty, fixed_boxes, kinds, params, q, limit):
             empty.grid,
             empty.grid_frame,
         )
-        for i in range(q.shape[1]):
-            frames_of(robot, q[b, i], frames)
-            for g in range(first, len(robot.frame)):
-                out[b, i, g - first] = link_clearance(robot, scene, g, frames[robot.frame[g]], limit)
+        clearances_into(robot, scene, q[b], limit, work, out[b])
     return out
 
 

@@ -1,0 +1,223 @@
+"""Compiled clearances of links to the scene, 16 configurations at once; see `lanes.py` for the form."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.collision.distance import points_distance
+from robotdiffuse.collision.lanes import W, place, place_frames
+
+_ZERO = np.float32(0.0)
+
+
+@njit(fastmath=True, cache=True, _nrt=False)
+def _to_spheres(at, s, obstacles, near, n, mark, out):
+    """Signed distances of a point in 16 lanes to obstacles.
+
+    With `mark`, to row n + k of `out` for every obstacle k; otherwise `out[0]` becomes the least of itself and
+    the distances to the obstacles with near[n + k].
+    """
+    for k in range(len(obstacles)):
+        if not (mark or near[n + k]):
+            continue
+        x, y, z, radius = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2], obstacles[k, 3]
+        row = n + k if mark else 0
+        for i in range(W):
+            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
+            d = np.sqrt(dx * dx + dy * dy + dz * dz) - radius
+            out[row, i] = d if mark else min(out[row, i], d)
+
+
+@njit(fastmath=True, cache=True, _nrt=False)
+def _to_boxes(at, s, obstacles, near, n, mark, out):
+    for k in range(len(obstacles)):
+        if not (mark or near[n + k]):
+            continue
+        x, y, z = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2]
+        a00, a01, a02 = obstacles[k, 3], obstacles[k, 4], obstacles[k, 5]
+        a10, a11, a12 = obstacles[k, 6], obstacles[k, 7], obstacles[k, 8]
+        a20, a21, a22 = obstacles[k, 9], obstacles[k, 10], obstacles[k, 11]
+        hx, hy, hz = obstacles[k, 12], obstacles[k, 13], obstacles[k, 14]
+        row = n + k if mark else 0
+        for i in range(W):
+            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
+            u = abs(a00 * dx + a01 * dy + a02 * dz) - hx
+            v = abs(a10 * dx + a11 * dy + a12 * dz) - hy
+            w = abs(a20 * dx + a21 * dy + a22 * dz) - hz
+            inside = min(max(max(u, v), w), _ZERO)
+            u, v, w = max(u, _ZERO), max(v, _ZERO), max(w, _ZERO)
+            d = np.sqrt(u * u + v * v + w * w) + inside
+            out[row, i] = d if mark else min(out[row, i], d)
+
+
+@njit(fastmath=True, cache=True, _nrt=False)
+def _to_round(at, s, obstacles, flat_ends, near, n, mark, out):
+    """Cylinders (`flat_ends`) or capsules."""
+    for k in range(len(obstacles)):
+        if not (mark or near[n + k]):
+            continue
+        x, y, z = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2]
+        a00, a01, a02 = obstacles[k, 3], obstacles[k, 4], obstacles[k, 5]
+        a10, a11, a12 = obstacles[k, 6], obstacles[k, 7], obstacles[k, 8]
+        a20, a21, a22 = obstacles[k, 9], obstacles[k, 10], obstacles[k, 11]
+        wide, half = obstacles[k, 12], obstacles[k, 13]
+        row = n + k if mark else 0
+        for i in range(W):
+            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
+            u = a00 * dx + a01 * dy + a02 * dz
+            v = a10 * dx + a11 * dy + a12 * dz
+            w = abs(a20 * dx + a21 * dy + a22 * dz) - half
+            if flat_ends:
+                r = np.sqrt(u * u + v * v) - wide
+                inside = min(max(r, w), _ZERO)
+                r, w = max(r, _ZERO), max(w, _ZERO)
+                d = np.sqrt(r * r + w * w) + inside
+            else:
+                w = max(w, _ZERO)
+                d = np.sqrt(u * u + v * v + w * w) - wide
+            out[row, i] = d if mark else min(out[row, i], d)
+
+
+@njit(cache=True, _nrt=False)
+def _to_points(at, s, scene, row, limit, mark, out):
+    for i in range(W):
+        d, _, _, _ = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit)
+        out[row, i] = d if mark else min(out[row, i], d)
+
+
+@njit(inline="always", _nrt=False)
+def _to_scene(at, s, scene, near, limit, mark, out):
+    n = 0
+    _to_spheres(at, s, scene.spheres, near, n, mark, out)
+    n += len(scene.spheres)
+    _to_boxes(at, s, scene.boxes, near, n, mark, out)
+    n += len(scene.boxes)
+    _to_round(at, s, scene.cylinders, True, near, n, mark, out)
+    n += len(scene.cylinders)
+    _to_round(at, s, scene.capsules, False, near, n, mark, out)
+    n += len(scene.capsules)
+    if len(scene.points) and (mark or near[n]):
+        _to_points(at, s, scene, n if mark else 0, limit, mark, out)
+
+
+class ClearanceWorkspace(NamedTuple):
+    """Scratch memory of `block_clearances`."""
+
+    frames: np.ndarray
+    """[dof + 1, 12 * W]"""
+    centres: np.ndarray
+    """[groups, 3 * W] centres of the bounding spheres."""
+    position: np.ndarray
+    """[1, 3 * W]"""
+    near: np.ndarray
+    """[obstacles]"""
+    bounds: np.ndarray
+    """[obstacles, W] distances of a bounding sphere's centre."""
+    least: np.ndarray
+    """[1, W]"""
+
+
+@njit(cache=True)
+def make_clearance_workspace(robot, obstacles):
+    """Scratch memory for one thread and at most so many obstacles (all point clouds together count as one)."""
+    frames = np.zeros((len(robot.offsets) + 1, 12 * W), np.float32)
+    for k in (0, 4, 8):
+        frames[0, k * W : (k + 1) * W] = 1.0
+    return ClearanceWorkspace(
+        frames,
+        np.empty((len(robot.frame), 3 * W), np.float32),
+        np.empty((1, 3 * W), np.float32),
+        np.empty(obstacles, np.bool_),
+        np.empty((obstacles, W), np.float32),
+        np.empty((1, W), np.float32),
+    )
+
+
+@njit(cache=True, _nrt=False)
+def count_obstacles(scene):
+    """Rows that `make_clearance_workspace` needs."""
+    return len(scene.spheres) + len(scene.boxes) + len(scene.cylinders) + len(scene.capsules) + 1
+
+
+@njit(fastmath=True, cache=True, _nrt=False)
+def _mark_near(obstacles, radius, limit, near, bounds, least):
+    """Marks the obstacles that can be nearest to a group in any lane, from distances of its bounding sphere.
+
+    An obstacle at d from the centre is at least d - radius and at most d + radius away from the group.
+    """
+    for i in range(W):
+        least[0, i] = limit
+    for k in range(obstacles):
+        for i in range(W):
+            least[0, i] = min(least[0, i], bounds[k, i] + radius)
+    count = 0
+    for k in range(obstacles):
+        total = 0
+        for i in range(W):
+            total += np.int32(bounds[k, i] - radius < least[0, i])
+        near[k] = total > 0
+        count += near[k]
+    for i in range(W):
+        least[0, i] = limit
+    return count
+
+
+@njit(fastmath=True, cache=True, _nrt=False)
+def _write(least, radius, best):
+    for i in range(W):
+        best[0, i] = min(best[0, i], least[0, i] - radius)
+
+
+@njit(cache=True, _nrt=False)
+def block_clearances(robot, scene, first, q, limit, work, best, out):
+    """Signed distances of the groups from `first` on to the scene, at most `limit`, of q[dof, 16]: out[groups, 16].
+
+    `best` is scratch, [1, 16].
+    """
+    place_frames(robot, q, work.frames, work.centres)
+    obstacles = count_obstacles(scene) - (len(scene.points) == 0)
+    for g in range(first, len(robot.frame)):
+        radius = robot.bounds[g, 3]
+        _to_scene(work.centres, g, scene, work.near, limit + radius, True, work.bounds)
+        for i in range(W):
+            best[0, i] = limit
+        if _mark_near(obstacles, radius, limit, work.near, work.bounds, work.least) > 0:
+            for s in range(robot.first[g], robot.first[g + 1]):
+                place(work.frames, robot.frame[g], robot.spheres, s, work.position, 0)
+                for i in range(W):
+                    work.least[0, i] = limit + robot.spheres[s, 3]
+                _to_scene(
+                    work.position, 0, scene, work.near, limit + robot.spheres[s, 3], False, work.least
+                )
+                _write(work.least, robot.spheres[s, 3], best)
+        for i in range(W):
+            out[g - first, i] = best[0, i]
+
+
+@njit(cache=True)
+def clearances_into(robot, scene, q, limit, work, out):
+    """Clearances of the moving groups for the rows of q[n, dof], into out[n, groups]."""
+    n, dof = q.shape
+    first = len(robot.frame) - out.shape[1]
+    block, found = np.empty((dof, W), np.float32), np.empty((out.shape[1], W), np.float32)
+    best = np.empty((1, W), np.float32)
+    for start in range(0, n, W):
+        for i in range(W):
+            row = min(start + i, n - 1)
+            for j in range(dof):
+                block[j, i] = q[row, j]
+        block_clearances(robot, scene, first, block, limit, work, best, found)
+        for i in range(min(W, n - start)):
+            for g in range(out.shape[1]):
+                out[start + i, g] = found[g, i]
+
+
+@njit(cache=True, nogil=True)
+def link_clearances(robot, scene, q, limit):
+    """[n, moving groups] signed distances to the scene, at most `limit`."""
+    moving = len(robot.frame) - np.searchsorted(robot.frame, 1)
+    out = np.empty((len(q), moving), np.float32)
+    work = make_clearance_workspace(robot, count_obstacles(scene))
+    clearances_into(robot, scene, q, limit, work, out)
+    return out

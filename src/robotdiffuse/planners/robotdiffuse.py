@@ -1,0 +1,248 @@
+"""RobotDiffuse: the paper's diffusion model, and around it what makes its motions dependable.
+
+The straight line if it is free; else a batch of trajectories sampled by the diffusion model under collision
+guidance; else the same trajectories after more gradient steps (refinement); else search. Everything goes
+through the judge, and the result names the stage that its path comes from.
+"""
+
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import load_model
+from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.planners import rrt_connect_kernel as kernel
+from robotdiffuse.planners.base import Call, usable_goals
+from robotdiffuse.planners.rrt_connect import Ends, RRTConnect, RRTConnectSettings, random_state, search_space
+from robotdiffuse.problem import Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.types import PlanResult
+
+BUNDLED = "learning/weights"
+"""Folder of the weights that come with the package, by robot."""
+
+
+@dataclass(frozen=True)
+class RobotDiffuseSettings:
+    weights: str | None = None
+    """Folder of a trained model; None: the one that comes with the package for the robot."""
+    samples: int = 16
+    """Trajectories per batch."""
+    sampling_steps: int = 6
+    """Calls of the denoiser per batch."""
+    guidance_steps: int = 4
+    """Gradient steps at each guided denoising step, the later half of them."""
+    eta: float = 0.0
+    """Fresh noise per denoising step: 0 is DDIM, 1 is ancestral sampling."""
+    points: int = 320
+    """Points of the cloud that the encoder sees (paper: 1,400)."""
+    refinement_steps: int = 40
+    """Most gradient steps on the sampled trajectories that still collide."""
+    shortened: int = 6
+    """Most candidates that are shortened; the shortest one is kept."""
+    shortcuts: int = 80
+    """Attempts to shorten each of them."""
+    resolution: float = 0.02
+    """No point of the arm moves further than this between two checks of a candidate [m]; the judge decides."""
+    guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
+    search: RRTConnectSettings = field(default_factory=RRTConnectSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "sampling_steps", "points", "shortened"):
+            if getattr(self, name) < 1:
+                raise InputError(f"robotdiffuse.{name} is {getattr(self, name)}; it must be at least 1")
+        if not self.resolution > 0:
+            raise InputError(f"robotdiffuse.resolution is {self.resolution}; it must be positive")
+
+
+@cache
+def bundled_model(robot_name: str) -> MotionModel | None:
+    """The model that comes with the package for a robot of this name, or None."""
+    folder = files("robotdiffuse").joinpath(BUNDLED, robot_name)
+    return load_model(Path(str(folder))) if folder.is_dir() else None
+
+
+class Candidates(NamedTuple):
+    """Trajectories between the ends of a problem, not yet judged."""
+
+    q: Float[ndarray, "count frames dof"]
+    free: Bool[ndarray, "count"]
+    """Whether the compiled check at the planner's resolution calls them free."""
+    stage: str
+
+
+class RobotDiffuse:
+    """Diffusion model, guidance, refinement; search where they fail."""
+
+    name = "robotdiffuse"
+
+    def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
+        """Raises InputError if the weights that the settings name cannot be read."""
+        self.settings = settings or RobotDiffuseSettings()
+        self._model = load_model(Path(self.settings.weights)) if self.settings.weights else None
+
+    def model(self, robot: Robot) -> MotionModel | None:
+        """The model for a robot; None if none comes with the package.
+
+        Raises InputError if the settings name weights of another robot.
+        """
+        if self._model is not None:
+            self._model.config.check_robot(robot, str(self.settings.weights))
+            return self._model
+        model = bundled_model(robot.name)
+        if model is None:
+            return None
+        try:
+            model.config.check_robot(robot, robot.name)
+        except InputError:
+            return None
+        return model
+
+    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+        """See `planners.base.Planner`."""
+        model = self.model(problem.robot)
+        call = Call(self.name, problem, time_limit, seed)
+        checker = CollisionChecker(problem.robot, problem.scene)
+        rng = np.random.default_rng(seed)
+        goals = usable_goals(call, checker, rng)
+        if isinstance(goals, PlanResult):
+            return goals
+        ends = Ends(checker, problem.start, goals)
+        if ends.reachable:
+            result = self._straight(call, checker, ends)
+            if result is None and model is not None:
+                result = self._learned(call, checker, ends, model, rng)
+            if result is not None:
+                return result
+        return RRTConnect(self.settings.search).search(call, checker, goals)
+
+    def _straight(self, call: Call, checker: CollisionChecker, ends: Ends) -> PlanResult | None:
+        """The straight line to the nearest goal that it reaches: no path could be shorter."""
+        space = search_space(checker, self.settings.resolution)
+        start, goals = _rows(ends)
+        for goal in sorted(goals, key=lambda goal: float(np.linalg.norm(goal - start))):
+            line = np.stack([start, goal])
+            if kernel.motions_free(space, line).all():
+                result = call.finish(ends.complete(line), "straight_line")
+                if result is not None:
+                    return result
+        return None
+
+    def _learned(
+        self, call: Call, checker: CollisionChecker, ends: Ends, model: MotionModel, rng: np.random.Generator
+    ) -> PlanResult | None:
+        start, goals = _rows(ends)
+        code = encode(model, checker, self.settings.points, rng)
+        sampled = self.sample(model, checker, code, start, goals, rng)
+        result = self._best(call, checker, ends, sampled)
+        if result is None and call.remaining > 0:
+            result = self._best(call, checker, ends, self.refine(checker, sampled.q))
+        return result
+
+    def sample(
+        self,
+        model: MotionModel,
+        checker: CollisionChecker,
+        code: Float[ndarray, "code"],
+        start: Float[ndarray, "dof"],
+        goals: Float[ndarray, "k dof"],
+        rng: np.random.Generator,
+    ) -> Candidates:
+        """The network alone: a batch of samples under guidance, shared out among the nearest goals."""
+        settings = self.settings
+        guidance = CollisionGuidance(checker, settings.guidance)
+        order = np.argsort(np.linalg.norm(goals - start, axis=1))[: max(settings.samples // 4, 1)]
+        counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(order))]
+
+        def clearances(q: ndarray) -> ndarray:
+            near = checker.link_clearances(q.reshape(-1, q.shape[-1]), model.config.clearance_high)
+            return near.reshape(*q.shape[:2], -1)
+
+        def guide(q: ndarray, _level: float) -> ndarray:
+            return guidance(q, settings.guidance_steps)[0]
+
+        parts = [
+            model.sample(
+                code,
+                start,
+                goals[i],
+                count,
+                rng,
+                clearances,
+                settings.sampling_steps,
+                guide if settings.guidance_steps else None,
+                settings.eta,
+            )
+            for i, count in zip(order, counts, strict=True)
+        ]
+        return self.candidates(checker, np.concatenate(parts), "network")
+
+    def refine(self, checker: CollisionChecker, q: Float[ndarray, "count frames dof"]) -> Candidates:
+        """More gradient steps on trajectories, whether sampled or not."""
+        moved, _ = CollisionGuidance(checker, self.settings.guidance)(q, self.settings.refinement_steps)
+        return self.candidates(checker, moved, "refinement")
+
+    def candidates(
+        self, checker: CollisionChecker, q: Float[ndarray, "count frames dof"], stage: str
+    ) -> Candidates:
+        """Trajectories with the verdict of the compiled check."""
+        space = search_space(checker, self.settings.resolution)
+        q = np.ascontiguousarray(q, np.float32)
+        return Candidates(q, np.array([kernel.motions_free(space, path).all() for path in q]), stage)
+
+    def _best(
+        self, call: Call, checker: CollisionChecker, ends: Ends, candidates: Candidates
+    ) -> PlanResult | None:
+        """The shortest of the free candidates that passes the judge, after shortcuts."""
+        space = search_space(checker, self.settings.resolution)
+        state = random_state(call.seed)
+        paths = sorted(candidates.q[candidates.free], key=kernel.path_length)[: self.settings.shortened]
+        short = [kernel.shortcut(space, path, self.settings.shortcuts, state) for path in paths]
+        for path in sorted(short, key=kernel.path_length):
+            result = call.finish(ends.complete(path), candidates.stage)
+            if result is not None:
+                return result
+            if call.remaining <= 0:
+                return None
+        return None
+
+
+def encode(
+    model: MotionModel, checker: CollisionChecker, points: int, rng: np.random.Generator
+) -> Float[ndarray, "code"]:
+    """z of a scene: its point cloud through the frozen encoder."""
+    return model.encode(sample_surface(checker.scene, points, rng, model.config.encoder_settings.region), rng)
+
+
+def unlearned_starts(
+    start: Float[ndarray, "dof"],
+    goal: Float[ndarray, "dof"],
+    count: int,
+    frames: int,
+    robot: Robot,
+    rng: np.random.Generator,
+) -> Float[ndarray, "count frames dof"]:
+    """The straight line, and the line with random smooth bumps: the control for what refinement owes to learning."""
+    t = np.linspace(0.0, 1.0, frames)[:, None]
+    q = np.repeat((start + t * (goal - start))[None], count, axis=0)
+    for harmonic in (1, 2):
+        bumps = np.sin(np.pi * harmonic * t) * rng.normal(0.0, 0.6 / harmonic, (count, 1, len(start)))
+        q[1:] += bumps[1:]
+    q = np.clip(q, robot.lower, robot.upper)
+    q[:, 0], q[:, -1] = start, goal
+    return q
+
+
+def _rows(ends: Ends) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
+    assert ends.start_lead is not None
+    return ends.start_lead.astype(np.float32), np.array(ends.goal_leads, np.float32)
