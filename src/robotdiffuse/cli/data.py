@@ -12,8 +12,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     generate = actions.add_parser(
         "generate",
         help="plan many random problems",
-        description="Plan many random problems and keep the motions in shards. Ctrl-C stops; the same command "
-        "continues.",
+        description="Plan many random problems and keep the motions in shards. Ctrl-C stops; the same "
+        "command continues.",
     )
     generate.add_argument("--out", required=True, metavar="FOLDER", help="folder for the shards")
     generate.add_argument("--robot", metavar="NAME", help="bundled name or URDF (default: panda)")
