@@ -24,7 +24,7 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
     """
     text = str(name)
     if isinstance(name, Path) or text.endswith((".urdf", ".xml")) or "/" in text or "\\" in text:
-        robot = _from_urdf(Path(name))
+        robot = replace(_from_urdf(Path(name)), source=str(Path(name).resolve()))
     else:
         robot = _by_name(text)
     return robot.with_locked(locked or {})
@@ -36,7 +36,7 @@ def _by_name(name: str) -> Robot:
     added = _added()
     if name not in added:
         raise unknown_name("robot", name, [*ROBOTS, *added])
-    return read_bundle(added[name])
+    return replace(read_bundle(added[name]), source=name)
 
 
 @lru_cache

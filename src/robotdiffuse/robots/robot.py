@@ -74,6 +74,8 @@ class Robot:
     """Values of the movable joints that planning holds [rad] or [m]."""
     notes: tuple[str, ...] = ()
     """What the reader of the URDF changed or ignored."""
+    source: str | None = None
+    """The file or the name that `load_robot` got, unless bundled: how problem files name the robot."""
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:

@@ -3,11 +3,13 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
+from typing import no_type_check
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.scenes.shapes import Shape
 
 
+@no_type_check
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Obstacles in the frame of the robot's base. Names are made unique by a number at the end."""
@@ -19,7 +21,9 @@ class Scene:
         taken: set[str] = set()
         for i, shape in enumerate(shapes):
             if not isinstance(shape, Shape):
-                raise InputError(f"scene[{i}] is a {type(shape).__name__}; it must be a shape, e.g. rd.Sphere")
+                raise InputError(
+                    f"scene[{i}] is a {type(shape).__name__}; it must be a shape, e.g. rd.Sphere"
+                )
             name, number = shape.name, 2
             while name in taken:
                 name, number = f"{shape.name}_{number}", number + 1

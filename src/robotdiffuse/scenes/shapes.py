@@ -1,55 +1,97 @@
-"""Obstacle shapes in the frame of the robot's base."""
+"""Obstacle shapes in the frame of the robot's base.
+
+The constructors check their arguments and say what is wrong, so run-time type checks (tests switch them on)
+are kept off these classes by `no_type_check`.
+"""
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
+from numpy.typing import ArrayLike
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.scenes.point_cloud import voxel_thin
 from robotdiffuse.transforms import rotation_from_quaternion, transform
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
-def _vector(shape: str, name: str, value: object, size: int) -> ndarray:
+def shown(value: object) -> str:
+    """A value as one short line, for error messages."""
+    text = " ".join(repr(value.tolist() if isinstance(value, ndarray) else value).split())
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def numbers(value: object) -> ndarray | None:
+    """A float64 array, or None where the value is anything but (nested lists of) numbers."""
     try:
-        array = np.asarray(value, dtype=np.float64)
+        array = np.asarray(value)
     except (TypeError, ValueError):
-        raise InputError(f"{shape}.{name} is {value!r}; it must be {size} numbers") from None
-    if array.shape != (size,) or not np.isfinite(array).all():
-        raise InputError(f"{shape}.{name} is {value!r}; it must be {size} finite numbers")
+        return None
+    return array.astype(np.float64) if array.dtype.kind in "iuf" else None
+
+
+def vector(owner: str, name: str, value: object, size: int) -> ndarray:
+    """`size` finite numbers, or an InputError that names owner.name."""
+    array = numbers(value)
+    if array is None or array.shape != (size,) or not np.isfinite(array).all():
+        raise InputError(f"{owner}.{name} is {shown(value)}; it must be {size} finite numbers")
     return array
 
 
-def _positive(shape: str, name: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-        raise InputError(f"{shape}.{name} is {value!r}; it must be a positive number")
-    if not (np.isfinite(value) and value > 0):
-        raise InputError(f"{shape}.{name} is {value!r}; it must be a positive number")
-    return float(value)
+def positive(owner: str, name: str, value: object) -> float:
+    """A positive number, or an InputError that names owner.name."""
+    array = numbers(value)
+    if array is None or array.ndim != 0 or not np.isfinite(array) or array <= 0:
+        raise InputError(f"{owner}.{name} is {shown(value)}; it must be a positive number")
+    return float(array)
 
 
-def _quaternion(shape: str, value: object) -> ndarray:
-    wxyz = _vector(shape, "wxyz", value, 4)
-    if np.linalg.norm(wxyz) < 1e-6:
-        raise InputError(f"{shape}.wxyz is {value!r}; a quaternion must not be zero")
-    return wxyz / np.linalg.norm(wxyz)
+def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
+    """The quaternion scaled to length 1; one that has it already is kept bit for bit."""
+    wxyz = vector(owner, name, value, 4)
+    norm = np.linalg.norm(wxyz)
+    if norm < 1e-6:
+        raise InputError(f"{owner}.{name} is {shown(value)}; a quaternion must not be zero")
+    return wxyz if abs(norm - 1) < 1e-15 else wxyz / norm
+
+
+def _form(array: ndarray | None) -> str:
+    return "not numbers" if array is None else f"an array of {' x '.join(map(str, array.shape))}"
 
 
 class Shape:
-    """Base of all obstacles. `kind` is its name in problem files."""
+    """Base of all obstacles. `kind` is its name in problem files.
+
+    The constructors take anything that NumPy reads as numbers and raise InputError for the rest.
+    """
 
     kind: ClassVar[str]
     name: str
 
+    @property
+    def area(self) -> float:
+        """Surface [m^2]."""
+        raise NotImplementedError
+
+    @property
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        """Least and greatest corner of an axis-aligned box that holds the shape [m]."""
+        raise NotImplementedError
+
 
 def _set(shape: Shape, **values: object) -> None:
+    if not isinstance(shape.name, str) or not shape.name:
+        raise InputError(f"{shape.kind}.name is {shown(shape.name)}; it must be a text, not empty")
     for key, value in values.items():
         object.__setattr__(shape, key, value)
 
 
+@no_type_check
 @dataclass(frozen=True, eq=False)
 class Sphere(Shape):
     center: Float[ndarray, "3"]
@@ -60,11 +102,24 @@ class Sphere(Shape):
     def __post_init__(self) -> None:
         _set(
             self,
-            center=_vector("sphere", "center", self.center, 3),
-            radius=_positive("sphere", "radius", self.radius),
+            center=vector("sphere", "center", self.center, 3),
+            radius=positive("sphere", "radius", self.radius),
         )
 
+    if TYPE_CHECKING:
 
+        def __init__(self, center: ArrayLike, radius: float, name: str = "sphere") -> None: ...
+
+    @property
+    def area(self) -> float:
+        return 4 * np.pi * self.radius**2
+
+    @property
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        return np.stack([self.center - self.radius, self.center + self.radius])
+
+
+@no_type_check
 @dataclass(frozen=True, eq=False)
 class Box(Shape):
     center: Float[ndarray, "3"]
@@ -75,13 +130,34 @@ class Box(Shape):
     kind: ClassVar[str] = "box"
 
     def __post_init__(self) -> None:
-        size = _vector("box", "size", self.size, 3)
+        size = vector("box", "size", self.size, 3)
         if (size <= 0).any():
             raise InputError(f"box.size is {self.size!r}; edge lengths must be positive")
-        center = _vector("box", "center", self.center, 3)
-        _set(self, center=center, size=size, wxyz=_quaternion("box", self.wxyz))
+        center = vector("box", "center", self.center, 3)
+        _set(self, center=center, size=size, wxyz=unit_quaternion("box", self.wxyz))
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self, center: ArrayLike, size: ArrayLike, wxyz: ArrayLike = IDENTITY, name: str = "box"
+        ) -> None: ...
+
+    @cached_property
+    def rotation(self) -> Float[ndarray, "3 3"]:
+        return rotation_from_quaternion(self.wxyz)
+
+    @property
+    def area(self) -> float:
+        x, y, z = self.size
+        return 2 * float(x * y + y * z + z * x)
+
+    @property
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        half = np.abs(self.rotation) @ self.size / 2
+        return np.stack([self.center - half, self.center + half])
 
 
+@no_type_check
 @dataclass(frozen=True, eq=False)
 class _Axial(Shape):
     center: Float[ndarray, "3"]
@@ -92,13 +168,18 @@ class _Axial(Shape):
     def __post_init__(self) -> None:
         _set(
             self,
-            center=_vector(self.kind, "center", self.center, 3),
-            radius=_positive(self.kind, "radius", self.radius),
-            height=_positive(self.kind, "height", self.height),
-            wxyz=_quaternion(self.kind, self.wxyz),
+            center=vector(self.kind, "center", self.center, 3),
+            radius=positive(self.kind, "radius", self.radius),
+            height=positive(self.kind, "height", self.height),
+            wxyz=unit_quaternion(self.kind, self.wxyz),
         )
 
+    @cached_property
+    def rotation(self) -> Float[ndarray, "3 3"]:
+        return rotation_from_quaternion(self.wxyz)
 
+
+@no_type_check
 @dataclass(frozen=True, eq=False)
 class Cylinder(_Axial):
     """A cylinder about its own z axis, `height` long."""
@@ -106,7 +187,29 @@ class Cylinder(_Axial):
     name: str = "cylinder"
     kind: ClassVar[str] = "cylinder"
 
+    if TYPE_CHECKING:
 
+        def __init__(
+            self,
+            center: ArrayLike,
+            radius: float,
+            height: float,
+            wxyz: ArrayLike = IDENTITY,
+            name: str = "cylinder",
+        ) -> None: ...
+
+    @property
+    def area(self) -> float:
+        return 2 * np.pi * self.radius * (self.radius + self.height)
+
+    @property
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        axis = self.rotation[:, 2]
+        half = np.abs(axis) * self.height / 2 + self.radius * np.sqrt(np.clip(1 - axis**2, 0, None))
+        return np.stack([self.center - half, self.center + half])
+
+
+@no_type_check
 @dataclass(frozen=True, eq=False)
 class Capsule(_Axial):
     """A cylinder about its own z axis, `height` long, with a half sphere at each end (outside `height`)."""
@@ -114,7 +217,28 @@ class Capsule(_Axial):
     name: str = "capsule"
     kind: ClassVar[str] = "capsule"
 
+    if TYPE_CHECKING:
 
+        def __init__(
+            self,
+            center: ArrayLike,
+            radius: float,
+            height: float,
+            wxyz: ArrayLike = IDENTITY,
+            name: str = "capsule",
+        ) -> None: ...
+
+    @property
+    def area(self) -> float:
+        return 2 * np.pi * self.radius * (2 * self.radius + self.height)
+
+    @property
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        half = np.abs(self.rotation[:, 2]) * self.height / 2 + self.radius
+        return np.stack([self.center - half, self.center + half])
+
+
+@no_type_check
 @dataclass(frozen=True, eq=False)
 class Mesh(Shape):
     """A triangle mesh; for collision, its surface."""
@@ -130,26 +254,60 @@ class Mesh(Shape):
     kind: ClassVar[str] = "mesh"
 
     def __post_init__(self) -> None:
-        vertices, faces = np.asarray(self.vertices, np.float64), np.asarray(self.faces, np.int64)
-        if vertices.ndim != 2 or vertices.shape[1] != 3 or not np.isfinite(vertices).all():
-            raise InputError(f"mesh.vertices has shape {vertices.shape}; it must be n x 3 finite numbers")
-        if faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-            raise InputError(f"mesh.faces has shape {faces.shape}; it must be n x 3 indices, at least one row")
-        if faces.min() < 0 or faces.max() >= len(vertices):
-            raise InputError(f"mesh.faces holds index {faces.max()}; there are {len(vertices)} vertices")
+        vertices, faces = numbers(self.vertices), numbers(self.faces)
+        if (
+            vertices is None
+            or vertices.ndim != 2
+            or vertices.shape[1] != 3
+            or not np.isfinite(vertices).all()
+        ):
+            raise InputError(f"mesh.vertices is {_form(vertices)}; it must be n x 3 finite numbers")
+        if faces is None or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
+            raise InputError(f"mesh.faces is {_form(faces)}; it must be n x 3 indices, at least one row")
+        if (faces != np.floor(faces)).any() or faces.min() < 0 or faces.max() >= len(vertices):
+            raise InputError(
+                f"mesh.faces holds values from {faces.min():g} to {faces.max():g}; "
+                f"they must be indices of the {len(vertices)} vertices"
+            )
         _set(
             self,
             vertices=vertices,
-            faces=faces,
-            xyz=_vector("mesh", "xyz", self.xyz, 3),
-            wxyz=_quaternion("mesh", self.wxyz),
+            faces=faces.astype(np.int64),
+            xyz=vector("mesh", "xyz", self.xyz, 3),
+            wxyz=unit_quaternion("mesh", self.wxyz),
         )
 
-    @property
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            vertices: ArrayLike,
+            faces: ArrayLike,
+            xyz: ArrayLike = (0.0, 0.0, 0.0),
+            wxyz: ArrayLike = IDENTITY,
+            file: str | None = None,
+            name: str = "mesh",
+        ) -> None: ...
+
+    @cached_property
     def world_vertices(self) -> Float[ndarray, "v 3"]:
         return self.vertices @ rotation_from_quaternion(self.wxyz).T + self.xyz
 
+    @cached_property
+    def face_areas(self) -> Float[ndarray, "f"]:
+        a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
+        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
+    @property
+    def area(self) -> float:
+        return float(self.face_areas.sum())
+
+    @property
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        return np.stack([self.world_vertices.min(axis=0), self.world_vertices.max(axis=0)])
+
+
+@no_type_check
 @dataclass(frozen=True, eq=False)
 class PointCloud(Shape):
     """Points, each of them a small sphere. May be empty."""
@@ -162,17 +320,40 @@ class PointCloud(Shape):
     kind: ClassVar[str] = "point_cloud"
 
     def __post_init__(self) -> None:
-        points = np.asarray(self.points, np.float64)
-        if points.size == 0:
+        points = numbers(self.points)
+        if points is not None and points.size == 0:
             points = points.reshape(0, 3)
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise InputError(f"point_cloud.points has shape {points.shape}; it must be n x 3")
+        if points is None or points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"point_cloud.points is {_form(points)}; it must be n x 3 numbers")
         if not np.isfinite(points).all():
             bad = int((~np.isfinite(points).all(axis=1)).sum())
             raise InputError(f"point_cloud.points holds {bad} points that are not finite; remove them")
-        _set(self, points=points, point_radius=_positive("point_cloud", "point_radius", self.point_radius))
+        _set(self, points=points, point_radius=positive("point_cloud", "point_radius", self.point_radius))
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            points: ArrayLike,
+            point_radius: float = 0.01,
+            file: str | None = None,
+            name: str = "point_cloud",
+        ) -> None: ...
+
+    @cached_property
+    def area(self) -> float:
+        """An estimate: one face of each cell, as wide as a point, that holds a point [m^2]."""
+        width = 2 * self.point_radius
+        return len(voxel_thin(self.points, width)) * width**2
+
+    @cached_property
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        if len(self.points) == 0:
+            return np.zeros((2, 3))
+        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        return np.stack([low - self.point_radius, high + self.point_radius])
 
 
 def pose(shape: Box | Cylinder | Capsule) -> Float[ndarray, "4 4"]:
     """T_base_shape of a shape with a centre and a quaternion."""
-    return transform(shape.center, rotation_from_quaternion(shape.wxyz))
+    return transform(shape.center, shape.rotation)

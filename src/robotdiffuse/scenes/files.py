@@ -1,0 +1,185 @@
+"""Scenes in problem files: plain dictionaries to shapes and back; YAML and mesh files."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import MISSING, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.scenes.point_cloud import read_points
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import (
+    IDENTITY,
+    Box,
+    Capsule,
+    Cylinder,
+    Mesh,
+    PointCloud,
+    Shape,
+    Sphere,
+    shown,
+)
+
+SHAPES: dict[str, type[Shape]] = {
+    shape.kind: shape for shape in (Sphere, Box, Cylinder, Capsule, Mesh, PointCloud)
+}
+MESH_FORMATS = (".dae", ".glb", ".obj", ".off", ".ply", ".stl")
+CONTENT = {"mesh": ("vertices", "faces"), "point_cloud": ("points",)}
+"""The fields that a `file` stands for."""
+
+
+class _Loader(yaml.CSafeLoader):
+    """Reads 1e-3 and 2.5e3 as numbers, which YAML 1.1 takes for texts."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
+    list("-+.0123456789"),
+)
+
+
+def read_text(file: str | Path) -> str:
+    """The content of a text file; InputError if it is missing or not text."""
+    try:
+        return Path(file).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{file} does not exist") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{file} cannot be read: {error}") from None
+
+
+def read_yaml(file: str | Path) -> object:
+    """The content of a YAML (or JSON) file; InputError with the line if it is not valid."""
+    text = read_text(file)
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise InputError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
+
+
+def check_fields(
+    where: str, data: object, required: Iterable[str], optional: Iterable[str] = ()
+) -> dict[str, Any]:
+    """`data`, if it is a mapping with all required fields and no unknown ones; InputError otherwise."""
+    required = tuple(required)
+    known = (*required, *optional)
+    if not isinstance(data, dict):
+        raise InputError(f"{where} is {shown(data)}; it must be a mapping with the fields {', '.join(known)}")
+    for name in data:
+        if name not in known:
+            raise unknown_name(f"field of {where}:", name, known)
+    missing = [name for name in required if name not in data]
+    if missing:
+        raise InputError(f"{where} has no {' and no '.join(missing)}; known fields: {', '.join(known)}")
+    return data
+
+
+def read_scene(entries: object, folder: Path) -> tuple[Scene, tuple[str, ...]]:
+    """A scene from the list in a problem file, and notes on what was changed in it.
+
+    Files are looked up from `folder`. Raises InputError for an unknown shape or field, for values of the
+    wrong kind and for files that cannot be read; the message starts with the place, e.g. scene[2].
+    """
+    if not isinstance(entries, list):
+        raise InputError(
+            f"scene is {shown(entries)}; it must be a list of shapes or the name of a MoveIt scene file"
+        )
+    shapes: list[Shape] = []
+    notes: list[str] = []
+    for i, entry in enumerate(entries):
+        where = f"scene[{i}]"
+        if not isinstance(entry, dict) or len(entry) != 1:
+            raise InputError(
+                f"{where} is {shown(entry)}; it must be one shape, e.g. {{sphere: {{...}}}}; "
+                f"known: {', '.join(SHAPES)}"
+            )
+        [(kind, values)] = entry.items()
+        if kind not in SHAPES:
+            raise unknown_name(f"shape in {where}:", kind, SHAPES)
+        shapes.append(_shape(f"{where}.{kind}", SHAPES[kind], values, folder, notes))
+    return Scene(shapes), tuple(notes)
+
+
+def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: list[str]) -> Shape:
+    required = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]  # type: ignore[arg-type]
+    optional = [f.name for f in fields(kind) if f.name not in required]  # type: ignore[arg-type]
+    if isinstance(values, dict) and "file" in values:
+        content = CONTENT.get(kind.kind, ())
+        required, optional = ["file"], [name for name in optional if name != "file"]
+        values = dict(check_fields(where, values, required, optional))
+        if not isinstance(values["file"], str) or not values["file"]:
+            raise InputError(f"{where}.file is {shown(values['file'])}; it must be the name of a file")
+        values["file"] = str(folder / values["file"])
+        try:
+            arrays = read_mesh(values["file"]) if kind is Mesh else _points(values["file"], notes)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        values |= dict(zip(content, arrays, strict=True))
+    else:
+        values = check_fields(where, values, required, optional)
+    try:
+        return kind(**values)
+    except InputError as error:
+        raise InputError(f"{where.removesuffix(kind.kind)}{error}") from None
+
+
+def _points(file: str, notes: list[str]) -> tuple[ndarray]:
+    points, more = read_points(file)
+    notes.extend(more)
+    return (points,)
+
+
+def read_mesh(file: str | Path) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
+    """Vertices [m] and faces of a mesh file; InputError if it is missing, empty or damaged."""
+    import trimesh
+
+    file = Path(file)
+    if file.suffix.lower() not in MESH_FORMATS:
+        raise unknown_name(f"mesh format of {file}:", file.suffix, MESH_FORMATS)
+    if not file.is_file():
+        raise InputError(f"mesh file {file} does not exist")
+    if file.stat().st_size == 0:
+        raise InputError(f"mesh file {file} is empty")
+    try:
+        mesh = trimesh.load_mesh(file, process=False)
+    except Exception as error:  # trimesh raises whatever its parsers meet in a damaged file
+        raise InputError(f"mesh file {file} cannot be read: {' '.join(str(error).split())}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise InputError(f"mesh file {file} holds no triangles")
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+
+
+def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str, object]]]:
+    """The scene as `read_scene` takes it: exact. Shapes read from files are written as their file's name."""
+    return [{shape.kind: _values(shape, folder)} for shape in scene.shapes]
+
+
+def _values(shape: Shape, folder: Path | None) -> dict[str, object]:
+    file = getattr(shape, "file", None)
+    left_out = {"file"} if file is None else {*CONTENT[shape.kind], "file"}
+    values: dict[str, object] = {} if file is None else {"file": _name_from(folder, Path(file))}
+    for f in fields(shape):  # type: ignore[arg-type]
+        value = getattr(shape, f.name)
+        if f.name not in left_out:
+            values[f.name] = value.tolist() if isinstance(value, ndarray) else value
+    if values["name"] == shape.kind:
+        del values["name"]
+    if values.get("wxyz") == list(IDENTITY):
+        del values["wxyz"]
+    return values
+
+
+def _name_from(folder: Path | None, file: Path) -> str:
+    """Relative for files in the folder and below it, so that the folder can be moved."""
+    file = file.resolve()
+    if folder is None:
+        return str(file)
+    folder = folder.resolve()
+    return file.relative_to(folder).as_posix() if file.is_relative_to(folder) else str(file)

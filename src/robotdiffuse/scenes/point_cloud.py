@@ -1,0 +1,147 @@
+"""Point clouds: reading files, thinning, cropping."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError, unknown_name
+
+
+def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m 3"]:
+    """The first point of every occupied cell of a grid with cells `voxel` wide [m], in the old order.
+
+    A dropped point is less than sqrt(3) * voxel away from one that was kept.
+    """
+    if len(points) == 0:
+        return points
+    cells = np.floor(points * (1 / voxel))
+    cells -= cells.min(axis=0)
+    extent = cells.max(axis=0) + 1
+    bits = len(points).bit_length()
+    if extent.prod() * 2.0**bits < 2.0**62 and extent.prod() < 2.0**53:
+        # One sort of cell number and point number packed together is several times faster than np.unique.
+        cell = (cells @ np.array([extent[1] * extent[2], extent[2], 1.0])).astype(np.int64)
+        packed = np.sort((cell << bits) | np.arange(len(points)))
+        first = np.flatnonzero(np.diff(packed >> bits, prepend=-1))
+        kept = packed[first] & ((1 << bits) - 1)
+    else:
+        kept = np.unique(cells, axis=0, return_index=True)[1]
+    return points[np.sort(kept)]
+
+
+def crop(points: Float[ndarray, "n 3"], center: Float[ndarray, "3"], reach: float) -> Float[ndarray, "m 3"]:
+    """The points within `reach` of `center` [m]."""
+    return points[((points - center) ** 2).sum(axis=1) <= reach**2]
+
+
+def read_points(file: str | Path) -> tuple[Float[ndarray, "n 3"], tuple[str, ...]]:
+    """The points of a .ply, .pcd, .xyz, .csv, .npy or .npz file [m], and notes on what was left out.
+
+    Points that are not finite (a depth camera's misses) are removed, with a note. Columns after the third
+    are ignored. Raises InputError if the file is missing, empty or holds something else.
+    """
+    file = Path(file)
+    reader = READERS.get(file.suffix.lower())
+    if reader is None:
+        raise unknown_name(f"point cloud format of {file}:", file.suffix, READERS)
+    if not file.is_file():
+        raise InputError(f"point cloud file {file} does not exist")
+    if file.stat().st_size == 0:
+        raise InputError(f"point cloud file {file} is empty")
+    try:
+        points = np.asarray(reader(file), dtype=np.float64)
+    except InputError:
+        raise
+    except Exception as error:  # the readers raise whatever their library does about a damaged file
+        raise InputError(f"point cloud file {file} cannot be read: {' '.join(str(error).split())}") from None
+    if points.size == 0:
+        return np.zeros((0, 3)), (f"{file} holds no points",)
+    if points.ndim != 2 or points.shape[1] < 3:
+        shape = " x ".join(map(str, points.shape))
+        raise InputError(f"point cloud file {file} holds an array of {shape}; it must be n x 3")
+    points = np.ascontiguousarray(points[:, :3])
+    finite = np.isfinite(points).all(axis=1)
+    if finite.all():
+        return points, ()
+    removed = int((~finite).sum())
+    return points[finite], (f"{file}: {removed} of {len(points)} points are not finite and were removed",)
+
+
+def _read_ply(file: Path) -> ndarray:
+    from trimesh.exchange.ply import load_ply
+
+    with file.open("rb") as stream:
+        fields = load_ply(stream)
+    return fields.get("vertices", np.zeros((0, 3)))
+
+
+def _read_text(file: Path) -> ndarray:
+    """Numbers in columns, parted by commas or blanks; a line of names may come first."""
+    with file.open(encoding="utf-8") as stream:
+        first = stream.readline()
+    delimiter = "," if "," in first else None
+    names = [name.strip().strip('"').lower() for name in first.split(delimiter)]
+    header = not _is_number(names[0])
+    columns = [names.index(axis) for axis in "xyz"] if header and {"x", "y", "z"} <= {*names} else None
+    if header and not file.read_text(encoding="utf-8").partition("\n")[2].strip():
+        return np.zeros((0, 3))
+    return np.loadtxt(file, delimiter=delimiter, skiprows=int(header), usecols=columns, ndmin=2, comments="#")
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return text.startswith("#")
+    return True
+
+
+def _read_npz(file: Path) -> ndarray:
+    arrays = np.load(file, allow_pickle=False)
+    if "points" not in arrays and len(arrays.files) != 1:
+        raise InputError(f"point cloud file {file} holds {', '.join(arrays.files)}; one must be named points")
+    return arrays["points" if "points" in arrays else arrays.files[0]]
+
+
+def _read_pcd(file: Path) -> ndarray:
+    """PCD version 0.7: https://pointclouds.org/documentation/tutorials/pcd_file_format.html"""
+    content = file.read_bytes()
+    header: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in header:
+        end = content.index(b"\n", at)
+        words = content[at:end].decode("ascii").split()
+        at = end + 1
+        if words and not words[0].startswith("#"):
+            header[words[0]] = words[1:]
+    names, storage = header["FIELDS"], header["DATA"][0]
+    counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
+    if not {"x", "y", "z"} <= {*names}:
+        raise InputError(
+            f"point cloud file {file} has the fields {', '.join(names)}; it must have x, y and z"
+        )
+    total = int(header["POINTS"][0])
+    if storage == "ascii":
+        columns = [sum(counts[: names.index(axis)]) for axis in "xyz"]
+        rows = content[at:].decode("ascii").splitlines()
+        return np.loadtxt(rows, usecols=columns, ndmin=2, max_rows=total) if total else np.zeros((0, 3))
+    if storage != "binary":
+        raise InputError(f"point cloud file {file} is stored as {storage}; it must be ascii or binary")
+    kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
+    # Positions as names: PCL writes several padding fields that are all called "_".
+    record = np.dtype([(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))])
+    points = np.frombuffer(content, record, count=total, offset=at)
+    return np.stack([points[str(names.index(axis))][:, 0].astype(np.float64) for axis in "xyz"], axis=1)
+
+
+READERS: dict[str, Callable[[Path], ndarray]] = {
+    ".ply": _read_ply,
+    ".pcd": _read_pcd,
+    ".xyz": _read_text,
+    ".csv": _read_text,
+    ".npy": lambda file: np.load(file, allow_pickle=False),
+    ".npz": _read_npz,
+}

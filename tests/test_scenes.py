@@ -1,0 +1,381 @@
+"""Shapes, points on their surfaces, point clouds and the files that hold them."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy import ndarray
+from trimesh.triangles import closest_point
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.scenes.files import SHAPES as KINDS
+from robotdiffuse.scenes.files import read_mesh, read_scene, read_yaml, scene_entries
+from robotdiffuse.scenes.point_cloud import crop, read_points, voxel_thin
+from robotdiffuse.scenes.sampling import SAMPLERS, VisibleRegion, sample_surface
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
+
+TURN = (0.8, 0.2, -0.5, 0.3)
+"""Not of length 1, on purpose."""
+TETRAHEDRON = ([[0, 0, 0], [1, 0, 0], [0, 2, 0], [0, 0, 3]], [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+SHAPES: dict[str, Shape] = {
+    "sphere": Sphere([0.1, 0.2, 0.9], 0.3),
+    "box": Box([0.1, 0.2, 0.9], [0.2, 0.5, 0.9], TURN),
+    "cylinder": Cylinder([0.1, 0.2, 0.9], 0.1, 0.7, TURN),
+    "capsule": Capsule([0.1, 0.2, 0.9], 0.1, 0.7, TURN),
+    "mesh": Mesh(*TETRAHEDRON, xyz=[0.1, 0.2, 0.3], wxyz=TURN),
+    "point_cloud": PointCloud(np.random.default_rng(0).uniform(0.2, 0.6, (500, 3))),
+}
+EVERYWHERE = VisibleRegion(floor=-10.0, reach=100.0)
+
+
+def surface_distance(shape: Shape, points: ndarray) -> ndarray:
+    """How far points are from the surface, by another form than the samplers'."""
+    if isinstance(shape, PointCloud):
+        return np.abs(points[:, None] - shape.points).max(axis=2).min(axis=1)
+    if isinstance(shape, Mesh):
+        triangles = shape.world_vertices[shape.faces]
+        gaps = [points - closest_point(np.repeat(t[None], len(points), 0), points) for t in triangles]
+        return np.linalg.norm(gaps, axis=2).min(axis=0)
+    assert isinstance(shape, Sphere | Box | Cylinder | Capsule)
+    local = points - shape.center
+    if isinstance(shape, Sphere):
+        return np.abs(np.linalg.norm(local, axis=1) - shape.radius)
+    local = local @ shape.rotation
+    if isinstance(shape, Box):
+        return np.abs((np.abs(local) - shape.size / 2).max(axis=1))
+    radial, along = np.linalg.norm(local[:, :2], axis=1), np.abs(local[:, 2]) - shape.height / 2
+    if isinstance(shape, Cylinder):
+        return np.abs(np.maximum(radial - shape.radius, along))
+    return np.abs(np.hypot(radial, np.maximum(0, along)) - shape.radius)
+
+
+def test_every_shape_has_a_sampler() -> None:
+    assert {*KINDS.values()} == {*SAMPLERS} == {type(shape) for shape in SHAPES.values()}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_samples_lie_on_the_surface_and_in_the_bounds(name: str) -> None:
+    shape = SHAPES[name]
+    points = SAMPLERS[type(shape)](shape, 2000, np.random.default_rng(1))
+    assert points.shape == (2000, 3)
+    assert surface_distance(shape, points).max() < 1e-9
+    low, high = shape.bounds
+    assert (points > low - 1e-9).all() and (points < high + 1e-9).all()
+    # Tight: some point comes near each side (3 % of the extent; a tetrahedron's corners are rarely hit).
+    slack = (0.2 if name == "mesh" else 0.05) * (high - low)
+    assert (points.min(axis=0) < low + slack).all() and (points.max(axis=0) > high - slack).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "share"),
+    [
+        ("sphere", lambda local: local[:, 2] > 0.15, 1 / 4),
+        ("box", lambda local: np.abs(local[:, 0]) > 0.1 - 1e-9, 2 * 0.45 / 1.46),
+        ("box", lambda local: np.abs(local[:, 2]) > 0.45 - 1e-9, 2 * 0.1 / 1.46),
+        ("cylinder", lambda local: np.abs(local[:, 2]) > 0.35 - 1e-9, 0.1 / 0.8),
+        ("cylinder", lambda local: np.hypot(local[:, 0], local[:, 1]) < 0.05, 0.1 / 0.8 / 4),
+        ("capsule", lambda local: np.abs(local[:, 2]) > 0.35, 0.2 / 0.9),
+        ("capsule", lambda local: local[:, 2] > 0.4, 0.05 / 0.9),
+    ],
+)
+def test_samples_are_uniform_by_area(name: str, part: Callable[[ndarray], ndarray], share: float) -> None:
+    shape = SHAPES[name]
+    points = SAMPLERS[type(shape)](shape, 40000, np.random.default_rng(2)) - shape.center  # type: ignore[attr-defined]
+    found = part(points if name == "sphere" else points @ shape.rotation).mean()  # type: ignore[attr-defined]
+    # Five standard deviations of a share among 40,000 draws.
+    assert abs(found - share) < 5 * np.sqrt(share * (1 - share) / 40000)
+
+
+def test_areas() -> None:
+    mesh = trimesh.Trimesh(*TETRAHEDRON)
+    assert SHAPES["mesh"].area == pytest.approx(mesh.area)
+    for shape, made in {
+        "cylinder": trimesh.creation.cylinder(0.1, 0.7, sections=400),
+        "capsule": trimesh.creation.capsule(0.7, 0.1, count=[100, 100]),
+        "box": trimesh.creation.box([0.2, 0.5, 0.9]),
+        "sphere": trimesh.creation.icosphere(5, 0.3),
+    }.items():
+        assert SHAPES[shape].area == pytest.approx(made.area, rel=2e-3)
+
+
+def test_surface_is_shared_by_area_and_seeded() -> None:
+    scene = Scene([Sphere([0.3, 0, 0.5], 0.1), Sphere([-0.3, 0, 0.5], 0.2)])
+    points = sample_surface(scene, 5000, np.random.default_rng(3))
+    assert points.shape == (5000, 3)
+    assert abs((points[:, 0] > 0).mean() - 1 / 5) < 0.03
+    # In random order: any part of the points is of the whole scene.
+    assert abs((points[:1000, 0] > 0).mean() - 1 / 5) < 0.07
+    assert (points == sample_surface(scene, 5000, np.random.default_rng(3))).all()
+
+
+def test_surface_keeps_to_the_region() -> None:
+    region = VisibleRegion()
+    floor = Box([0, 0, -0.05], [2, 2, 0.1])
+    table = Box([1.5, 0, 0.4], [4.0, 4.0, 0.02])
+    points = sample_surface(Scene([floor, table]), 512, np.random.default_rng(4))
+    assert len(points) == 512
+    assert (points[:, 2] > region.floor).all()
+    assert (np.linalg.norm(points - region.center, axis=1) < region.reach).all()
+
+
+@pytest.mark.parametrize(
+    "shapes",
+    [[], [Sphere([5, 0, 0.5], 0.2)], [Box([0, 0, -0.05], [2, 2, 0.1])], [PointCloud([])]],
+    ids=["nothing", "out of reach", "floor alone", "empty cloud"],
+)
+def test_surface_of_nothing_visible(shapes: list[Shape]) -> None:
+    assert sample_surface(Scene(shapes), 64, np.random.default_rng(5)).shape == (0, 3)
+
+
+def test_a_sliver_in_reach_is_repeated() -> None:
+    points = sample_surface(Scene([Sphere([1.3, 0, 0.3], 0.1001)]), 512, np.random.default_rng(6))
+    assert len(points) in (0, 512)
+
+
+def test_region_refuses_a_floor_above_the_reach() -> None:
+    with pytest.raises(InputError, match="floor is 2"):
+        VisibleRegion(floor=2.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Sphere([0, 0], 1), r"sphere.center is \[0, 0\]; it must be 3 finite numbers"),
+        (lambda: Sphere([0, 0, np.nan], 1), "sphere.center"),
+        (lambda: Sphere(["a", 0, 0], 1), "sphere.center"),
+        (lambda: Sphere(["1", "2", "3"], 1), "sphere.center"),
+        (lambda: Sphere([0, 0, 0], -1), "sphere.radius is -1; it must be a positive number"),
+        (lambda: Sphere([0, 0, 0], True), "sphere.radius is True"),
+        (lambda: Sphere([0, 0, 0], 1, name=""), "sphere.name"),
+        (lambda: Box([0, 0, 0], [1, 0, 1]), "box.size"),
+        (lambda: Box([0, 0, 0], [1, 1, 1], [0, 0, 0, 0]), "must not be zero"),
+        (lambda: Cylinder([0, 0, 0], 1, np.inf), "cylinder.height is inf"),
+        (lambda: Capsule([0, 0, 0], None, 1), "capsule.radius is None"),  # type: ignore[arg-type]
+        (lambda: Mesh([[0, 0, 0]], [[0, 0, 1]]), "indices of the 1 vertices"),
+        (lambda: Mesh([[0, 0, 0]], []), "mesh.faces"),
+        (lambda: PointCloud([[0, 0]]), "an array of 1 x 2; it must be n x 3"),
+        (lambda: PointCloud([[0, 0, np.inf]]), "1 points that are not finite"),
+        (lambda: PointCloud([[0, 0, 0], [1]]), "not numbers"),
+        (lambda: PointCloud([], point_radius=0), "point_cloud.point_radius is 0"),
+        (lambda: Scene(["ball"]), r"scene\[0\] is a str"),  # type: ignore[list-item]
+    ],
+)
+def test_wrong_shapes(make: Callable[[], Shape], message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        make()
+    assert "\n" not in str(raised.value)
+
+
+def test_names_are_made_unique() -> None:
+    ball = Sphere([0, 0, 0], 1)
+    assert [shape.name for shape in Scene([ball, ball, ball]).shapes] == ["sphere", "sphere_2", "sphere_3"]
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-3, 3, width=32)] * 3), max_size=60),
+    st.sampled_from([1e-6, 0.01, 0.5, 10.0]),
+)
+def test_thinning_keeps_one_point_of_each_cell(rows: list[tuple[float, float, float]], voxel: float) -> None:
+    points = np.array(rows, np.float64).reshape(-1, 3)
+    kept = voxel_thin(points, voxel)
+    cells = np.floor(points * (1 / voxel))
+    assert len(kept) == len(np.unique(cells, axis=0))
+    assert len(np.unique(np.floor(kept * (1 / voxel)), axis=0)) == len(kept)
+    if len(points):
+        gap = np.linalg.norm(points[:, None] - kept, axis=2).min(axis=1)
+        assert (gap <= np.sqrt(3) * voxel * (1 + 1e-9)).all()
+        assert (gap[(points[:, None] == kept).all(axis=2).any(axis=1)] == 0).all()
+
+
+def test_thinning_of_points_far_apart() -> None:
+    points = np.array([[-1e9, 0, 0], [1e9, 5e8, 1e9], [1e9, 5e8, 1e9], [0, 0, 0]])
+    assert len(voxel_thin(points, 1e-3)) == 3
+
+
+def test_crop() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0]])
+    assert (crop(points, np.array([1.0, 0, 0]), 1.0) == points[:2]).all()
+
+
+POINTS = np.random.default_rng(7).uniform(-1, 1, (50, 3)).astype(np.float32).astype(np.float64)
+PCD = """# .PCD v0.7
+VERSION 0.7
+FIELDS rgb x y z _
+SIZE 4 4 4 4 1
+TYPE U F F F U
+COUNT 1 1 1 1 4
+WIDTH {n}
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS {n}
+DATA {data}
+"""
+
+
+def ply(points: ndarray, binary: bool) -> bytes:
+    kind = "binary_little_endian" if binary else "ascii"
+    header = f"ply\nformat {kind} 1.0\nelement vertex {len(points)}\n"
+    header += "property float x\nproperty float y\nproperty float z\nend_header\n"
+    rows = points.astype("<f4").tobytes() if binary else text(points, " ")
+    return header.encode() + rows
+
+
+def pcd(points: ndarray, binary: bool) -> bytes:
+    header = PCD.format(n=len(points), data="binary" if binary else "ascii").encode()
+    if not binary:
+        return header + "".join(f"7 {x!r} {y!r} {z!r} 0 0 0 0\n" for x, y, z in points.tolist()).encode()
+    record = np.zeros(len(points), np.dtype([("rgb", "<u4"), ("xyz", "<f4", 3), ("_", "u1", 4)]))
+    record["xyz"] = points
+    return header + record.tobytes()
+
+
+def text(points: ndarray, delimiter: str, header: str = "") -> bytes:
+    return (header + "".join(delimiter.join(map(repr, row)) + "\n" for row in points.tolist())).encode()
+
+
+def write_points(folder: Path, form: str, points: ndarray) -> Path:
+    file = folder / f"cloud.{form.split()[0]}"
+    swapped = text(points[:, ::-1], ",", "z, y, x\n")
+    match form:
+        case "npy":
+            np.save(file, points)
+        case "npz":
+            np.savez(file, points=points, colors=points)
+        case "ply ascii" | "ply binary":
+            file.write_bytes(ply(points, form.endswith("binary")))
+        case "pcd ascii" | "pcd binary":
+            file.write_bytes(pcd(points, form.endswith("binary")))
+        case "csv":
+            file.write_bytes(text(points, ","))
+        case "csv with names":
+            file.write_bytes(swapped)
+        case "xyz":
+            file.write_bytes(text(np.column_stack([points, points]), " ", "# made by hand\n"))
+    return file
+
+
+FORMS = ["npy", "npz", "ply ascii", "ply binary", "pcd ascii", "pcd binary", "csv", "csv with names", "xyz"]
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_point_files(form: str, tmp_path: Path) -> None:
+    points, notes = read_points(write_points(tmp_path, form, POINTS))
+    assert notes == ()
+    assert (points == POINTS).all()
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_points_that_are_not_finite_are_removed_and_said(form: str, tmp_path: Path) -> None:
+    spoilt = POINTS.copy()
+    spoilt[3], spoilt[9, 1] = np.nan, np.nan
+    points, notes = read_points(write_points(tmp_path, form, spoilt))
+    assert (points == np.delete(POINTS, [3, 9], axis=0)).all()
+    assert len(notes) == 1 and "2 of 50 points are not finite" in notes[0]
+
+
+@pytest.mark.parametrize("form", [f for f in FORMS if f != "xyz"])
+def test_files_of_no_points(form: str, tmp_path: Path) -> None:
+    file = write_points(tmp_path, form, POINTS[:0])
+    if file.stat().st_size == 0:
+        with pytest.raises(InputError, match="is empty"):
+            read_points(file)
+    else:
+        points, notes = read_points(file)
+        assert points.shape == (0, 3) and "holds no points" in notes[0]
+
+
+@pytest.mark.parametrize("form", ["ply ascii", "ply binary", "pcd ascii", "pcd binary", "npy", "npz"])
+def test_damaged_point_files(form: str, tmp_path: Path) -> None:
+    file = write_points(tmp_path, form, POINTS)
+    file.write_bytes(file.read_bytes()[: 100 if form.startswith("np") else 240])
+    with pytest.raises(InputError, match=r"cannot be read|holds") as raised:
+        read_points(file)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("cloud.las", b"x", "known: .csv, .npy, .npz, .pcd, .ply, .xyz"),
+        ("cloud.ply", None, "does not exist"),
+        ("cloud.ply", b"", "is empty"),
+        ("cloud.csv", b"1,2\n3,4\n", "an array of 2 x 2; it must be n x 3"),
+        ("cloud.xyz", b"1 2 3\n4 five 6\n", "cannot be read"),
+        ("cloud.pcd", PCD.format(n=1, data="binary_compressed").encode(), "stored as binary_compressed"),
+        (
+            "cloud.pcd",
+            PCD.replace("x y z", "i j k").format(n=1, data="ascii").encode(),
+            "must have x, y and z",
+        ),
+    ],
+)
+def test_wrong_point_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message):
+        read_points(tmp_path / name)
+
+
+@pytest.mark.parametrize("ending", ["stl", "obj", "ply", "off", "glb"])
+def test_mesh_files(ending: str, tmp_path: Path) -> None:
+    trimesh.creation.box([1, 2, 3]).export(tmp_path / f"box.{ending}")
+    vertices, faces = read_mesh(tmp_path / f"box.{ending}")
+    assert len(faces) == 12
+    assert np.abs(vertices).max(axis=0) == pytest.approx([0.5, 1, 1.5])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.stl", None, "does not exist"),
+        ("a.stl", b"", "is empty"),
+        ("a.stl", b"nonsense", "cannot be read|no triangles"),
+        ("a.obj", b"v 0 0 0\n", "cannot be read|no triangles"),
+        ("a.txt", b"", "mesh format"),
+    ],
+)
+def test_wrong_mesh_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message) as raised:
+        read_mesh(tmp_path / name)
+    assert "\n" not in str(raised.value)
+
+
+def assert_equal(a: Scene, b: Scene) -> None:
+    assert [type(shape) for shape in a.shapes] == [type(shape) for shape in b.shapes]
+    for one, other in zip(a.shapes, b.shapes, strict=True):
+        for name in one.__dataclass_fields__:  # type: ignore[attr-defined]
+            assert np.array_equal(getattr(one, name), getattr(other, name)), f"{one.name}.{name}"
+
+
+def test_scene_entries_are_read_back_exactly(tmp_path: Path) -> None:
+    scene = Scene([*SHAPES.values(), *SHAPES.values(), Box([0, 0, 0], [1, 1, 1], name="lid")])
+    back, notes = read_scene(scene_entries(scene, tmp_path), tmp_path)
+    assert notes == ()
+    assert_equal(scene, back)
+
+
+def test_shapes_from_files_are_written_as_names_of_files(tmp_path: Path) -> None:
+    trimesh.creation.box([1, 2, 3]).export(tmp_path / "box.stl")
+    np.save(tmp_path / "cloud.npy", [[0.1, 0.2, np.nan], [1, 2, 3]])
+    entries = [
+        {"mesh": {"file": "box.stl", "xyz": [0, 0, 1]}},
+        {"point_cloud": {"file": "cloud.npy", "point_radius": 0.02}},
+    ]
+    scene, notes = read_scene(entries, tmp_path)
+    assert len(notes) == 1 and "1 of 2 points" in notes[0]
+    written = scene_entries(scene, tmp_path)
+    assert written == [{"mesh": {"file": "box.stl", "xyz": [0.0, 0.0, 1.0]}}, entries[1]]
+    assert scene_entries(scene, None)[0]["mesh"]["file"] == str((tmp_path / "box.stl").resolve())
+    assert_equal(scene, read_scene(written, tmp_path)[0])
+
+
+def test_yaml_numbers_with_exponents(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("[1e-3, 2.5e3, -1E+2, .5e1, 1e, e1, 3]")
+    assert read_yaml(tmp_path / "a.yaml") == [1e-3, 2500.0, -100.0, 5.0, "1e", "e1", 3]
