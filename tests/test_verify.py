@@ -169,6 +169,15 @@ def test_the_first_of_two_collisions_is_reported() -> None:
     assert found.message.startswith("l3 is 7.") or found.message.startswith("l3 is 8.0 cm inside b")
 
 
+def test_a_contact_with_two_obstacles_at_once_has_a_depth() -> None:
+    """The nearer of two that the arm starts in, whichever the search met first."""
+    deep, shallow = Sphere(vector(1.1, 0.02, 0), 0.1, "deep"), Sphere(vector(1.15, 0.12, 0), 0.1, "shallow")
+    for shapes in ((deep, shallow), (shallow, deep)):
+        found = refused(judge(np.array([[0, 0, 0], [-0.5, 0, 0]]), *shapes), "scene_collision")
+        assert (found.time, found.subject, found.other) == (0, "l3", "deep")
+        assert found.excess == pytest.approx(0.11, abs=0.003)
+
+
 def test_self_collision_between_waypoints() -> None:
     rows = np.array([[0, 2.7, 1.0], [0, 2.7, 2.7]])
     found = refused(judge(rows), "self_collision")
