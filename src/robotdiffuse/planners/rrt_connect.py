@@ -24,20 +24,22 @@ RETREAT_STEPS = 100
 
 @dataclass(frozen=True)
 class RRTConnectSettings:
-    reach: float = 1.5
+    reach: float = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
     resolution: float = 0.04
     """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
     covers the rest, and a path that it refuses is searched again at half the distance."""
-    shortcuts: int = 60
-    """Attempts to shorten each path found."""
+    searches: int = 2
+    """Paths found, the shortest of which is shortened: a second search costs less than the shortcuts it saves."""
+    shortcuts: int = 30
+    """Attempts to shorten a path."""
     optimize_time: float = 0.0
     """Time spent on restarts and more shortcuts after the first path [s]; the shortest path is kept."""
     capacity: int = 20_000
     """Most nodes of a tree; a full pair of trees is started anew."""
 
     def __post_init__(self) -> None:
-        for name in ("reach", "resolution", "capacity"):
+        for name in ("reach", "resolution", "capacity", "searches"):
             if not getattr(self, name) > 0:
                 raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must be positive")
         for name in ("shortcuts", "optimize_time"):
@@ -181,6 +183,26 @@ class RRTConnect:
         state: ndarray,
         until: float,
     ) -> Float[ndarray, "n dof"] | None:
+        """The shortest of some searches, shortened; None if the first of them takes until `until` [s]."""
+        best: ndarray | None = None
+        for _ in range(settings.searches):
+            path = self._search_once(call, space, start, goals, settings, state, until)
+            if path is None:
+                break
+            if best is None or kernel.path_length(path) < kernel.path_length(best):
+                best = path
+        return None if best is None else kernel.shortcut(space, best, settings.shortcuts, state)
+
+    def _search_once(
+        self,
+        call: Call,
+        space: kernel.Space,
+        start: ndarray,
+        goals: ndarray,
+        settings: RRTConnectSettings,
+        state: ndarray,
+        until: float,
+    ) -> Float[ndarray, "n dof"] | None:
         reach = np.float32(settings.reach)
         capacity = settings.capacity + len(goals)
         while True:
@@ -188,6 +210,6 @@ class RRTConnect:
             while trees.sizes.max() < capacity:
                 path = kernel.search(space, trees, reach, ITERATIONS, state)
                 if len(path):
-                    return kernel.shortcut(space, path, settings.shortcuts, state)
+                    return path
                 if call.elapsed > until:
                     return None
