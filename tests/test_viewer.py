@@ -12,7 +12,7 @@ from PIL import Image
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
-from robotdiffuse.robots.visual import VisualMesh, load_visual, write_visual
+from robotdiffuse.robots.visual import VisualMesh, load_visual, visual_meshes, write_visual
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 from robotdiffuse.transforms import transform
@@ -229,6 +229,22 @@ def test_visual_meshes_survive_the_file_and_must_agree(arm, tmp_path, monkeypatc
     np.testing.assert_array_equal(drawn["tip"][0].faces, CUBE)
     np.testing.assert_array_equal(drawn["tip"][0].colors, colors)
     np.testing.assert_array_equal(drawn["arm"][0].vertices, arm.meshes["arm"][0].vertices)
+
+
+def test_visual_meshes_of_a_urdf(tmp_path):
+    import trimesh
+
+    trimesh.Trimesh(CORNERS, CUBE, process=False).export(tmp_path / "cube.stl")
+    urdf = """<robot name="r"><link name="a"><visual><origin xyz="0 0 1" rpy="0 0 1.5707963267948966"/>
+      <geometry><mesh filename="{}" scale="1 2 3"/></geometry></visual></link></robot>"""
+    (tmp_path / "r.urdf").write_text(urdf.format("cube.stl"))
+    meshes = visual_meshes(tmp_path / "r.urdf")
+    assert list(meshes) == ["a"] and len(meshes["a"].vertices) == 8 and len(meshes["a"].faces) == 12
+    np.testing.assert_allclose(meshes["a"].vertices.min(0), [-2, -1, -2], atol=1e-6)
+    np.testing.assert_allclose(meshes["a"].vertices.max(0), [2, 1, 4], atol=1e-6)
+    (tmp_path / "r.urdf").write_text(urdf.format("package://gone/missing.stl"))
+    with pytest.raises(InputError, match=r"package://gone/missing\.stl"):
+        visual_meshes(tmp_path / "r.urdf")
 
 
 @pytest.mark.parametrize(

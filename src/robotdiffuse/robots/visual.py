@@ -158,13 +158,13 @@ def _read_mesh(file: Path, T_link_mesh: ndarray) -> list[tuple[ndarray, ndarray,
 
 
 def _joined(parts: list[tuple[ndarray, ndarray, ndarray]], share: float) -> VisualMesh:
-    import fast_simplification
-
     vertices, faces, colors, count = [], [], [], 0
     for points, triangles, color in parts:
         # Small pieces (covers, lamps, labels) lose their shape first, so they keep more of their faces.
         target = min(len(triangles), max(int(share * len(triangles)), 500))
         if target < len(triangles):
+            import fast_simplification
+
             reduction = 1 - target / len(triangles)
             points, triangles = fast_simplification.simplify(points, triangles, target_reduction=reduction)[
                 :2

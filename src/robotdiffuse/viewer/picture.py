@@ -20,8 +20,8 @@ from robotdiffuse.viewer.look import GOAL, START, Surface, join
 from robotdiffuse.viewer.raster import blend_ghost, draw, light_lattice, shade
 
 SUPERSAMPLING = 2
-SKY_LIGHTS, SKY_MAP = 72, 320
-KEY_LIGHTS, KEY_MAP = 36, 768
+SKY_LIGHTS, SKY_MAP = 60, 320
+KEY_LIGHTS, KEY_MAP = 28, 768
 """How many directions, and pixels along each side of the map of what each of them reaches."""
 LATTICE = 4
 """Light is gathered at every fourth pixel of the supersampled image."""
