@@ -73,8 +73,14 @@ class TrajectoryData:
         return self._rows(slice(None, cut)), self._rows(slice(cut, None))
 
     def _rows(self, rows: slice) -> "TrajectoryData":
-        arrays = (self.q, self.kinds, self.params, self.trivial, self.codes)
-        return TrajectoryData(*(array[rows] for array in arrays), self.digest)
+        return TrajectoryData(
+            self.q[rows],
+            self.kinds[rows],
+            self.params[rows],
+            self.trivial[rows],
+            self.codes[rows],
+            self.digest,
+        )
 
 
 def load_data(

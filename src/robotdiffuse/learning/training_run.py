@@ -103,7 +103,7 @@ class TrainingRun:
         torch.set_num_threads(self.settings.threads)
         try:
             with _stop_requested() as stop, _progress() as progress:
-                task = progress.add_task(title, total=1.0, completed=self.fraction, rate="", loss="")
+                task = progress.add_task(title, total=1.0, rate="", loss="")
                 last = saved = time.monotonic()
                 while self.fraction < 1.0 and not stop.is_set():
                     self.step(loss)
@@ -140,9 +140,8 @@ class TrainingRun:
         self._losses.append(value.item())
         with torch.no_grad():
             decay = min(self.average_decay, self.at.step / (self.at.step + 10))
-            torch._foreach_lerp_(
-                list(self.average.values()), [p.detach() for p in self.parameters.values()], 1 - decay
-            )
+            for name, p in self.parameters.items():
+                self.average[name].lerp_(p, 1 - decay)
 
     def _lr(self) -> float:
         warmup = min(1.0, (self.at.step + 1) / max(1, self.settings.warmup_steps))
@@ -222,7 +221,7 @@ class TrainingRun:
         }
         write_tensors(self._file, tensors, notes)
         text = io.StringIO()
-        writer = csv.DictWriter(text, COLUMNS)
+        writer: csv.DictWriter[str] = csv.DictWriter(text, COLUMNS)
         writer.writeheader()
         writer.writerows(self.rows)
         write_atomically(self.out / "log.csv", text.getvalue().encode())
