@@ -199,7 +199,12 @@ def _area(triangles: ndarray) -> float:
 def _grid(cloud: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Points sorted by cell, first point of each cell, distance grid and its frame (see SceneArrays)."""
     if not len(cloud):
-        return cloud.reshape(0, 4), np.zeros(2, np.int32), np.zeros((0, 0, 0), np.float32), np.ones(8, np.float32)
+        return (
+            cloud.reshape(0, 4),
+            np.zeros(2, np.int32),
+            np.zeros((0, 0, 0), np.float32),
+            np.ones(8, np.float32),
+        )
     radius = float(cloud[:, 3].max())
     low = cloud[:, :3].min(axis=0) - radius - GRID_BAND
     extent = cloud[:, :3].max(axis=0) + radius + GRID_BAND - low

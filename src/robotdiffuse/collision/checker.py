@@ -33,19 +33,20 @@ class CollisionChecker:
         """Whether each configuration is free of collision."""
         return lanes.free_many(self.robot_arrays, self.scene_arrays, _float32(q), self.padding)
 
-    def link_clearances(
-        self, q: Float[ndarray, "n dof"], limit: float = 1.0
-    ) -> Float[ndarray, "n links"]:
+    def link_clearances(self, q: Float[ndarray, "n dof"], limit: float = 1.0) -> Float[ndarray, "n links"]:
         """Signed distance of each moving link to the scene [m], at most `limit`; the lower, the faster.
 
         Towards point clouds and meshes at most 0.2 m less a sphere's radius.
         """
         limit = np.float32(limit)
-        return lane_clearance.link_clearances(self.robot_arrays, self.scene_arrays, _float32(q), limit) - self.padding
+        return (
+            lane_clearance.link_clearances(self.robot_arrays, self.scene_arrays, _float32(q), limit)
+            - self.padding
+        )
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
         """Distance between the links of each checked pair [m], at most 1 m."""
-        return distance.pair_clearances(self.robot_arrays, _float32(q), distance.CAP)
+        return lane_clearance.pair_clearances(self.robot_arrays, _float32(q), distance.CAP)
 
     def clearance(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n"]:
         """Least distance to the scene and between links [m], at most 1 m; negative in collision."""
@@ -59,7 +60,7 @@ class CollisionChecker:
 
         `margin` and `self_margin` [m]: distances to obstacles and between links below which cost arises.
         """
-        return distance.cost_gradients(
+        return lane_clearance.cost_gradients(
             self.robot_arrays,
             self.scene_arrays,
             _float32(q),

@@ -181,39 +181,6 @@ def scene_distance(scene, x, y, z, limit):
     return best, bx, by, bz
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
-def pair_clearance(robot, p, frames, limit):
-    """Least distance between the spheres of a checked pair if below `limit`, else `limit`."""
-    best = limit
-    a, b = robot.pairs[p, 0], robot.pairs[p, 1]
-    fa, fb = frames[robot.frame[a]], frames[robot.frame[b]]
-    bb = robot.bounds[b]
-    cx, cy, cz = placed(fb, bb[0], bb[1], bb[2])
-    for s in range(robot.first[a], robot.first[a + 1]):
-        x, y, z = placed(fa, robot.spheres[s, 0], robot.spheres[s, 1], robot.spheres[s, 2])
-        radius = robot.spheres[s, 3]
-        if np.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2) - bb[3] - radius >= best:
-            continue
-        for t in range(robot.first[b], robot.first[b + 1]):
-            u, v, w = placed(fb, robot.spheres[t, 0], robot.spheres[t, 1], robot.spheres[t, 2])
-            d = np.sqrt((x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2) - radius - robot.spheres[t, 3]
-            if d < best:
-                best = d
-    return best
-
-
-@njit(cache=True, nogil=True)
-def pair_clearances(robot, q, limit):
-    """[n, pairs] distances between checked pairs of links, at most `limit`."""
-    out = np.empty((len(q), len(robot.pairs)), np.float32)
-    frames = np.empty((q.shape[1] + 1, 12), np.float32)
-    for i in range(len(q)):
-        frames_of(robot, q[i], frames)
-        for p in range(len(robot.pairs)):
-            out[i, p] = pair_clearance(robot, p, frames, limit)
-    return out
-
-
 @njit(inline="always", _nrt=False)
 def _pull(robot, frames, frame, x, y, z, fx, fy, fz, sign, grad):
     """Adds sign * J^T f of a point at x of a frame to grad."""
@@ -224,30 +191,26 @@ def _pull(robot, frames, frame, x, y, z, fx, fy, fz, sign, grad):
             grad[j] += sign * (ax * fx + ay * fy + az * fz)
         else:
             rx, ry, rz = x - axis[9], y - axis[10], z - axis[11]
-            grad[j] += sign * (
-                (ay * rz - az * ry) * fx + (az * rx - ax * rz) * fy + (ax * ry - ay * rx) * fz
-            )
+            grad[j] += sign * ((ay * rz - az * ry) * fx + (az * rx - ax * rz) * fy + (ax * ry - ay * rx) * fz)
 
 
 @njit(fastmath=True, cache=True, _nrt=False)
-def cost_gradient_at(robot, scene, q, margin, self_margin, frames, grad):
+def cost_gradient_at(robot, scene, q, links, pairs, margin, self_margin, frames, grad):
     """Collision cost of a configuration and its gradient (added to `grad`).
 
     The cost is the paper's hinge h, squared: the sum over the spheres of (S - D)^2 / 2 for D < S, with D
     the signed distance and S the margin [m]; and the same between the links of the checked pairs.
+    `links` and `pairs` are the clearances of the moving groups and of the pairs here (`lane_clearance`), as far
+    as they are below the margins.
     """
     frames_of(robot, q, frames)
     cost = _ZERO
-    for g in range(len(robot.frame)):
+    fixed = len(robot.frame) - len(links)
+    for g in range(fixed, len(robot.frame)):
+        if links[g - fixed] >= margin:
+            continue
         index = robot.frame[g]
-        if index == 0:
-            continue
-        frame, bound = frames[index], robot.bounds[g]
-        x, y, z = placed(frame, bound[0], bound[1], bound[2])
-        reach = bound[3] + margin
-        d, _, _, _ = scene_distance(scene, x, y, z, reach)
-        if d >= reach:
-            continue
+        frame = frames[index]
         for s in range(robot.first[g], robot.first[g + 1]):
             x, y, z = placed(frame, robot.spheres[s, 0], robot.spheres[s, 1], robot.spheres[s, 2])
             reach = robot.spheres[s, 3] + margin
@@ -258,13 +221,11 @@ def cost_gradient_at(robot, scene, q, margin, self_margin, frames, grad):
                 _pull(robot, frames, index, x, y, z, nx, ny, nz, -h, grad)
     for p in range(len(robot.pairs)):
         a, b = robot.pairs[p, 0], robot.pairs[p, 1]
-        ia, ib = robot.frame[a], robot.frame[b]
-        fa, fb, ba, bb = frames[ia], frames[ib], robot.bounds[a], robot.bounds[b]
-        x, y, z = placed(fa, ba[0], ba[1], ba[2])
-        cx, cy, cz = placed(fb, bb[0], bb[1], bb[2])
-        reach = ba[3] + bb[3] + self_margin
-        if (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2 >= reach * reach:
+        if pairs[p] >= self_margin:
             continue
+        ia, ib = robot.frame[a], robot.frame[b]
+        fa, fb, bb = frames[ia], frames[ib], robot.bounds[b]
+        cx, cy, cz = placed(fb, bb[0], bb[1], bb[2])
         for s in range(robot.first[a], robot.first[a + 1]):
             x, y, z = placed(fa, robot.spheres[s, 0], robot.spheres[s, 1], robot.spheres[s, 2])
             reach = robot.spheres[s, 3] + bb[3] + self_margin
@@ -281,14 +242,3 @@ def cost_gradient_at(robot, scene, q, margin, self_margin, frames, grad):
                     _pull(robot, frames, ia, x, y, z, nx, ny, nz, -h, grad)
                     _pull(robot, frames, ib, u, v, w, nx, ny, nz, h, grad)
     return cost
-
-
-@njit(cache=True, nogil=True)
-def cost_gradients(robot, scene, q, margin, self_margin):
-    """Collision costs [n] of the rows of q[n, dof] and their gradients [n, dof]; see `cost_gradient_at`."""
-    n, dof = q.shape
-    costs, grads = np.empty(n, np.float32), np.zeros((n, dof), np.float32)
-    frames = np.empty((dof + 1, 12), np.float32)
-    for i in range(n):
-        costs[i] = cost_gradient_at(robot, scene, q[i], margin, self_margin, frames, grads[i])
-    return costs, grads

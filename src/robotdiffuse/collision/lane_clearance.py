@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from robotdiffuse.collision.distance import points_distance
+from robotdiffuse.collision.distance import cost_gradient_at, points_distance
 from robotdiffuse.collision.lanes import W, place, place_frames
 
 _ZERO = np.float32(0.0)
@@ -101,8 +101,28 @@ def _to_scene(at, s, scene, near, limit, mark, out):
         _to_points(at, s, scene, n if mark else 0, limit, mark, out)
 
 
+@njit(fastmath=True, cache=True, _nrt=False)
+def _nearer(a, s, b, t, radii, best):
+    """How many lanes have spheres s of a and t of b nearer to each other than best[0]."""
+    total = 0
+    for i in range(W):
+        dx, dy, dz = a[s, i] - b[t, i], a[s, W + i] - b[t, W + i], a[s, 2 * W + i] - b[t, 2 * W + i]
+        total += np.int32(np.sqrt(dx * dx + dy * dy + dz * dz) - radii < best[0, i])
+    return total
+
+
+@njit(fastmath=True, cache=True, _nrt=False)
+def _keep_least(a, s, b, first, last, spheres, radius, best):
+    """Lowers best[0] to the distances of sphere s of a to the spheres from `first` to `last` of b."""
+    for t in range(first, last):
+        radii = radius + spheres[t, 3]
+        for i in range(W):
+            dx, dy, dz = a[s, i] - b[t, i], a[s, W + i] - b[t, W + i], a[s, 2 * W + i] - b[t, 2 * W + i]
+            best[0, i] = min(best[0, i], np.sqrt(dx * dx + dy * dy + dz * dz) - radii)
+
+
 class ClearanceWorkspace(NamedTuple):
-    """Scratch memory of `block_clearances`."""
+    """Scratch memory of `block_clearances` and `block_pair_clearances`."""
 
     frames: np.ndarray
     """[dof + 1, 12 * W]"""
@@ -116,6 +136,10 @@ class ClearanceWorkspace(NamedTuple):
     """[obstacles, W] distances of a bounding sphere's centre."""
     least: np.ndarray
     """[1, W]"""
+    positions: np.ndarray
+    """[spheres, 3 * W]"""
+    placed: np.ndarray
+    """[groups] whether the group's positions are those of this block."""
 
 
 @njit(cache=True)
@@ -131,6 +155,8 @@ def make_clearance_workspace(robot, obstacles):
         np.empty(obstacles, np.bool_),
         np.empty((obstacles, W), np.float32),
         np.empty((1, W), np.float32),
+        np.empty((len(robot.spheres), 3 * W), np.float32),
+        np.empty(len(robot.frame), np.bool_),
     )
 
 
@@ -187,12 +213,64 @@ def block_clearances(robot, scene, first, q, limit, work, best, out):
                 place(work.frames, robot.frame[g], robot.spheres, s, work.position, 0)
                 for i in range(W):
                     work.least[0, i] = limit + robot.spheres[s, 3]
-                _to_scene(
-                    work.position, 0, scene, work.near, limit + robot.spheres[s, 3], False, work.least
-                )
+                _to_scene(work.position, 0, scene, work.near, limit + robot.spheres[s, 3], False, work.least)
                 _write(work.least, robot.spheres[s, 3], best)
         for i in range(W):
             out[g - first, i] = best[0, i]
+
+
+@njit(inline="always", _nrt=False)
+def _place_group(robot, g, work):
+    if not work.placed[g]:
+        for s in range(robot.first[g], robot.first[g + 1]):
+            place(work.frames, robot.frame[g], robot.spheres, s, work.positions, s)
+        work.placed[g] = True
+
+
+@njit(cache=True, _nrt=False)
+def block_pair_clearances(robot, q, limit, work, out):
+    """Distances between the links of the checked pairs, at most `limit`, of q[dof, 16]: out[pairs, 16]."""
+    place_frames(robot, q, work.frames, work.centres)
+    work.placed[:] = False
+    centres, positions, best = work.centres, work.positions, work.least
+    spheres, bounds, first = robot.spheres, robot.bounds, robot.first
+    for p in range(len(robot.pairs)):
+        a, b = robot.pairs[p, 0], robot.pairs[p, 1]
+        for i in range(W):
+            best[0, i] = limit
+        if _nearer(centres, a, centres, b, bounds[a, 3] + bounds[b, 3], best) > 0:
+            _place_group(robot, a, work)
+            _place_group(robot, b, work)
+            for s in range(first[a], first[a + 1]):
+                radius = spheres[s, 3]
+                if _nearer(positions, s, centres, b, radius + bounds[b, 3], best) > 0:
+                    _keep_least(positions, s, positions, first[b], first[b + 1], spheres, radius, best)
+        for i in range(W):
+            out[p, i] = best[0, i]
+
+
+@njit(cache=True)
+def pair_clearances_into(robot, q, limit, work, out):
+    """Clearances of the checked pairs for the rows of q[n, dof], into out[n, pairs]."""
+    n, dof = q.shape
+    block, found = np.empty((dof, W), np.float32), np.empty((out.shape[1], W), np.float32)
+    for start in range(0, n, W):
+        for i in range(W):
+            row = min(start + i, n - 1)
+            for j in range(dof):
+                block[j, i] = q[row, j]
+        block_pair_clearances(robot, block, limit, work, found)
+        for i in range(min(W, n - start)):
+            for p in range(out.shape[1]):
+                out[start + i, p] = found[p, i]
+
+
+@njit(cache=True, nogil=True)
+def pair_clearances(robot, q, limit):
+    """[n, pairs] distances between checked pairs of links, at most `limit`."""
+    out = np.empty((len(q), len(robot.pairs)), np.float32)
+    pair_clearances_into(robot, q, limit, make_clearance_workspace(robot, 1), out)
+    return out
 
 
 @njit(cache=True)
@@ -221,3 +299,15 @@ def link_clearances(robot, scene, q, limit):
     work = make_clearance_workspace(robot, count_obstacles(scene))
     clearances_into(robot, scene, q, limit, work, out)
     return out
+
+
+@njit(cache=True, nogil=True)
+def cost_gradients(robot, scene, q, margin, self_margin):
+    """Collision costs [n] of the rows of q[n, dof] and their gradients [n, dof]; see `cost_gradient_at`."""
+    n, dof = q.shape
+    costs, grads = np.empty(n, np.float32), np.zeros((n, dof), np.float32)
+    frames = np.empty((dof + 1, 12), np.float32)
+    clearances = link_clearances(robot, scene, q, margin)
+    for i in range(n):
+        costs[i] = cost_gradient_at(robot, scene, q[i], clearances[i], margin, self_margin, frames, grads[i])
+    return costs, grads

@@ -29,9 +29,21 @@ def _unpack(kinds, params, spheres, boxes):
                 boxes[m, i] = p[i]
                 boxes[m, 12 + i] = p[3 + i] * np.float32(0.5)
             # rows of the world-to-box rotation: the columns of the quaternion's matrix
-            boxes[m, 3], boxes[m, 4], boxes[m, 5] = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)
-            boxes[m, 6], boxes[m, 7], boxes[m, 8] = 2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)
-            boxes[m, 9], boxes[m, 10], boxes[m, 11] = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+            boxes[m, 3], boxes[m, 4], boxes[m, 5] = (
+                1 - 2 * (y * y + z * z),
+                2 * (x * y + w * z),
+                2 * (x * z - w * y),
+            )
+            boxes[m, 6], boxes[m, 7], boxes[m, 8] = (
+                2 * (x * y - w * z),
+                1 - 2 * (x * x + z * z),
+                2 * (y * z + w * x),
+            )
+            boxes[m, 9], boxes[m, 10], boxes[m, 11] = (
+                2 * (x * z + w * y),
+                2 * (y * z - w * x),
+                1 - 2 * (x * x + y * y),
+            )
             m += 1
     return n, m
 

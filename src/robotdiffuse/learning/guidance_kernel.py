@@ -4,6 +4,12 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.distance import cost_gradient_at
+from robotdiffuse.collision.lane_clearance import (
+    clearances_into,
+    count_obstacles,
+    make_clearance_workspace,
+    pair_clearances_into,
+)
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -24,12 +30,19 @@ def descend(robot, scene, q, lower, upper, kernel, margin, self_margin, push, re
     pushes, active = np.empty((n, dof), np.float32), np.empty(n, np.float32)
     gradient = np.empty(dof, np.float32)
     costs = np.zeros(count, np.float32)
+    work = make_clearance_workspace(robot, count_obstacles(scene))
+    links = np.empty((n, len(robot.frame) - np.searchsorted(robot.frame, 1)), np.float32)
+    pairs = np.empty((n, len(robot.pairs)), np.float32)
     for b in range(count):
         for _ in range(steps):
             total = _ZERO
+            clearances_into(robot, scene, q[b], margin, work, links)
+            pair_clearances_into(robot, q[b], self_margin, work, pairs)
             for i in range(1, n - 1):
                 gradient[:] = _ZERO
-                cost = cost_gradient_at(robot, scene, q[b, i], margin, self_margin, frames, gradient)
+                cost = cost_gradient_at(
+                    robot, scene, q[b, i], links[i], pairs[i], margin, self_margin, frames, gradient
+                )
                 total += cost
                 active[i] = _ZERO
                 square = _ZERO

@@ -1,6 +1,7 @@
 """MotionModel: encoder, denoiser and sampler put together; all that planning needs of the learned part."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -122,7 +123,7 @@ class MotionModel(nn.Module):
         if len(points) > MAX_POINTS:
             rng = np.random.default_rng(0) if rng is None else rng
             points = points[rng.choice(len(points), MAX_POINTS, replace=False)]
-        with torch.inference_mode():
+        with torch.inference_mode(), one_thread():
             return self.encoder(torch.from_numpy(points)[None])[0].numpy()
 
     def line(
@@ -208,13 +209,25 @@ class MotionModel(nn.Module):
                 clean = self.residual(guide(self.joints(hold_ends(clean), line), level / levels), line)
             return hold_ends(clean)
 
-        with torch.inference_mode():
+        with torch.inference_mode(), one_thread():
             sampler = SAMPLERS[self.config.sampler]
             x = sampler(predict, self.schedule, lambda: self.draw_noise(count, rng), steps, eta)
         q = self.joints(x, line).astype(np.float64)
         np.clip(q, self.config.lower, self.config.upper, out=q)
         q[:, 0], q[:, -1] = start, goal
         return q
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """PyTorch on one thread: for work this small, waiting for a second one costs more than it saves, and where
+    other processes keep the cores busy it takes a hundred times as long."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def hold_ends(x: Float[ndarray, "*batch frames dof"]) -> Float[ndarray, "*batch frames dof"]:
