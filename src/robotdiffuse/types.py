@@ -61,7 +61,7 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class PlanResult:
-    """The answer of a planner. `path` is set if and only if `status` is SOLVED, and then it passed `verify`."""
+    """The answer of a planner. `path` is set if and only if `status` is SOLVED; then it passed `verify`."""
 
     status: Status
     reason: str
@@ -76,7 +76,7 @@ class PlanResult:
     path: Path | None = None
     trajectory: Trajectory | None = None
     min_clearance: float | None = None
-    """Least distance along the path to obstacles and between links [m], of the collision spheres (a lower bound)."""
+    """A lower bound of the distance to obstacles and between links along the motion [m]; see `verify.Report`."""
     notes: tuple[str, ...] = field(default=())
     """What was changed or ignored in the input, e.g. a start clamped to a limit."""
 

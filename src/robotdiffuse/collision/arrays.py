@@ -15,7 +15,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere, pose
 
 MESH_SPACING = 0.02
-"""Triangles of mesh obstacles are divided until no edge is longer [m]; each piece becomes a covering point."""
+"""Triangles of mesh obstacles are divided until no edge is longer [m]; each piece becomes a point."""
 THINNING = 0.5
 """Edge of the thinning voxels of a point cloud, as a multiple of its point radius."""
 MAX_POINTS = 400_000

@@ -156,7 +156,7 @@ def points_distance(scene, x, y, z, limit):
 
 @njit(inline="always", _nrt=False)
 def scene_distance(scene, x, y, z, limit):
-    """Signed distance of a point to the nearest obstacle if below `limit` (else `limit`), and its gradient."""
+    """Signed distance of a point to the nearest obstacle if below `limit`, else `limit`; and its gradient."""
     best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
     for k in range(len(scene.spheres)):
         d, nx, ny, nz = _sphere(scene.spheres[k], x, y, z)
@@ -200,8 +200,8 @@ def cost_gradient_at(robot, scene, q, links, pairs, margin, self_margin, frames,
 
     The cost is the paper's hinge h, squared: the sum over the spheres of (S - D)^2 / 2 for D < S, with D
     the signed distance and S the margin [m]; and the same between the links of the checked pairs.
-    `links` and `pairs` are the clearances of the moving groups and of the pairs here (`lane_clearance`), as far
-    as they are below the margins.
+    `links` and `pairs` are the clearances of the moving groups and of the pairs here (`lane_clearance`), as
+    far as they are below the margins.
     """
     frames_of(robot, q, frames)
     cost = _ZERO

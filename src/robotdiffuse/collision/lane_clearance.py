@@ -15,8 +15,8 @@ _ZERO = np.float32(0.0)
 def _to_spheres(at, s, obstacles, near, n, mark, out):
     """Signed distances of a point in 16 lanes to obstacles.
 
-    With `mark`, to row n + k of `out` for every obstacle k; otherwise `out[0]` becomes the least of itself and
-    the distances to the obstacles with near[n + k].
+    With `mark`, to row n + k of `out` for every obstacle k; otherwise `out[0]` becomes the least of itself
+    and the distances to the obstacles with near[n + k].
     """
     for k in range(len(obstacles)):
         if not (mark or near[n + k]):
@@ -144,7 +144,7 @@ class ClearanceWorkspace(NamedTuple):
 
 @njit(cache=True)
 def make_clearance_workspace(robot, obstacles):
-    """Scratch memory for one thread and at most so many obstacles (all point clouds together count as one)."""
+    """Scratch memory for one thread and at most so many obstacles (all point clouds count as one)."""
     frames = np.zeros((len(robot.offsets) + 1, 12 * W), np.float32)
     for k in (0, 4, 8):
         frames[0, k * W : (k + 1) * W] = 1.0
@@ -197,7 +197,9 @@ def _write(least, radius, best):
 
 @njit(cache=True, _nrt=False)
 def block_clearances(robot, scene, first, q, limit, work, best, out):
-    """Signed distances of the groups from `first` on to the scene, at most `limit`, of q[dof, 16]: out[groups, 16].
+    """Signed distances to the scene, at most `limit`, of the groups from `first` on: out[groups, 16].
+
+    q: [dof, 16].
 
     `best` is scratch, [1, 16].
     """

@@ -258,10 +258,10 @@ def _touch_scene(at, s, radius, scene, near, mark, hits):
 
 @njit(cache=True, _nrt=False)
 def _all_lanes_hit(hits):
+    total = 0
     for i in range(W):
-        if hits[i] == 0:
-            return False
-    return True
+        total += np.int32(hits[i] > 0)
+    return total == W
 
 
 class Workspace(NamedTuple):
@@ -371,8 +371,8 @@ def _hits_itself(robot, stop_at_first, work):
 def block_hits(robot, scene, q, padding, stop_at_first, work):
     """Collisions of 16 configurations, q[dof, 16]; `work.hits` counts them by lane.
 
-    `padding` [m] is added to the radii towards the scene. With `stop_at_first` it returns at the first link or
-    pair that collides in any lane, otherwise when all lanes are decided. Returns whether any lane collides.
+    `padding` [m] is added to the radii towards the scene. With `stop_at_first` it returns at the first link
+    or pair that collides in any lane, otherwise when all lanes are decided. Returns whether any lane collides.
     """
     work.hits[:] = 0
     work.placed[:] = False

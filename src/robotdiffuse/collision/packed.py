@@ -81,7 +81,7 @@ def packed_link_clearances(
     fixed: Scene,
     limit: float,
 ) -> Float32[ndarray, "batch frames links"]:
-    """Signed distances of the moving links to the obstacles [m], at most `limit`, for each sample's own scene.
+    """Signed distances of the moving links to the obstacles of each sample's own scene [m], at most `limit`.
 
     `fixed` holds the boxes that are part of every scene (the floor). `robot` comes from `compile_robot`.
     """

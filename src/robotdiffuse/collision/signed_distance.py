@@ -19,7 +19,7 @@ class SignedDistance:
     """Signed distances of a robot's covering spheres to a scene and between its links, by batches.
 
     The same spheres and shapes as `CollisionChecker`; differentiable in the configurations. For point clouds
-    and meshes the distance is interpolated in a grid, which reaches 0.2 m, and is exact to the grid's spacing.
+    and meshes the distance is interpolated in a grid that reaches 0.2 m, and exact to the grid's spacing.
     """
 
     def __init__(

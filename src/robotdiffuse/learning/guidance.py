@@ -18,8 +18,8 @@ from robotdiffuse.learning.guidance_kernel import descend
 @dataclass(frozen=True)
 class GuidanceSettings:
     margin: float = 0.04
-    """Distance to obstacles below which frames are pushed away [m]: the paper's safe distance S. It also covers
-    what lies between two frames."""
+    """Distance to obstacles below which frames are pushed away [m]: the paper's safe distance S. It also
+    covers what lies between two frames."""
     self_margin: float = 0.01
     """The same between links [m]."""
     push: float = 0.15

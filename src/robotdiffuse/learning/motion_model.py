@@ -220,7 +220,7 @@ class MotionModel(nn.Module):
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """PyTorch on one thread: for work this small, waiting for a second one costs more than it saves, and where
+    """PyTorch on one thread: for work this small, waiting for a second costs more than it saves, and where
     other processes keep the cores busy it takes a hundred times as long."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -53,7 +53,7 @@ class RobotDiffuseSettings:
     shortcuts: int = 80
     """Attempts to shorten each of them."""
     resolution: float = 0.02
-    """No point of the arm moves further than this between two checks of a candidate [m]; the judge decides."""
+    """No point of the arm moves further than this between two checks of a candidate [m]."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
     search: RRTConnectSettings = field(default_factory=RRTConnectSettings)
 
@@ -232,7 +232,7 @@ def unlearned_starts(
     robot: Robot,
     rng: np.random.Generator,
 ) -> Float[ndarray, "count frames dof"]:
-    """The straight line, and the line with random smooth bumps: the control for what refinement owes to learning."""
+    """The straight line, and the line with random bumps: the control for what refinement owes to learning."""
     t = np.linspace(0.0, 1.0, frames)[:, None]
     q = np.repeat((start + t * (goal - start))[None], count, axis=0)
     for harmonic in (1, 2):

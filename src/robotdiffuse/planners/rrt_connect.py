@@ -30,7 +30,7 @@ class RRTConnectSettings:
     """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
     covers the rest, and a path that it refuses is searched again at half the distance."""
     searches: int = 2
-    """Paths found, the shortest of which is shortened: a second search costs less than the shortcuts it saves."""
+    """Paths found, the shortest of which is shortened: a search costs less than the shortcuts it saves."""
     shortcuts: int = 30
     """Attempts to shorten a path."""
     optimize_time: float = 0.0
@@ -90,7 +90,7 @@ def retreat(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> Float[ndarra
 
 
 class Ends:
-    """Start and goals that the spheres call free, each with the contact-near configuration that it stands for."""
+    """Start and goals that the spheres call free, with the configurations near contact that they stand for."""
 
     def __init__(self, checker: CollisionChecker, start: ndarray, goals: ndarray) -> None:
         self.start, self.start_lead = start, retreat(checker, start)

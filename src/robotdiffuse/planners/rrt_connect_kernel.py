@@ -80,7 +80,7 @@ def motion_free(space, a, b, block, work):
 
 @njit(cache=True, nogil=True)
 def motions_free(space, path):
-    """Whether each straight motion between the rows of path[n, dof] is free; its end is checked, not its start."""
+    """Whether each straight motion between the rows of path[n, dof] is free; ends are checked, not starts."""
     work, block = make_workspace(space.robot, space.scene), np.empty((path.shape[1], W), np.float32)
     out = np.empty(len(path) - 1, np.bool_)
     for i in range(len(path) - 1):
@@ -247,7 +247,7 @@ def shortcut(space, path, tries, state):
 
 @njit(cache=True)
 def _skip(space, path, out, block, work):
-    """Copies the path without the waypoints that straight lines can skip, farthest first; returns how many."""
+    """Copies the path less the waypoints that straight lines can skip, farthest first; returns how many."""
     n, i = 0, 0
     while True:
         out[n] = path[i]

@@ -16,14 +16,16 @@ ROBOTS = tuple(sorted(file.parent.name for file in DATA.glob(f"*/{ROBOT_FILE}"))
 
 
 def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robot:
-    """A robot by its bundled name, the name that `robotdiffuse robot add` gave it, or a path to a URDF.
+    """A robot by its bundled name, the name that `robotdiffuse robot add` gave it, its folder, or its URDF.
 
     A URDF is looked up by its content among the robots that were added; a new or changed one is fitted with
     spheres first, which takes about half a minute, and kept. `locked` holds joints at values (see
     Robot.with_locked). Raises InputError for an unknown name or bad input.
     """
     text = str(name)
-    if isinstance(name, Path) or text.endswith((".urdf", ".xml")) or "/" in text or "\\" in text:
+    if (Path(name) / ROBOT_FILE).is_file():
+        robot = replace(read_bundle(name), source=str(Path(name).resolve()))
+    elif isinstance(name, Path) or text.endswith((".urdf", ".xml")) or "/" in text or "\\" in text:
         robot = replace(_from_urdf(Path(name)), source=str(Path(name).resolve()))
     else:
         robot = _by_name(text)

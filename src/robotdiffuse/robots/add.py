@@ -16,6 +16,7 @@ from robotdiffuse.robots.allowed_collisions import (
     find_allowed_collisions,
 )
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
+from robotdiffuse.robots.interfaces import face_allowances, stick_out_of_arm
 from robotdiffuse.robots.limits import read_limits, with_limits
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
@@ -32,7 +33,10 @@ class LinkReport:
     link: str
     spheres: int
     stick_out: float
-    """How far a sphere reaches out of the collision meshes, at most [m]."""
+    """How far a sphere reaches out of the arm, at most [m]: of the meshes of the link and, where it meets its
+    neighbours, of theirs, at any value of the joints between them."""
+    stick_out_of_link: float
+    """The same for the meshes of this link alone, so with what is hidden in its neighbours [m]."""
     covered: bool
     """Whether the spheres provably cover the surface of the meshes."""
 
@@ -77,8 +81,9 @@ def add_robot(
 ) -> AddReport:
     """Read a URDF (see read_urdf), fit spheres, find allowed collisions, write the robot folder.
 
-    `name` defaults to the URDF's; `out`, the folder, to `user_robots() / name`; `limits` is a file in the form
-    of MoveIt's joint_limits.yaml. The same input and seed give the same robot. Raises InputError for bad input.
+    `name` defaults to the URDF's; `out`, the folder, to `user_robots() / name`; `limits` is a file in the
+    form of MoveIt's joint_limits.yaml. The same input and seed give the same robot. Raises InputError for
+    bad input.
     """
     begin = time.perf_counter()
     report = progress or (lambda what, step, steps: None)
@@ -91,16 +96,17 @@ def add_robot(
         robot = with_limits(robot, read_limits(limits))
     if not robot.meshes:
         raise InputError(f"{urdf}: no link has collision geometry; nothing could be checked")
+    settings = spheres or SphereSettings()
     steps = len(robot.meshes) + 1
     fitted, links = {}, []
     for step, (link, meshes) in enumerate(robot.meshes.items()):
         report(f"spheres of {link}", step, steps)
-        # what is written to the file, rounded, is what is judged
-        fitted[link] = np.round(
-            fit_spheres(meshes, spheres or SphereSettings(), np.random.default_rng(seed)), 6
-        )
-        out_by = float(stick_out(meshes, fitted[link]).max())
-        links.append(LinkReport(link, len(fitted[link]), out_by, covered(meshes, fitted[link])))
+        tolerance = settings.tolerance(robot, link)
+        hidden = face_allowances(robot, link, tolerance)
+        fit = fit_spheres(meshes, tolerance, np.random.default_rng(seed), hidden, settings)
+        fitted[link] = np.round(fit, 6)  # as the file holds them: these are judged
+        own, arm = float(stick_out(meshes, fitted[link]).max()), stick_out_of_arm(robot, link, fitted[link])
+        links.append(LinkReport(link, len(fit), min(own, arm), own, covered(meshes, fitted[link])))
     report("pairs of links", steps - 1, steps)
     robot = replace(robot, spheres=fitted)
     pairs = find_allowed_collisions(robot, sampling or SamplingSettings(), np.random.default_rng(seed))

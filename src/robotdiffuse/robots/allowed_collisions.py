@@ -1,14 +1,18 @@
 """Pairs of links that need no check against each other, found by sampling configurations."""
 
+# Coal's Python module has no type information.
+# pyright: reportAttributeAccessIssue=false
+
 from dataclasses import dataclass
 
 import coal
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Robot
+from robotdiffuse.robots.interfaces import coal_hull
+from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
 from robotdiffuse.transforms import rotation_about
 
 ADJACENT, ALWAYS, NEVER, DEFAULT, CHECKED = "adjacent", "always", "never", "default", "checked"
@@ -21,7 +25,7 @@ class SamplingSettings:
     samples: int = 20_000
     """Configurations, uniform within the limits of all joints, gripper joints included."""
     always: float = 0.95
-    """Share of collisions from which on a pair counts as always colliding (MoveIt's setup assistant: 0.95)."""
+    """Share of collisions from which on a pair counts as always colliding (0.95 in MoveIt's assistant)."""
     descents: int = 20
     """Closest samples from which a pair that never collided is driven towards collision, to be sure."""
 
@@ -51,14 +55,17 @@ def find_allowed_collisions(
     """One report for each pair of links with meshes on different frames; the robot needs covering spheres.
 
     Allowed are, as in MoveIt's setup assistant: adjacent links (joined by a joint, links without geometry
-    between them skipped); pairs that always or never collide; and pairs that collide in the default pose, all
-    joints at zero, if that is within the limits. Meshes are tested with Coal, where the covering spheres do
-    not already show that they are apart. Pairs that never collided are driven together by random descent from
-    their closest samples; those that can be made to collide are checked.
+    between them skipped); pairs that always or never collide; and pairs that collide in the default pose,
+    with the joints between them at zero. For such a pair the limits of the joints say that the manufacturer
+    holds that pose to be safe, so the meshes are coarse there. Hence it must be within the limits, and both
+    links must be the arm's own: the limits know nothing of a tool that is fixed to the last link.
+
+    Meshes are tested with Coal, where the covering spheres do not already show that they are apart. Pairs
+    that never collided are driven together by random descent from their closest samples; those that can be
+    made to collide are checked.
     """
     sampler = _Sampler(robot)
-    default = np.zeros((1, len(sampler.joints)))
-    inside = ((default >= sampler.lower) & (default <= sampler.upper)).all()
+    default = np.clip(np.zeros((1, len(sampler.joints))), sampler.lower, sampler.upper)
     q = sampler.random(settings.samples, rng)
     poses = sampler.poses(q)
     default_poses = sampler.poses(default)
@@ -74,7 +81,7 @@ def find_allowed_collisions(
             reason = ADJACENT
         elif colliding.mean() >= settings.always:
             reason = ALWAYS
-        elif inside and sampler.collide(default_poses, a, b, 0):
+        elif _default_counts(robot, a, b) and sampler.collide(default_poses, a, b, 0):
             reason = DEFAULT
         elif not colliding.any() and not _descend(
             sampler, a, b, q[np.argsort(near)[: settings.descents]], rng
@@ -114,6 +121,19 @@ def _descend(
     return False
 
 
+def _default_counts(robot: Robot, a: str, b: str) -> bool:
+    """Whether both are links of the arm itself, and zero is within the limits of all joints between them."""
+    by_child = {joint.child: joint for joint in robot.joints}
+
+    def joints_above(link: str) -> list[Joint]:
+        return [by_child[link], *joints_above(by_child[link].parent)] if link in by_child else []
+
+    above = {link: joints_above(link) for link in (a, b)}
+    own = all(not joints or joints[0] in robot.planned_joints for joints in above.values())
+    between = {j.name: j for j in (*above[a], *above[b]) if (j in above[a]) != (j in above[b])}.values()
+    return own and all(joint.lower <= 0 <= joint.upper for joint in between if joint.kind in MOVING_KINDS)
+
+
 def _moving_pairs(robot: Robot) -> list[tuple[str, str]]:
     links = [link for link in robot.link_names if link in robot.meshes]
     return [
@@ -143,7 +163,7 @@ class _Sampler:
         self.joints = [joint for joint in robot.joints if joint.kind in MOVING_KINDS]
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
-        self.hulls = {link: [_coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
+        self.hulls = {link: [coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
         self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
 
@@ -204,15 +224,6 @@ def _motions(axis: Float[ndarray, "3"], prismatic: bool, q: Float[ndarray, "n"])
     cross = rotation_about(axis, np.pi / 2) - np.outer(axis, axis)  # Rodrigues: [axis]x
     T[:, :3, :3] += np.sin(q)[:, None, None] * cross + (1 - np.cos(q))[:, None, None] * (cross @ cross)
     return T
-
-
-def _coal_hull(mesh: ConvexMesh) -> "coal.Convex":
-    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-    for vertex in mesh.vertices:
-        points.append(vertex)
-    for face in mesh.faces:
-        triangles.append(coal.Triangle(*map(int, face)))
-    return coal.Convex(points, triangles)
 
 
 def _coal_pose(T: Float[ndarray, "4 4"]) -> "coal.Transform3s":

@@ -22,7 +22,8 @@ LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 def write_bundle(robot: Robot, folder: str | Path, source: dict[str, str]) -> None:
     """Write robot.json and meshes.npz into a folder, each whole or not at all; other files in it stay.
 
-    `source` says where the robot comes from (urdf, sha256, licence). Raises InputError if it cannot be written.
+    `source` says where the robot comes from (urdf, sha256, licence). Raises InputError if the folder cannot
+    be written.
     """
     folder = Path(folder)
     meshes = io.BytesIO()

@@ -19,66 +19,82 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots.robot import ConvexMesh
+from robotdiffuse.robots.robot import ConvexMesh, Robot
 
 
 @dataclass(frozen=True)
 class SphereSettings:
     """How closely spheres follow the meshes of a link."""
 
-    tolerance: float | None = None
-    """How far a sphere may stick out of the mesh [m]; by default `relative` times the mesh's inradius,
-    between `finest` and `coarsest`."""
-    relative: float = 0.25
+    coarsest: float = 0.015
+    """How far a sphere may stick out of a link in the first half of the arm [m]."""
+    at_tip: float = 0.007
+    """The same behind the last joint, where the arm works close to obstacles; between them, linear [m]."""
+    relative: float = 0.7
+    """Never more than this times the radius of the largest sphere inside the link."""
     finest: float = 0.004
-    """[m]; for fingers, that work a few millimetres from obstacles."""
-    coarsest: float = 0.0145
-    """[m]"""
+    """Nor less than this [m]."""
     candidates: int = 1000
     """Places inside the mesh that the greedy cover chooses from."""
-    rounds: int = 10
+    rounds: int = 8
     """Rounds of the alternation for each number of spheres."""
+    tries: int = 3
+    """Spheres of which each is dropped for a try, before their number is final."""
 
     def __post_init__(self) -> None:
-        if self.tolerance is not None and not self.tolerance > 0:
-            raise InputError(f"sphere tolerance is {self.tolerance}; it must be positive")
-        if not 0 < self.finest <= self.coarsest:
+        if not 0 < self.finest <= self.at_tip <= self.coarsest:
             raise InputError(
-                f"sphere tolerances: finest {self.finest}, coarsest {self.coarsest}; 0 < finest <= coarsest"
+                f"sphere tolerances: finest {self.finest}, at_tip {self.at_tip}, coarsest {self.coarsest}; "
+                "each must be positive and at most the next"
             )
 
-    def for_meshes(self, meshes: tuple[ConvexMesh, ...]) -> float:
-        """The tolerance for a link [m]."""
-        if self.tolerance is not None:
-            return self.tolerance
-        inside = _Body(meshes).depth(_grid(meshes, 0.005))
-        return float(np.clip(self.relative * inside.max(), self.finest, self.coarsest))
+    def tolerance(self, robot: Robot, link: str) -> float:
+        """How far the spheres of a link may stick out [m]."""
+        meshes = robot.meshes[link]
+        along = max(0.0, 2 * robot.link_frame(link) / robot.dof - 1)
+        wanted = self.coarsest + along * (self.at_tip - self.coarsest)
+        size = np.ptp(np.concatenate([mesh.vertices for mesh in meshes]), axis=0).min()
+        inradius = _Body(meshes).depth(_grid(meshes, size / 16)).max()
+        return float(np.clip(min(wanted, self.relative * inradius), self.finest, self.coarsest))
 
 
 def fit_spheres(
-    meshes: tuple[ConvexMesh, ...], settings: SphereSettings, rng: np.random.Generator
+    meshes: tuple[ConvexMesh, ...],
+    tolerance: float,
+    rng: np.random.Generator,
+    allowances: tuple[Float[ndarray, "f"], ...] | None = None,
+    settings: SphereSettings = SphereSettings(),
 ) -> Float[ndarray, "n 4"]:
-    """Spheres [x y z radius, m] that cover the union of convex meshes and stick out by the tolerance at most."""
-    tolerance = settings.for_meshes(meshes)
-    body = _Body(meshes)
-    # a sphere that sticks out by e of a flat face covers a disc of radius sqrt(2 r e); cells are a fraction of it
-    disc = np.sqrt(2 * tolerance * body.depth(_grid(meshes, tolerance)).max())
-    cells = _Cells.of(meshes, disc / 4)
-    places = _inside_points(body, meshes, settings.candidates, rng)
+    """Spheres [x y z radius, m] that cover the union of convex meshes and stick out by `tolerance` [m].
+
+    Over the faces of each mesh they may stick out by `allowances` [m] more, where the next link hides it.
+    """
+    body, true_body = _Body(meshes, allowances), _Body(meshes)
+    grid = _grid(meshes, tolerance / 2)
+    # sticking out of a flat face by e, a sphere covers a disc of radius sqrt(2 r e); cells are much smaller
+    disc = np.sqrt(2 * tolerance * true_body.depth(grid).max())
+    cells = _Cells.of(meshes, disc / 5)
+    places = _inside_points(true_body, meshes, settings.candidates, rng)
     needed = cells.stick_out(body, places)
     centers = places[_greedy_cover(needed <= np.maximum(tolerance, needed.min(1, keepdims=True)))]
-    centers = _relax(body, cells, centers, 2 * settings.rounds)
+    centers = _relax(body, cells, centers, settings.rounds, tolerance)
     while (needed := cells.stick_out(body, centers).min(1)).max() > tolerance:
         extra = cells.points[cells.corners[needed.argmax()]].mean(0)
-        centers = _relax(body, cells, np.concatenate([centers, extra[None]]), settings.rounds)
-    while len(centers) > 1:
-        fewer = _relax(body, cells, _without_least(body, cells, centers), settings.rounds)
-        if cells.stick_out(body, fewer).min(1).max() > tolerance:
-            break
-        centers = fewer
-    cells = _Cells.of(meshes, disc / 10)
-    spheres = _with_radii(body, cells, _relax(body, cells, centers, settings.rounds // 2))
-    return _without_holes(body, _grid(meshes, tolerance / 2), spheres, tolerance)
+        centers = _relax(body, cells, np.concatenate([centers, extra[None]]), settings.rounds, tolerance)
+    for finer in (1, 2):
+        if finer == 2:
+            cells = _Cells.of(meshes, disc / 10)
+        failures = 0
+        while len(centers) > 1 and failures < settings.tries:
+            fewer = _without_one(body, cells, centers, failures)
+            fewer = _relax(body, cells, fewer, settings.rounds, tolerance)
+            if cells.stick_out(body, fewer).min(1).max() > tolerance:
+                failures += 1
+            else:
+                centers, failures = fewer, 0
+    cells = _Cells.of(meshes, disc / 20)
+    spheres = _with_radii(body, cells, _relax(body, cells, centers, settings.rounds // 2, 0.0))
+    return _without_holes(true_body, grid, spheres, tolerance)
 
 
 def stick_out(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n"]:
@@ -111,10 +127,13 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], fine
 
 
 class _Body:
-    """A union of convex meshes as face planes."""
+    """A union of convex meshes as face planes, each moved outwards by its allowance."""
 
-    def __init__(self, meshes: tuple[ConvexMesh, ...]) -> None:
-        self.planes = [_planes(mesh) for mesh in meshes]
+    def __init__(
+        self, meshes: tuple[ConvexMesh, ...], allowances: tuple[Float[ndarray, "f"], ...] | None = None
+    ) -> None:
+        allowances = allowances or tuple(np.zeros(len(mesh.faces)) for mesh in meshes)
+        self.planes = [_planes(mesh, extra) for mesh, extra in zip(meshes, allowances, strict=True)]
 
     def depth(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
         """Distance from each point inside to the nearest face plane [m]; negative outside."""
@@ -122,13 +141,25 @@ class _Body:
         return depths[0] if len(depths) == 1 else np.max(depths, axis=0)
 
 
-def _planes(mesh: ConvexMesh) -> tuple[Float[ndarray, "3 f"], Float[ndarray, "f"]]:
+def _planes(
+    mesh: ConvexMesh, allowance: Float[ndarray, "f"]
+) -> tuple[Float[ndarray, "3 p"], Float[ndarray, "p"]]:
+    """Normals and offsets of the distinct planes of a mesh."""
+    normals = face_normals(mesh)
+    good = np.linalg.norm(normals, axis=1) > 0.5
+    normals, index = np.unique(np.round(normals[good], 9), axis=0, return_inverse=True)
+    least = np.full(len(normals), np.inf)
+    np.minimum.at(least, index.ravel(), allowance[good])
+    # the farthest vertex, not the face's own: rounding must not put a plane inside the mesh
+    return np.ascontiguousarray(normals.T), (mesh.vertices @ normals.T).max(0) + least
+
+
+def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:
+    """Outward unit normals; zero for a face without area."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
     normals = np.cross(b - a, c - a)
-    size = np.linalg.norm(normals, axis=1)
-    normals = np.unique(np.round(normals[size > 1e-14] / size[size > 1e-14, None], 9), axis=0)
-    # the farthest vertex, not the face's own: rounding must not put a plane inside the mesh
-    return np.ascontiguousarray(normals.T), (mesh.vertices @ normals.T).max(0)
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(size > 1e-14, normals / np.maximum(size, 1e-14), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,11 +194,16 @@ class _Cells:
 
     def outlines(self, owner: Int[ndarray, "c"], count: int) -> list[Float[ndarray, "k 3"]]:
         """For each owner, points whose convex hull holds all its cells."""
-        total = np.bincount(self.corners.ravel(), minlength=len(self.points))
+        # a point between cells of one owner is needed only if it is a vertex of the mesh
+        first = np.full(len(self.points), count)
+        last = np.full(len(self.points), -1)
+        np.minimum.at(first, self.corners.ravel(), np.repeat(owner, 3))
+        np.maximum.at(last, self.corners.ravel(), np.repeat(owner, 3))
+        rim = (first != last) | self.sharp
         lines = []
         for i in range(count):
-            mine = np.bincount(self.corners[owner == i].ravel(), minlength=len(self.points))
-            lines.append(self.points[(mine > 0) & ((mine < total) | self.sharp)])
+            corners = self.corners[owner == i].ravel()
+            lines.append(self.points[np.unique(corners[rim[corners]])])
         return lines
 
     def farthest(self, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "c n"]:
@@ -190,21 +226,27 @@ def _greedy_cover(holds: Bool[ndarray, "c n"]) -> Int[ndarray, "k"]:
     return np.array(chosen)
 
 
-def _relax(body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int) -> Float[ndarray, "n 3"]:
-    """Alternate between giving cells to spheres and moving the spheres; the best centres met."""
+def _relax(
+    body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
+) -> Float[ndarray, "n 3"]:
+    """Alternate between giving cells to spheres and moving the spheres; the best centres met.
+
+    Ends early when all spheres stick out by `enough` [m] or less.
+    """
     step, best, best_value = 0.004, centers, np.inf
-    for _ in range(rounds):
+    for i in range(rounds + 1):
         needed = cells.stick_out(body, centers)
         value = float(needed.min(1).max())
         if value < best_value:
             best, best_value = centers, value
+        if value <= enough or i == rounds:
+            break
         outlines = cells.outlines(needed.argmin(1), len(centers))
         centers = np.stack(
             [_best_center(body, own, p, step) for own, p in zip(outlines, centers, strict=True)]
         )
         step = max(0.8 * step, 0.0005)
-    value = float(cells.stick_out(body, centers).min(1).max())
-    return centers if value < best_value else best
+    return best
 
 
 def _best_center(
@@ -229,27 +271,29 @@ def _best_center(
     return center
 
 
-def _without_least(body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
-    """Drop the sphere whose cells the others take over with the least stick-out."""
+def _without_one(
+    body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"], rank: int
+) -> Float[ndarray, "m 3"]:
+    """Drop the sphere whose cells the others take over with the least stick-out, or the next by rank."""
     needed = cells.stick_out(body, centers)
     second = np.partition(needed, 1, axis=1)[:, 1]
     owner = needed.argmin(1)
     loss = [second[owner == i].max(initial=0.0) for i in range(len(centers))]
-    return np.delete(centers, int(np.argmin(loss)), axis=0)
+    return np.delete(centers, int(np.argsort(loss)[min(rank, len(loss) - 1)]), axis=0)
 
 
 def _with_radii(body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
     """Least radii with which each sphere holds its own cells; spheres without any are dropped."""
     radius = cells.farthest(centers)
     own = np.eye(len(centers), dtype=bool)[(radius - body.depth(centers)).argmin(1)]
-    radii = np.where(own, radius, 0.0).max(0) + 1e-6
+    radii = np.where(own, radius, 0.0).max(0) + 3e-6
     return np.concatenate([centers, radii[:, None]], axis=1)[own.any(0)]
 
 
 def _without_holes(
     body: _Body, grid: Float[ndarray, "g 3"], spheres: Float[ndarray, "n 4"], hole: float
 ) -> Float[ndarray, "m 4"]:
-    """Fill holes inside the meshes, where a small obstacle could hide: spheres at the emptiest grid points."""
+    """Fill holes inside the meshes, where a small obstacle could hide, from the emptiest grid point on."""
     inside = body.depth(grid)
     grid, inside = grid[inside > 0], inside[inside > 0]
     while len(grid):
