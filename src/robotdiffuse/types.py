@@ -76,7 +76,7 @@ class PlanResult:
     path: Path | None = None
     trajectory: Trajectory | None = None
     min_clearance: float | None = None
-    """A lower bound of the distance to obstacles and between links along the motion [m]; see `verify.Report`."""
+    """A lower bound of all distances to obstacles and between links along the motion [m]."""
     notes: tuple[str, ...] = field(default=())
     """What was changed or ignored in the input, e.g. a start clamped to a limit."""
 

@@ -309,7 +309,9 @@ def cost_gradients(robot, scene, q, margin, self_margin):
     n, dof = q.shape
     costs, grads = np.empty(n, np.float32), np.zeros((n, dof), np.float32)
     frames = np.empty((dof + 1, 12), np.float32)
-    clearances = link_clearances(robot, scene, q, margin)
+    links, pairs = link_clearances(robot, scene, q, margin), pair_clearances(robot, q, self_margin)
     for i in range(n):
-        costs[i] = cost_gradient_at(robot, scene, q[i], clearances[i], margin, self_margin, frames, grads[i])
+        costs[i] = cost_gradient_at(
+            robot, scene, q[i], links[i], pairs[i], margin, self_margin, frames, grads[i]
+        )
     return costs, grads

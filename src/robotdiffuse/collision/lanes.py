@@ -371,8 +371,9 @@ def _hits_itself(robot, stop_at_first, work):
 def block_hits(robot, scene, q, padding, stop_at_first, work):
     """Collisions of 16 configurations, q[dof, 16]; `work.hits` counts them by lane.
 
-    `padding` [m] is added to the radii towards the scene. With `stop_at_first` it returns at the first link
-    or pair that collides in any lane, otherwise when all lanes are decided. Returns whether any lane collides.
+    `padding` [m] is added to the radii towards the scene. With `stop_at_first` it returns at the first
+    link or pair that collides in any lane, otherwise when all lanes are decided. Returns whether any lane
+    collides.
     """
     work.hits[:] = 0
     work.placed[:] = False

@@ -90,7 +90,7 @@ def retreat(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> Float[ndarra
 
 
 class Ends:
-    """Start and goals that the spheres call free, with the configurations near contact that they stand for."""
+    """Start and goals that the spheres call free, with the ends near contact that they stand for."""
 
     def __init__(self, checker: CollisionChecker, start: ndarray, goals: ndarray) -> None:
         self.start, self.start_lead = start, retreat(checker, start)

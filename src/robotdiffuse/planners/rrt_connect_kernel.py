@@ -225,7 +225,13 @@ def shortcut(space, path, tries, state):
             s, t = t, s
         i = _place_at(points, n, s, a)
         k = _place_at(points, n, t, b)
-        if i == k or not motion_free(space, a, b, block, work):
+        # the remnants of the cut segments are checked anew: their checks fall elsewhere than before
+        if (
+            i == k
+            or not motion_free(space, a, b, block, work)
+            or not motion_free(space, points[i], a, block, work)
+            or not motion_free(space, b, points[k + 1], block, work)
+        ):
             continue
         # keep points[..i], a, b, points[k + 1..]
         removed = k - i
