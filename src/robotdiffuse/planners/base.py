@@ -41,6 +41,8 @@ class Call:
         if seed < 0:
             raise InputError(f"seed is {seed}; it must be at least 0")
         self.planner, self.problem, self.time_limit, self.seed = planner, problem, time_limit, seed
+        self.notes = list(problem.notes)
+        """What the result will say was changed or ignored; planners may add to it."""
 
     @property
     def elapsed(self) -> float:
@@ -61,7 +63,7 @@ class Call:
             robot=self.problem.robot.name,
             planning_time=self.elapsed,
             seed=self.seed,
-            notes=self.problem.notes,
+            notes=tuple(self.notes),
         )
 
     def timeout(self, reason: str = "") -> PlanResult:
@@ -99,7 +101,7 @@ class Call:
             path=path,
             trajectory=trajectory,
             min_clearance=min(report.min_clearance, timed.min_clearance),
-            notes=problem.notes,
+            notes=tuple(self.notes),
         )
 
 

@@ -7,8 +7,6 @@ through the judge, and the result names the stage that its path comes from.
 
 from dataclasses import dataclass, field
 from functools import cache
-from importlib.resources import files
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.checkpoint import load_model
+from robotdiffuse.learning.checkpoint import BUNDLED, load_model
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planners import rrt_connect_kernel as kernel
@@ -27,9 +25,6 @@ from robotdiffuse.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.types import PlanResult
-
-BUNDLED = "learning/weights"
-"""Folder of the weights that come with the package, by robot."""
 
 
 @dataclass(frozen=True)
@@ -68,8 +63,8 @@ class RobotDiffuseSettings:
 @cache
 def bundled_model(robot_name: str) -> MotionModel | None:
     """The model that comes with the package for a robot of this name, or None."""
-    folder = files("robotdiffuse").joinpath(BUNDLED, robot_name)
-    return load_model(Path(str(folder))) if folder.is_dir() else None
+    folder = BUNDLED / robot_name
+    return load_model(folder) if folder.is_dir() else None
 
 
 class Candidates(NamedTuple):
@@ -89,7 +84,7 @@ class RobotDiffuse:
     def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
         """Raises InputError if the weights that the settings name cannot be read."""
         self.settings = settings or RobotDiffuseSettings()
-        self._model = load_model(Path(self.settings.weights)) if self.settings.weights else None
+        self._model = load_model(self.settings.weights) if self.settings.weights else None
 
     def model(self, robot: Robot) -> MotionModel | None:
         """The model for a robot; None if none comes with the package.
@@ -112,6 +107,8 @@ class RobotDiffuse:
         """See `planners.base.Planner`."""
         model = self.model(problem.robot)
         call = Call(self.name, problem, time_limit, seed)
+        if model is None:
+            call.notes.append(f"no weights come with the package for {problem.robot.name}; planned by search")
         checker = CollisionChecker(problem.robot, problem.scene)
         rng = np.random.default_rng(seed)
         goals = usable_goals(call, checker, rng)
