@@ -77,7 +77,7 @@ def test_a_point_cloud_in_place_of_shapes(planner):
 
 
 def test_several_goals_and_pose_goals(planner):
-    goals = np.stack([RIGHT, RIGHT + [0.3, 0, 0, 0, 0, 0, 0], RIGHT - [0.3, 0, 0, 0, 0, 0, 0]])
+    goals = RIGHT + np.outer([0.0, 0.3, -0.3], np.eye(7)[0])
     result = planner.plan(Problem(PANDA, Scene([BALL]), LEFT, JointGoal(goals)), time_limit=10.0)
     assert result.path is not None and (result.path.positions[-1] == goals).all(axis=1).any()
     T = link_pose(PANDA, RIGHT, "panda_hand")

@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 
 DEMO = "shelf.yaml"
 DEMO_TIME_LIMIT = 5.0
-"""[s], for the first call too, which may compile."""
+"""[s]"""
+WARM_UP = 0.001
+"""Time limit of the call that loads the compiled code [s]."""
 
 
 def add_plan(commands: argparse._SubParsersAction) -> None:
@@ -102,10 +104,18 @@ def run_demo(arguments: argparse.Namespace) -> int:
 
 
 def solve(problem: "Problem", planner: str, time_limit: float, seed: int) -> "PlanResult":
-    """Load the planner and plan, behind a spinner: the first call on a machine compiles for some seconds."""
+    """Load the planner and plan, behind a spinner.
+
+    A first call, whose result is dropped, loads the compiled code, or compiles it on a new machine, which
+    would otherwise use up the time limit.
+    """
     from rich.console import Console
 
     from robotdiffuse.planners import load_planner
 
-    with Console(stderr=True).status(f"planning with {planner}"):
-        return load_planner(planner).plan(problem, time_limit=time_limit, seed=seed)
+    console = Console(stderr=True)
+    with console.status("loading compiled code (a new machine compiles it first, for about a minute)"):
+        loaded = load_planner(planner)
+        loaded.plan(problem, time_limit=WARM_UP, seed=seed)
+    with console.status(f"planning with {planner}"):
+        return loaded.plan(problem, time_limit=time_limit, seed=seed)

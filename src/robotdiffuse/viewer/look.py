@@ -224,7 +224,7 @@ def facts(motion: Path | Trajectory, result: PlanResult | None) -> list[tuple[st
         rows.append(("status", result.status.value.replace("_", " ")))
         same = result.stage in ("", result.planner)
         rows.append(("planner", result.planner if same else f"{result.planner} · {result.stage}"))
-        rows.append(("planning time", f"{result.planning_time * 1e3:.3g} ms"))
+        rows.append(("planning time", f"{1e3 * result.planning_time:.0f} ms"))
     rows.append(("path length", f"{length:.2f} rad"))
     if result is not None and result.min_clearance is not None:
         rows.append(("clearance", f"{result.min_clearance * 1e3:.0f} mm"))
