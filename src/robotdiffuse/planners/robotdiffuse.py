@@ -201,7 +201,8 @@ class RobotDiffuse:
         self, call: Call, checker: CollisionChecker, ends: Ends, candidates: Candidates
     ) -> PlanResult | None:
         """The shortest of the free candidates that passes the judge, after shortcuts."""
-        space = search_space(checker, self.settings.resolution)
+        clearance = ends.kept_clearance(self.settings.search.clearance)
+        space = search_space(checker, self.settings.resolution, clearance)
         state = random_state(call.seed)
         paths = sorted(candidates.q[candidates.free], key=kernel.path_length)[: self.settings.shortened]
         short = [kernel.shortcut(space, path, self.settings.shortcuts, state) for path in paths]

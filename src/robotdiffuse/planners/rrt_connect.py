@@ -29,6 +29,8 @@ class RRTConnectSettings:
     resolution: float = 0.04
     """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
     covers the rest, and a path that it refuses is searched again at half the distance."""
+    clearance: float = 0.002
+    """Distance to obstacles that paths keep where start and goal allow it [m]."""
     searches: int = 2
     """Paths found, the shortest of which is shortened: a search costs less than the shortcuts it saves."""
     shortcuts: int = 30
@@ -42,7 +44,7 @@ class RRTConnectSettings:
         for name in ("reach", "resolution", "capacity", "searches"):
             if not getattr(self, name) > 0:
                 raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must be positive")
-        for name in ("shortcuts", "optimize_time"):
+        for name in ("clearance", "shortcuts", "optimize_time"):
             if getattr(self, name) < 0:
                 raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must not be negative")
 
@@ -93,6 +95,7 @@ class Ends:
     """Start and goals that the spheres call free, with the ends near contact that they stand for."""
 
     def __init__(self, checker: CollisionChecker, start: ndarray, goals: ndarray) -> None:
+        self.checker = checker
         self.start, self.start_lead = start, retreat(checker, start)
         leads = [(retreat(checker, goal), goal) for goal in goals]
         self.goals = [goal for lead, goal in leads if lead is not None]
@@ -102,6 +105,12 @@ class Ends:
     def reachable(self) -> bool:
         """Whether a search can begin and end."""
         return self.start_lead is not None and bool(self.goals)
+
+    def kept_clearance(self, wanted: float) -> float:
+        """The distance that a path can keep to obstacles: as wanted, or half of what the ends have [m]."""
+        assert self.start_lead is not None
+        leads = np.concatenate([self.start_lead[None], self.goal_leads])
+        return min(wanted, 0.5 * float(self.checker.link_clearances(leads).min(initial=wanted)))
 
     def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
         """The path with its exact ends in float64 in place of, or before and after, those of the search."""
@@ -156,7 +165,7 @@ class RRTConnect:
     def _shortest(
         self, call: Call, checker: CollisionChecker, ends: Ends, settings: RRTConnectSettings, attempt: int
     ) -> Float[ndarray, "n dof"] | None:
-        space = search_space(checker, settings.resolution)
+        space = search_space(checker, settings.resolution, ends.kept_clearance(settings.clearance))
         state = random_state(call.seed, attempt)
         assert ends.start_lead is not None
         start = ends.start_lead.astype(np.float32)

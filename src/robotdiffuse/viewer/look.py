@@ -218,7 +218,9 @@ def decimated(
 
 def facts(motion: Path | Trajectory, result: PlanResult | None) -> list[tuple[str, str]]:
     """Label and value of what is known about a motion, for the header."""
-    length = Path(motion.joint_names, motion.positions).length
+    length = result.path_length if result is not None else None
+    if length is None:
+        length = Path(motion.joint_names, motion.positions).length
     rows = []
     if result is not None:
         rows.append(("status", result.status.value.replace("_", " ")))
@@ -227,7 +229,7 @@ def facts(motion: Path | Trajectory, result: PlanResult | None) -> list[tuple[st
         rows.append(("planning time", f"{1e3 * result.planning_time:.0f} ms"))
     rows.append(("path length", f"{length:.2f} rad"))
     if result is not None and result.min_clearance is not None:
-        rows.append(("clearance", f"{result.min_clearance * 1e3:.0f} mm"))
+        rows.append(("clearance", f"{result.min_clearance * 1e3:.1f} mm"))
     if isinstance(motion, Trajectory):
         rows.append(("duration", f"{motion.duration:.2f} s"))
     else:
