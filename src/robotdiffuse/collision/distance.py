@@ -1,13 +1,12 @@
 """Compiled signed distances of the covering spheres, and gradients: one configuration after the other.
 
 The yes-or-no check is in `lanes.py`; these serve where the amount of clearance matters: the judge, guidance,
-refinement, and the clearances that the denoiser sees. Functions that allocate nothing are compiled without
-reference counting (_nrt=False): counting the arrays passed in would take most of the time.
+refinement, and the clearances that the denoiser sees.
 """
 
 import numpy as np
-from numba import njit
 
+from robotdiffuse.collision.compiled import allocation_free
 from robotdiffuse.collision.lanes import GRID_BAND_F
 
 CAP = np.float32(1.0)
@@ -17,7 +16,7 @@ _ZERO = np.float32(0.0)
 _TINY = np.float32(1e-9)
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def frames_of(robot, q, frames):
     """Fills frames[dof + 1, 12] (rotation row-major, translation); frame 0 is the base."""
     frames[0, :] = _ZERO
@@ -38,7 +37,7 @@ def frames_of(robot, q, frames):
             child[9 + k] = r0 * offset[9] + r1 * offset[10] + r2 * offset[11] + parent[9 + k] + z * slide
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def placed(frame, x, y, z):
     """Position of a point of a frame."""
     return (
@@ -48,7 +47,7 @@ def placed(frame, x, y, z):
     )
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _local(obstacle, x, y, z):
     dx, dy, dz = x - obstacle[0], y - obstacle[1], z - obstacle[2]
     return (
@@ -58,7 +57,7 @@ def _local(obstacle, x, y, z):
     )
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _outwards(obstacle, u, v, w):
     return (
         obstacle[3] * u + obstacle[6] * v + obstacle[9] * w,
@@ -67,14 +66,14 @@ def _outwards(obstacle, u, v, w):
     )
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _sphere(obstacle, x, y, z):
     dx, dy, dz = x - obstacle[0], y - obstacle[1], z - obstacle[2]
     d = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
     return d - obstacle[3], dx / d, dy / d, dz / d
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _box(obstacle, x, y, z):
     u, v, w = _local(obstacle, x, y, z)
     a, b, c = abs(u) - obstacle[12], abs(v) - obstacle[13], abs(w) - obstacle[14]
@@ -93,7 +92,7 @@ def _box(obstacle, x, y, z):
     return d, nx, ny, nz
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _cylinder(obstacle, x, y, z):
     u, v, w = _local(obstacle, x, y, z)
     r = np.sqrt(u * u + v * v) + _TINY
@@ -111,7 +110,7 @@ def _cylinder(obstacle, x, y, z):
     return d, nx, ny, nz
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _capsule(obstacle, x, y, z):
     u, v, w = _local(obstacle, x, y, z)
     w -= min(max(w, -obstacle[13]), obstacle[13])
@@ -120,7 +119,7 @@ def _capsule(obstacle, x, y, z):
     return d - obstacle[12], nx, ny, nz
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def points_distance(scene, x, y, z, limit):
     """Distance to the nearest of the scene's points if below `limit`, else a lower bound of at least that."""
     points, first, frame, grid = scene.points, scene.cell_first, scene.grid_frame, scene.grid
@@ -154,7 +153,7 @@ def points_distance(scene, x, y, z, limit):
     return best, bx, by, bz
 
 
-@njit(inline="always", _nrt=False)
+@allocation_free(inline="always")
 def scene_distance(scene, x, y, z, limit):
     """Signed distance of a point to the nearest obstacle if below `limit`, else `limit`; and its gradient."""
     best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
@@ -181,7 +180,7 @@ def scene_distance(scene, x, y, z, limit):
     return best, bx, by, bz
 
 
-@njit(inline="always", _nrt=False)
+@allocation_free(inline="always")
 def _pull(robot, frames, frame, x, y, z, fx, fy, fz, sign, grad):
     """Adds sign * J^T f of a point at x of a frame to grad."""
     for j in range(frame):
@@ -194,7 +193,7 @@ def _pull(robot, frames, frame, x, y, z, fx, fy, fz, sign, grad):
             grad[j] += sign * ((ay * rz - az * ry) * fx + (az * rx - ax * rz) * fy + (ax * ry - ay * rx) * fz)
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def cost_gradient_at(robot, scene, q, links, pairs, margin, self_margin, frames, grad):
     """Collision cost of a configuration and its gradient (added to `grad`).
 

@@ -5,13 +5,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from robotdiffuse.collision.compiled import allocation_free
 from robotdiffuse.collision.distance import cost_gradient_at, points_distance
 from robotdiffuse.collision.lanes import W, place, place_frames
 
 _ZERO = np.float32(0.0)
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _to_spheres(at, s, obstacles, near, n, mark, out):
     """Signed distances of a point in 16 lanes to obstacles.
 
@@ -29,7 +30,7 @@ def _to_spheres(at, s, obstacles, near, n, mark, out):
             out[row, i] = d if mark else min(out[row, i], d)
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _to_boxes(at, s, obstacles, near, n, mark, out):
     for k in range(len(obstacles)):
         if not (mark or near[n + k]):
@@ -51,7 +52,7 @@ def _to_boxes(at, s, obstacles, near, n, mark, out):
             out[row, i] = d if mark else min(out[row, i], d)
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _to_round(at, s, obstacles, flat_ends, near, n, mark, out):
     """Cylinders (`flat_ends`) or capsules."""
     for k in range(len(obstacles)):
@@ -79,14 +80,14 @@ def _to_round(at, s, obstacles, flat_ends, near, n, mark, out):
             out[row, i] = d if mark else min(out[row, i], d)
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def _to_points(at, s, scene, row, limit, mark, out):
     for i in range(W):
         d, _, _, _ = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit)
         out[row, i] = d if mark else min(out[row, i], d)
 
 
-@njit(inline="always", _nrt=False)
+@allocation_free(inline="always")
 def _to_scene(at, s, scene, near, limit, mark, out):
     n = 0
     _to_spheres(at, s, scene.spheres, near, n, mark, out)
@@ -101,7 +102,7 @@ def _to_scene(at, s, scene, near, limit, mark, out):
         _to_points(at, s, scene, n if mark else 0, limit, mark, out)
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _nearer(a, s, b, t, radii, best):
     """How many lanes have spheres s of a and t of b nearer to each other than best[0]."""
     total = 0
@@ -111,7 +112,7 @@ def _nearer(a, s, b, t, radii, best):
     return total
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _keep_least(a, s, b, first, last, spheres, radius, best):
     """Lowers best[0] to the distances of sphere s of a to the spheres from `first` to `last` of b."""
     for t in range(first, last):
@@ -160,13 +161,13 @@ def make_clearance_workspace(robot, obstacles):
     )
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def count_obstacles(scene):
     """Rows that `make_clearance_workspace` needs."""
     return len(scene.spheres) + len(scene.boxes) + len(scene.cylinders) + len(scene.capsules) + 1
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _mark_near(obstacles, radius, limit, near, bounds, least):
     """Marks the obstacles that can be nearest to a group in any lane, from distances of its bounding sphere.
 
@@ -189,13 +190,13 @@ def _mark_near(obstacles, radius, limit, near, bounds, least):
     return count
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _write(least, radius, best):
     for i in range(W):
         best[0, i] = min(best[0, i], least[0, i] - radius)
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def block_clearances(robot, scene, first, q, limit, work, best, out):
     """Signed distances to the scene, at most `limit`, of the groups from `first` on: out[groups, 16].
 
@@ -221,7 +222,7 @@ def block_clearances(robot, scene, first, q, limit, work, best, out):
             out[g - first, i] = best[0, i]
 
 
-@njit(inline="always", _nrt=False)
+@allocation_free(inline="always")
 def _place_group(robot, g, work):
     if not work.placed[g]:
         for s in range(robot.first[g], robot.first[g + 1]):
@@ -229,7 +230,7 @@ def _place_group(robot, g, work):
         work.placed[g] = True
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def block_pair_clearances(robot, q, limit, work, out):
     """Distances between the links of the checked pairs, at most `limit`, of q[dof, 16]: out[pairs, 16]."""
     place_frames(robot, q, work.frames, work.centres)

@@ -2,14 +2,15 @@
 
 Everything is written so that LLVM turns the loops over lanes into SIMD instructions: flat float32 arrays with
 constant lane offsets, small functions with few stores, polynomial sine and cosine, integer hit counts in
-place of early exits inside a lane loop. Functions that allocate nothing are compiled without reference
-counting (_nrt=False), which otherwise takes two thirds of the time.
+place of early exits inside a lane loop.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+
+from robotdiffuse.collision.compiled import allocation_free
 
 W = 16
 """Lanes: configurations per block."""
@@ -32,7 +33,7 @@ def _sine_of_turn(u):
     return u * (_S1 + v * (_S3 + v * (_S5 + v * (_S7 + v * (_S9 + v * _S11)))))
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _turn(parent, child, offset, q):
     """Frame behind a revolute joint: child = parent @ offset @ Rz(q), 16 lanes."""
     a00, a01, a02 = offset[0], offset[1], offset[2]
@@ -56,7 +57,7 @@ def _turn(parent, child, offset, q):
             child[(9 + k) * W + i] = r0 * px + r1 * py + r2 * pz + parent[(9 + k) * W + i]
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _slide(parent, child, offset, q):
     """Frame behind a prismatic joint: child = parent @ offset @ Tz(q), 16 lanes."""
     a00, a01, a02 = offset[0], offset[1], offset[2]
@@ -73,7 +74,7 @@ def _slide(parent, child, offset, q):
             child[(9 + k) * W + i] = r0 * px + r1 * py + r2 * pz + parent[(9 + k) * W + i] + z * q[i]
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def place(frames, f, spheres, s, positions, p):
     """Positions of a sphere's centre in 16 lanes, to row p."""
     x, y, z = spheres[s, 0], spheres[s, 1], spheres[s, 2]
@@ -87,7 +88,7 @@ def place(frames, f, spheres, s, positions, p):
             )
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _touch_spheres(at, s, radius, obstacles, near, n, mark, hits):
     """Adds 1 to the lanes whose sphere touches an obstacle; returns how many touches there are.
 
@@ -112,7 +113,7 @@ def _touch_spheres(at, s, radius, obstacles, near, n, mark, hits):
     return touches
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _touch_boxes(at, s, radius, obstacles, near, n, mark, hits):
     touches = 0
     reach = radius * radius
@@ -139,7 +140,7 @@ def _touch_boxes(at, s, radius, obstacles, near, n, mark, hits):
     return touches
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _touch_round(at, s, radius, obstacles, flat_ends, near, n, mark, hits):
     """Cylinders (`flat_ends`) or capsules."""
     touches = 0
@@ -170,7 +171,7 @@ def _touch_round(at, s, radius, obstacles, flat_ends, near, n, mark, hits):
     return touches
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _touch_each_other(a, s, b, t, reach, hits):
     reach *= reach
     total = 0
@@ -182,7 +183,7 @@ def _touch_each_other(a, s, b, t, reach, hits):
     return total
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def point_touches(scene, x, y, z, radius):
     """Whether a sphere touches one of the scene's points: distance grid first, then the cells around."""
     grid, frame = scene.grid, scene.grid_frame
@@ -204,7 +205,7 @@ def point_touches(scene, x, y, z, radius):
 GRID_BAND_F = 0.2
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def _touches_points_near(scene, x, y, z, radius):
     points, first, frame = scene.points, scene.cell_first, scene.grid_frame
     cell, reach = frame[4], radius + frame[5]
@@ -226,7 +227,7 @@ def _touches_points_near(scene, x, y, z, radius):
     return False
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def _touch_points(at, s, radius, scene, hits):
     total = 0
     for i in range(W):
@@ -236,7 +237,7 @@ def _touch_points(at, s, radius, scene, hits):
     return total
 
 
-@njit(inline="always", _nrt=False)
+@allocation_free(inline="always")
 def _touch_scene(at, s, radius, scene, near, mark, hits):
     """Touches of sphere s with the obstacles marked as near (with `mark`: with all, marking them)."""
     n = 0
@@ -256,7 +257,7 @@ def _touch_scene(at, s, radius, scene, near, mark, hits):
     return total
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def _all_lanes_hit(hits):
     total = 0
     for i in range(W):
@@ -301,7 +302,7 @@ def make_workspace(robot, scene):
     )
 
 
-@njit(inline="always", _nrt=False)
+@allocation_free(inline="always")
 def _place_group(robot, g, work):
     if not work.placed[g]:
         for s in range(robot.first[g], robot.first[g + 1]):
@@ -309,7 +310,7 @@ def _place_group(robot, g, work):
         work.placed[g] = True
 
 
-@njit(inline="always", _nrt=False)
+@allocation_free(inline="always")
 def place_frames(robot, q, frames, centres):
     """Frames of 16 configurations, and the centres of the bounding spheres of all groups."""
     for j in range(len(robot.offsets)):
@@ -321,7 +322,7 @@ def place_frames(robot, q, frames, centres):
         place(frames, robot.frame[g], robot.bounds, g, centres, g)
 
 
-@njit(inline="always", _nrt=False)
+@allocation_free(inline="always")
 def _hits_scene(robot, scene, padding, stop_at_first, work):
     any_hit = False
     for g in range(len(robot.frame)):
@@ -342,7 +343,7 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
     return any_hit
 
 
-@njit(inline="always", _nrt=False)
+@allocation_free(inline="always")
 def _hits_itself(robot, stop_at_first, work):
     any_hit = False
     positions, centres, scratch, hits = work.positions, work.centres, work.scratch, work.hits
@@ -367,7 +368,7 @@ def _hits_itself(robot, stop_at_first, work):
     return any_hit
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def block_hits(robot, scene, q, padding, stop_at_first, work):
     """Collisions of 16 configurations, q[dof, 16]; `work.hits` counts them by lane.
 

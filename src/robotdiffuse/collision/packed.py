@@ -6,6 +6,7 @@ from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision.arrays import RobotArrays, SceneArrays, compile_scene
+from robotdiffuse.collision.compiled import allocation_free
 from robotdiffuse.collision.lane_clearance import clearances_into, make_clearance_workspace
 from robotdiffuse.scenes.scene import Scene
 
@@ -13,7 +14,7 @@ SPHERE, BOX = 1, 2
 """Kinds in a packed scene; 0 means no obstacle. Parameters: centre, radius; or centre, size, wxyz."""
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def _unpack(kinds, params, spheres, boxes):
     """Writes the rows of SceneArrays; returns how many spheres and boxes there are."""
     n, m = 0, 0

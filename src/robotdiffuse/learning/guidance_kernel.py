@@ -3,6 +3,7 @@
 import numpy as np
 from numba import njit
 
+from robotdiffuse.collision.compiled import allocation_free
 from robotdiffuse.collision.distance import cost_gradient_at
 from robotdiffuse.collision.lane_clearance import (
     clearances_into,
@@ -63,7 +64,7 @@ def descend(robot, scene, q, lower, upper, kernel, margin, self_margin, push, re
     return costs
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _spread(q, pushes, active, kernel, lower, upper):
     n, dof = q.shape
     for i in range(1, n - 1):
@@ -82,7 +83,7 @@ def _spread(q, pushes, active, kernel, lower, upper):
             q[i, j] = min(max(q[i, j], lower[j]), upper[j])
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _relax(q, share):
     n, dof = q.shape
     for parity in range(2):

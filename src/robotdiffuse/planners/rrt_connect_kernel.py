@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from robotdiffuse.collision.compiled import allocation_free
 from robotdiffuse.collision.lanes import W, block_hits, make_workspace
 
 _ONE = np.float32(1.0)
@@ -44,7 +45,7 @@ class Trees(NamedTuple):
     """[2]"""
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def random(state):
     """Uniform in [0, 1) from the state uint64[1] (xorshift64*, S. Vigna 2016)."""
     x = state[0]
@@ -55,7 +56,7 @@ def random(state):
     return np.float32((x * np.uint64(2685821657736338717)) >> np.uint64(40)) * np.float32(5.9604645e-08)
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def motion_free(space, a, b, block, work):
     """Whether the straight motion from a to b is free; b is checked, a is not.
 
@@ -88,7 +89,7 @@ def motions_free(space, path):
     return out
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _distance(a, b):
     total = np.float32(0.0)
     for j in range(len(a)):
@@ -96,7 +97,7 @@ def _distance(a, b):
     return np.sqrt(total)
 
 
-@njit(fastmath=True, cache=True, _nrt=False)
+@allocation_free(fastmath=True)
 def _nearest(nodes, tree, size, q):
     best, where = np.float32(np.inf), 0
     dof = len(q)
@@ -268,7 +269,7 @@ def _skip(space, path, out, block, work):
         i = following
 
 
-@njit(cache=True, _nrt=False)
+@allocation_free()
 def _place_at(points, n, length, out):
     """Writes the place at a length along the path; returns the index of its segment."""
     for i in range(n - 1):
