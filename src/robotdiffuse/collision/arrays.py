@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy import ndarray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -213,7 +213,7 @@ def _grid(cloud: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     shape = np.ceil(extent / voxel).astype(int)
     axes = [low[i] + voxel * (np.arange(shape[i]) + 0.5) for i in range(3)]
     centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    tree = cKDTree(cloud[:, :3])
+    tree = KDTree(cloud[:, :3])
     bound = GRID_BAND + radius + voxel
     nearest, _ = tree.query(centres, distance_upper_bound=bound, workers=1)
     grid = (np.minimum(nearest, bound) - radius).astype(np.float32).reshape(shape)
@@ -221,6 +221,7 @@ def _grid(cloud: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     cells = np.ceil(extent / cell).astype(int)
     where = np.ravel_multi_index(tuple(((cloud[:, :3] - low) / cell).astype(int).T), tuple(cells))
     order = np.argsort(where, kind="stable")
-    first = np.searchsorted(where[order], np.arange(cells.prod() + 1)).astype(np.int32)
+    edges = np.arange(int(np.prod(cells)) + 1)
+    first = np.asarray(np.searchsorted(where[order], edges), np.int32)
     frame = np.array([*low, voxel, cell, radius, cells[1], cells[2]], np.float32)
     return np.ascontiguousarray(cloud[order]), first, grid, frame

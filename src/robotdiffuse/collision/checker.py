@@ -38,11 +38,8 @@ class CollisionChecker:
 
         Towards point clouds and meshes at most 0.2 m less a sphere's radius.
         """
-        limit = np.float32(limit)
-        return (
-            lane_clearance.link_clearances(self.robot_arrays, self.scene_arrays, _float32(q), limit)
-            - self.padding
-        )
+        arrays = self.robot_arrays, self.scene_arrays
+        return lane_clearance.link_clearances(*arrays, _float32(q), np.float32(limit)) - self.padding
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
         """Distance between the links of each checked pair [m], at most 1 m."""

@@ -28,8 +28,9 @@ FLAGS = (
 def read_limits(file: str | Path) -> dict[str, dict[str, float]]:
     """Limits by joint and field of Joint, from a YAML or JSON file.
 
-    It holds joint_limits: {JOINT: {max_velocity: 2.0}}. Fields: min_position, max_position, max_velocity, max_acceleration, max_jerk; MoveIt's has_..._limits are
-    accepted, and a field whose flag is false is left out. Raises InputError naming the joint and the field.
+    It holds joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position, max_position,
+    max_velocity, max_acceleration, max_jerk; MoveIt's has_..._limits are accepted, and a field whose flag is
+    false is left out. Raises InputError naming the joint and the field.
     """
     try:
         data = yaml.safe_load(Path(file).read_text(encoding="utf-8"))

@@ -14,12 +14,12 @@ sphere to its best centre. It starts from a greedy set cover and drops spheres a
 from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import ConvexMesh, Robot
+from robotdiffuse.robots.sphere_kernels import DIRECTIONS, assign, depths_at, relax
 
 
 @dataclass(frozen=True)
@@ -28,18 +28,20 @@ class SphereSettings:
 
     coarsest: float = 0.015
     """How far a sphere may stick out of a link in the first half of the arm [m]."""
-    at_tip: float = 0.007
+    at_tip: float = 0.008
     """The same behind the last joint, where the arm works close to obstacles; between them, linear [m]."""
-    relative: float = 0.7
+    relative: float = 1.0
     """Never more than this times the radius of the largest sphere inside the link."""
     finest: float = 0.004
     """Nor less than this [m]."""
     candidates: int = 1000
     """Places inside the mesh that the greedy cover chooses from."""
-    rounds: int = 8
+    rounds: int = 15
     """Rounds of the alternation for each number of spheres."""
-    tries: int = 3
+    tries: int = 5
     """Spheres of which each is dropped for a try, before their number is final."""
+    starts: int = 2
+    """Fits from different starts, of which the one with the fewest spheres is kept."""
 
     def __post_init__(self) -> None:
         if not 0 < self.finest <= self.at_tip <= self.coarsest:
@@ -72,29 +74,18 @@ def fit_spheres(
     body, true_body = _Body(meshes, allowances), _Body(meshes)
     grid = _grid(meshes, tolerance / 2)
     # sticking out of a flat face by e, a sphere covers a disc of radius sqrt(2 r e); cells are much smaller
-    disc = np.sqrt(2 * tolerance * true_body.depth(grid).max())
-    cells = _Cells.of(meshes, disc / 5)
-    places = _inside_points(true_body, meshes, settings.candidates, rng)
-    needed = cells.stick_out(body, places)
-    centers = places[_greedy_cover(needed <= np.maximum(tolerance, needed.min(1, keepdims=True)))]
-    centers = _relax(body, cells, centers, settings.rounds, tolerance)
-    while (needed := cells.stick_out(body, centers).min(1)).max() > tolerance:
-        extra = cells.points[cells.corners[needed.argmax()]].mean(0)
-        centers = _relax(body, cells, np.concatenate([centers, extra[None]]), settings.rounds, tolerance)
-    for finer in (1, 2):
-        if finer == 2:
-            cells = _Cells.of(meshes, disc / 10)
-        failures = 0
-        while len(centers) > 1 and failures < settings.tries:
-            fewer = _without_one(body, cells, centers, failures)
-            fewer = _relax(body, cells, fewer, settings.rounds, tolerance)
-            if cells.stick_out(body, fewer).min(1).max() > tolerance:
-                failures += 1
-            else:
-                centers, failures = fewer, 0
-    cells = _Cells.of(meshes, disc / 20)
-    spheres = _with_radii(body, cells, _relax(body, cells, centers, settings.rounds // 2, 0.0))
-    return _without_holes(true_body, grid, spheres, tolerance)
+    disc = float(np.sqrt(2 * tolerance * true_body.depth(grid).max()))
+    coarse, medium, fine = (_Cells.of(meshes, disc / cut) for cut in (4, 8, 16))
+    best = None
+    for _ in range(settings.starts):
+        places = _inside_points(true_body, meshes, settings.candidates, rng)
+        centers = _first_cover(body, coarse, places, tolerance, settings.rounds)
+        for cells in (coarse, medium):
+            centers = _thin_out(body, cells, centers, tolerance, settings)
+        if best is None or len(centers) < len(best):
+            best = centers
+    centers, _ = _relax(body, fine, best, settings.rounds, 0.0)
+    return _without_holes(true_body, grid, _with_radii(body, fine, centers), tolerance)
 
 
 def stick_out(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n"]:
@@ -133,17 +124,24 @@ class _Body:
         self, meshes: tuple[ConvexMesh, ...], allowances: tuple[Float[ndarray, "f"], ...] | None = None
     ) -> None:
         allowances = allowances or tuple(np.zeros(len(mesh.faces)) for mesh in meshes)
-        self.planes = [_planes(mesh, extra) for mesh, extra in zip(meshes, allowances, strict=True)]
+        planes = [_planes(mesh, extra) for mesh, extra in zip(meshes, allowances, strict=True)]
+        self.normals = np.concatenate([normals for normals, _ in planes])
+        self.offsets = np.concatenate([offsets for _, offsets in planes])
+        self.starts = np.cumsum([0, *(len(offsets) for _, offsets in planes)])
+        """First plane of each mesh, and the number of planes."""
+
+    @property
+    def arrays(self) -> tuple[ndarray, ndarray, ndarray]:
+        return self.normals, self.offsets, self.starts
 
     def depth(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
         """Distance from each point inside to the nearest face plane [m]; negative outside."""
-        depths = [-(points @ normals - offsets).max(1) for normals, offsets in self.planes]
-        return depths[0] if len(depths) == 1 else np.max(depths, axis=0)
+        return depths_at(points, *self.arrays)
 
 
 def _planes(
     mesh: ConvexMesh, allowance: Float[ndarray, "f"]
-) -> tuple[Float[ndarray, "3 p"], Float[ndarray, "p"]]:
+) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p"]]:
     """Normals and offsets of the distinct planes of a mesh."""
     normals = face_normals(mesh)
     good = np.linalg.norm(normals, axis=1) > 0.5
@@ -151,7 +149,7 @@ def _planes(
     least = np.full(len(normals), np.inf)
     np.minimum.at(least, index.ravel(), allowance[good])
     # the farthest vertex, not the face's own: rounding must not put a plane inside the mesh
-    return np.ascontiguousarray(normals.T), (mesh.vertices @ normals.T).max(0) + least
+    return normals, (mesh.vertices @ normals.T).max(0) + least
 
 
 def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:
@@ -175,36 +173,26 @@ class _Cells:
     @staticmethod
     def of(meshes: tuple[ConvexMesh, ...], size: float) -> "_Cells":
         """Triangles with edges of at most this size [m], without those inside another mesh."""
-        points, corners, sharp, count = [], [], [], 0
+        soup, vertices, cut = [], [], []
         for k, mesh in enumerate(meshes):
-            p, f = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, size, max_iter=30)
-            p, f = np.asarray(p), np.asarray(f)
-            hidden = np.zeros(len(f), dtype=bool)
+            triangles = _split(mesh.vertices[mesh.faces], size)
+            hidden = np.zeros(len(triangles), dtype=bool)
             for other in meshes[:k] + meshes[k + 1 :]:
-                hidden |= (_Body((other,)).depth(p) > 1e-9)[f].all(1)
-            used, index = np.unique(f[~hidden], return_inverse=True)
-            p, f = p[used], index.reshape(-1, 3)
-            is_vertex = (_distances(p, mesh.vertices) < 1e-9).any(1)
-            # where triangles were left out, any point may be a corner of what is left
-            sharp.append(is_vertex | hidden.any())
-            points.append(p)
-            corners.append(f + count)
-            count += len(p)
-        return _Cells(np.concatenate(points), np.concatenate(corners), np.concatenate(sharp))
-
-    def outlines(self, owner: Int[ndarray, "c"], count: int) -> list[Float[ndarray, "k 3"]]:
-        """For each owner, points whose convex hull holds all its cells."""
-        # a point between cells of one owner is needed only if it is a vertex of the mesh
-        first = np.full(len(self.points), count)
-        last = np.full(len(self.points), -1)
-        np.minimum.at(first, self.corners.ravel(), np.repeat(owner, 3))
-        np.maximum.at(last, self.corners.ravel(), np.repeat(owner, 3))
-        rim = (first != last) | self.sharp
-        lines = []
-        for i in range(count):
-            corners = self.corners[owner == i].ravel()
-            lines.append(self.points[np.unique(corners[rim[corners]])])
-        return lines
+                inside = _Body((other,)).depth(triangles.reshape(-1, 3)) > 1e-9
+                hidden |= inside.reshape(-1, 3).all(1)
+            soup.append(triangles[~hidden])
+            vertices.append(mesh.vertices)
+            cut.append(hidden.any())
+        corners = np.concatenate(soup).reshape(-1, 3)
+        keys = np.round(np.concatenate([*vertices, corners]), 9) + 0.0
+        _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        points = np.concatenate([*vertices, corners])[first]
+        count = len(keys) - len(corners)
+        sharp = np.zeros(len(points), dtype=bool)
+        sharp[index.ravel()[:count]] = True
+        # where triangles were left out, any point may be a corner of what is left
+        sharp |= any(cut)
+        return _Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
 
     def farthest(self, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "c n"]:
         """Radius that each centre needs to hold each cell [m]."""
@@ -212,74 +200,56 @@ class _Cells:
         a, b, c = self.corners.T
         return np.maximum(np.maximum(distance[a], distance[b]), distance[c])
 
-    def stick_out(self, body: _Body, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "c n"]:
-        """How far a sphere at each centre would reach out of the meshes to hold each cell [m]."""
-        return self.farthest(centers) - body.depth(centers)
-
-
-def _greedy_cover(holds: Bool[ndarray, "c n"]) -> Int[ndarray, "k"]:
-    left = holds
-    chosen: list[int] = []
-    while len(left):
-        chosen.append(int(left.sum(0).argmax()))
-        left = left[~left[:, chosen[-1]]]
-    return np.array(chosen)
+    def assigned(
+        self, body: _Body, centers: Float[ndarray, "n 3"]
+    ) -> tuple[Int[ndarray, "c"], Float[ndarray, "c"], Float[ndarray, "c"]]:
+        """For each cell the sphere that holds it with the least stick-out, that, and the next least [m]."""
+        owner = np.empty(len(self.corners), np.int64)
+        least, second = np.empty(len(owner)), np.empty(len(owner))
+        assign(self.points, self.corners, centers, body.depth(centers), owner, least, second)
+        return owner, least, second
 
 
 def _relax(
     body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
-) -> Float[ndarray, "n 3"]:
-    """Alternate between giving cells to spheres and moving the spheres; the best centres met.
-
-    Ends early when all spheres stick out by `enough` [m] or less.
-    """
-    step, best, best_value = 0.004, centers, np.inf
-    for i in range(rounds + 1):
-        needed = cells.stick_out(body, centers)
-        value = float(needed.min(1).max())
-        if value < best_value:
-            best, best_value = centers, value
-        if value <= enough or i == rounds:
-            break
-        outlines = cells.outlines(needed.argmin(1), len(centers))
-        centers = np.stack(
-            [_best_center(body, own, p, step) for own, p in zip(outlines, centers, strict=True)]
-        )
-        step = max(0.8 * step, 0.0005)
-    return best
+) -> tuple[Float[ndarray, "n 3"], float]:
+    """Better centres, and how far the worst sphere sticks out [m]; ends early at `enough`."""
+    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *body.arrays, DIRECTIONS)
 
 
-def _best_center(
-    body: _Body, own: Float[ndarray, "k 3"], center: Float[ndarray, "3"], step: float
-) -> Float[ndarray, "3"]:
-    """Centre of least stick-out for a sphere that holds these points, by pattern search."""
-    if not len(own):
-        return center
-
-    def value(centers: ndarray) -> ndarray:
-        return _distances(centers, own).max(1) - body.depth(centers)
-
-    least = value(center[None])[0]
-    while step > 2e-4:
-        around = center + step * DIRECTIONS
-        values = value(around)
-        i = int(values.argmin())
-        if values[i] < least - 1e-7:
-            center, least = around[i], values[i]
-        else:
-            step /= 2
-    return center
+def _first_cover(
+    body: _Body, cells: _Cells, places: Float[ndarray, "n 3"], tolerance: float, rounds: int
+) -> Float[ndarray, "k 3"]:
+    """Centres from a greedy set cover, with more until none sticks out by more than the tolerance."""
+    needed = cells.farthest(places) - body.depth(places)
+    open_cells = needed <= np.maximum(tolerance, needed.min(1, keepdims=True))
+    chosen: list[int] = []
+    while len(open_cells):
+        chosen.append(int(open_cells.sum(0).argmax()))
+        open_cells = open_cells[~open_cells[:, chosen[-1]]]
+    centers, worst = _relax(body, cells, places[chosen], rounds, tolerance)
+    while worst > tolerance:
+        extra = cells.points[cells.corners[cells.assigned(body, centers)[1].argmax()]].mean(0)
+        centers, worst = _relax(body, cells, np.concatenate([centers, extra[None]]), rounds, tolerance)
+    return centers
 
 
-def _without_one(
-    body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"], rank: int
+def _thin_out(
+    body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"], tolerance: float, settings: SphereSettings
 ) -> Float[ndarray, "m 3"]:
-    """Drop the sphere whose cells the others take over with the least stick-out, or the next by rank."""
-    needed = cells.stick_out(body, centers)
-    second = np.partition(needed, 1, axis=1)[:, 1]
-    owner = needed.argmin(1)
-    loss = [second[owner == i].max(initial=0.0) for i in range(len(centers))]
-    return np.delete(centers, int(np.argsort(loss)[min(rank, len(loss) - 1)]), axis=0)
+    """Drop spheres, those first whose cells the others take over best, as long as the tolerance holds."""
+    failures = 0
+    while failures < min(settings.tries, len(centers) - 1):
+        owner, _, second = cells.assigned(body, centers)
+        loss = np.zeros(len(centers))
+        np.maximum.at(loss, owner, second)
+        fewer = np.delete(centers, np.argsort(loss)[failures], axis=0)
+        fewer, worst = _relax(body, cells, fewer, settings.rounds, tolerance)
+        if worst > tolerance:
+            failures += 1
+        else:
+            centers, failures = fewer, 0
+    return centers
 
 
 def _with_radii(body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
@@ -305,7 +275,24 @@ def _without_holes(
     return spheres
 
 
-def _distances(a: Float[ndarray, "n 3"], b: Float[ndarray, "m 3"]) -> Float[ndarray, "n m"]:
+def _split(triangles: Float[ndarray, "n 3 3"], size: float) -> Float[ndarray, "m 3 3"]:
+    """Halve triangles at their longest edge until no edge is longer than `size` [m]."""
+    done = []
+    while len(triangles):
+        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
+        longest = edges.argmax(1)
+        small = edges.max(1) <= size
+        done.append(triangles[small])
+        triangles, longest = triangles[~small], longest[~small]
+        turn = (longest[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(triangles, turn[:, :, None], axis=1), 1, 0)
+        middle = (a + b) / 2
+        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+    return np.concatenate(done)
+
+
+def _distances(a: ndarray, b: ndarray) -> ndarray:
+    """Distances [n, m] of points [n, 3] and [m, 3]."""
     squares = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
     return np.sqrt(np.maximum(squares, 0.0))
 
@@ -325,9 +312,3 @@ def _inside_points(
     corners = np.concatenate([mesh.vertices for mesh in meshes])
     points = rng.uniform(corners.min(0), corners.max(0), (20 * count, 3))
     return points[body.depth(points) > 0][:count]
-
-
-DIRECTIONS = np.array(
-    [[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], dtype=float
-)
-DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)

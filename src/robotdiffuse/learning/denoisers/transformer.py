@@ -83,6 +83,9 @@ class Transformer(nn.Module):
     z_tk is also added to every other token, which spares the first layer from having to spread it.
     """
 
+    positions: Tensor
+    frequencies: Tensor
+
     def __init__(
         self, settings: TransformerSettings, frames: int, dof: int, features: int, condition: int
     ) -> None:
