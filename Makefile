@@ -1,4 +1,5 @@
 # make demo      plan a bundled problem; creates the core environment in .venv when there is none
+# make weights   makes training data and trains the weights anew, in runs/panda; the same command resumes
 # make install   the development environment with all extras in .venv
 # make test      all tests          make lint   ruff and pyright          make bench   all benchmarks
 
@@ -6,7 +7,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: install demo test lint bench clean
+.PHONY: install demo test lint bench weights clean
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
@@ -34,6 +35,12 @@ lint: .venv/dev.stamp
 
 bench: .venv/dev.stamp
 	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
+
+weights: .venv/core.stamp
+	$(BIN)/robotdiffuse data generate --out runs/panda/data --problems 240000
+	$(BIN)/robotdiffuse train encoder --out runs/panda/encoder --minutes 6
+	$(BIN)/robotdiffuse train planner --out runs/panda/planner --minutes 44 \
+		--data runs/panda/data --encoder runs/panda/encoder
 
 clean:
 	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis demo.png demo.html
