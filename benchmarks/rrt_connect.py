@@ -41,9 +41,9 @@ def search_seconds(problem: Problem, settings: RRTConnectSettings) -> float:
     checker = CollisionChecker(problem.robot, problem.scene)
     assert isinstance(problem.goal, JointGoal)
     ends = Ends(checker, problem.start, problem.goal.positions)
-    assert ends.start_lead is not None
-    start, goals = ends.start_lead.astype(np.float32), np.array(ends.goal_leads, np.float32)
-    space, state = search_space(checker, settings.resolution), random_state(0)
+    start, goals = ends.rows()
+    clearance = ends.kept_clearance(settings.clearance)
+    space, state = search_space(checker, settings.resolution, clearance), random_state(0)
     began = time.process_time()
     best = None
     for _ in range(settings.searches):

@@ -126,7 +126,7 @@ class RobotDiffuse:
     def _straight(self, call: Call, checker: CollisionChecker, ends: Ends) -> PlanResult | None:
         """The straight line to the nearest goal that it reaches: no path could be shorter."""
         space = search_space(checker, self.settings.resolution)
-        start, goals = _rows(ends)
+        start, goals = ends.rows()
         for goal in sorted(goals, key=lambda goal: float(np.linalg.norm(goal - start))):
             line = np.stack([start, goal])
             if kernel.motions_free(space, line).all():
@@ -138,7 +138,7 @@ class RobotDiffuse:
     def _learned(
         self, call: Call, checker: CollisionChecker, ends: Ends, model: MotionModel, rng: np.random.Generator
     ) -> PlanResult | None:
-        start, goals = _rows(ends)
+        start, goals = ends.rows()
         code = encode(model, checker, self.settings.points, rng)
         sampled = self.sample(model, checker, code, start, goals, rng)
         result = self._best(call, checker, ends, sampled)
@@ -239,8 +239,3 @@ def unlearned_starts(
     q = np.clip(q, robot.lower, robot.upper)
     q[:, 0], q[:, -1] = start, goal
     return q
-
-
-def _rows(ends: Ends) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
-    assert ends.start_lead is not None
-    return ends.start_lead.astype(np.float32), np.array(ends.goal_leads, np.float32)

@@ -106,10 +106,15 @@ class Ends:
         """Whether a search can begin and end."""
         return self.start_lead is not None and bool(self.goals)
 
+    def rows(self) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
+        """Where a search begins and where it may end, in float32."""
+        assert self.start_lead is not None
+        return self.start_lead.astype(np.float32), np.array(self.goal_leads, np.float32)
+
     def kept_clearance(self, wanted: float) -> float:
         """The distance that a path can keep to obstacles: as wanted, or half of what the ends have [m]."""
-        assert self.start_lead is not None
-        leads = np.concatenate([self.start_lead[None], self.goal_leads])
+        start, goals = self.rows()
+        leads = np.concatenate([start[None], goals])
         return min(wanted, 0.5 * float(self.checker.link_clearances(leads).min(initial=wanted)))
 
     def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
@@ -151,7 +156,7 @@ class RRTConnect:
             return call.timeout("the start or every goal touches an obstacle too closely to search from")
         attempt = 0
         while attempt == 0 or call.remaining > 0:
-            path = self._shortest(call, checker, ends, settings, attempt)
+            path = _Search(call, checker, ends, settings, attempt).best()
             if path is None:
                 break
             result = call.finish(ends.complete(path), self.name)
@@ -162,63 +167,52 @@ class RRTConnect:
             attempt += 1
         return call.timeout()
 
-    def _shortest(
+
+class _Search:
+    """Paths between the ends of a call, not yet judged."""
+
+    def __init__(
         self, call: Call, checker: CollisionChecker, ends: Ends, settings: RRTConnectSettings, attempt: int
-    ) -> Float[ndarray, "n dof"] | None:
-        space = search_space(checker, settings.resolution, ends.kept_clearance(settings.clearance))
-        state = random_state(call.seed, attempt)
-        assert ends.start_lead is not None
-        start = ends.start_lead.astype(np.float32)
-        goals = np.array(ends.goal_leads, np.float32)
-        best = self._first(call, space, start, goals, settings, state, call.time_limit)
+    ) -> None:
+        self.call, self.settings = call, settings
+        self.space = search_space(checker, settings.resolution, ends.kept_clearance(settings.clearance))
+        self.state = random_state(call.seed, attempt)
+        self.start, self.goals = ends.rows()
+
+    def best(self) -> Float[ndarray, "n dof"] | None:
+        """The first path, or the shortest after restarts for as long as the settings say."""
+        best = self._shortened(self.call.time_limit)
         if best is None:
             return None
-        until = min(call.elapsed + settings.optimize_time, call.time_limit)
-        while call.elapsed < until:
-            other = self._first(call, space, start, goals, settings, state, until)
+        until = min(self.call.elapsed + self.settings.optimize_time, self.call.time_limit)
+        while self.call.elapsed < until:
+            other = self._shortened(until)
             if other is not None:
                 if kernel.path_length(other) < kernel.path_length(best):
-                    best, other = other, best
-                best = kernel.shortcut(space, best, settings.shortcuts, state)
+                    best = other
+                best = kernel.shortcut(self.space, best, self.settings.shortcuts, self.state)
         return best
 
-    def _first(
-        self,
-        call: Call,
-        space: kernel.Space,
-        start: ndarray,
-        goals: ndarray,
-        settings: RRTConnectSettings,
-        state: ndarray,
-        until: float,
-    ) -> Float[ndarray, "n dof"] | None:
-        """The shortest of some searches, shortened; None if the first of them takes until `until` [s]."""
+    def _shortened(self, until: float) -> Float[ndarray, "n dof"] | None:
+        """The shortest of some paths, shortened; None if the first of them takes until `until` [s]."""
         best: ndarray | None = None
-        for _ in range(settings.searches):
-            path = self._search_once(call, space, start, goals, settings, state, until)
+        for _ in range(self.settings.searches):
+            path = self._path(until)
             if path is None:
                 break
             if best is None or kernel.path_length(path) < kernel.path_length(best):
                 best = path
-        return None if best is None else kernel.shortcut(space, best, settings.shortcuts, state)
+        return (
+            None if best is None else kernel.shortcut(self.space, best, self.settings.shortcuts, self.state)
+        )
 
-    def _search_once(
-        self,
-        call: Call,
-        space: kernel.Space,
-        start: ndarray,
-        goals: ndarray,
-        settings: RRTConnectSettings,
-        state: ndarray,
-        until: float,
-    ) -> Float[ndarray, "n dof"] | None:
-        reach = np.float32(settings.reach)
-        capacity = settings.capacity + len(goals)
+    def _path(self, until: float) -> Float[ndarray, "n dof"] | None:
+        reach, capacity = np.float32(self.settings.reach), self.settings.capacity + len(self.goals)
         while True:
-            trees = kernel.make_trees(start, goals, capacity)
+            trees = kernel.make_trees(self.start, self.goals, capacity)
             while trees.sizes.max() < capacity:
-                path = kernel.search(space, trees, reach, ITERATIONS, state)
+                path = kernel.search(self.space, trees, reach, ITERATIONS, self.state)
                 if len(path):
                     return path
-                if call.elapsed > until:
+                if self.call.elapsed > until:
                     return None
