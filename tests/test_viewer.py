@@ -104,7 +104,7 @@ def test_replay_holds_everything(arm, scene, motion, tmp_path):
     np.testing.assert_allclose(data["positions"][0], motion.positions[0], atol=1e-5)
     np.testing.assert_allclose(data["positions"][-1], motion.positions[-1], atol=1e-5)
     assert np.shape(data["candidates"]) == (2, 120, 3)
-    assert dict(data["facts"])["clearance"] == "42 mm"
+    assert dict(data["facts"])["clearance"] == "42.0 mm"
     assert dict(data["facts"])["planner"] == "robotdiffuse · refinement"
     assert data["robot"]["spheres"] == [[3, 0.0, 0.0, 0.1, 0.12]]
     assert file.stat().st_size < 800_000
