@@ -82,7 +82,7 @@ def stick_out_of_arm(robot: Robot, link: str, spheres: Float[ndarray, "n 4"], po
             local = np.einsum("nji,nj->ni", other.T_link_neighbour[:, :3, :3], p)
             best = min(best, float(_distance(robot, other.link, local, best).max()))
         worst = max(worst, best)
-    return worst
+    return float(worst)
 
 
 def _allowance(

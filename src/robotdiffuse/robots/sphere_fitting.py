@@ -21,15 +21,18 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import ConvexMesh, Robot
 from robotdiffuse.robots.sphere_kernels import DIRECTIONS, assign, depths_at, relax
 
+MARGIN = 1e-5
+"""Added to the radii [m]: covers rounding in files and in single-precision kernels."""
+
 
 @dataclass(frozen=True)
 class SphereSettings:
     """How closely spheres follow the meshes of a link."""
 
-    coarsest: float = 0.015
-    """How far a sphere may stick out of a link in the first half of the arm [m]."""
-    at_tip: float = 0.008
-    """The same behind the last joint, where the arm works close to obstacles; between them, linear [m]."""
+    first_half: float = 0.015
+    """How far a sphere may stick out of a link that half of the joints (rounded up) or fewer move [m]."""
+    second_half: float = 0.009
+    """The same for the links beyond, which work closer to obstacles [m]."""
     relative: float = 1.0
     """Never more than this times the radius of the largest sphere inside the link."""
     finest: float = 0.004
@@ -44,20 +47,20 @@ class SphereSettings:
     """Fits from different starts, of which the one with the fewest spheres is kept."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.finest <= self.at_tip <= self.coarsest:
+        if not 0 < self.finest <= min(self.first_half, self.second_half):
             raise InputError(
-                f"sphere tolerances: finest {self.finest}, at_tip {self.at_tip}, coarsest {self.coarsest}; "
-                "each must be positive and at most the next"
+                f"sphere tolerances: finest is {self.finest}; it must be positive and at most first_half "
+                f"({self.first_half}) and second_half ({self.second_half})"
             )
 
     def tolerance(self, robot: Robot, link: str) -> float:
         """How far the spheres of a link may stick out [m]."""
         meshes = robot.meshes[link]
-        along = max(0.0, 2 * robot.link_frame(link) / robot.dof - 1)
-        wanted = self.coarsest + along * (self.at_tip - self.coarsest)
+        first = robot.link_frame(link) <= (robot.dof + 1) // 2
+        wanted = self.first_half if first else self.second_half
         size = np.ptp(np.concatenate([mesh.vertices for mesh in meshes]), axis=0).min()
         inradius = _Body(meshes).depth(_grid(meshes, size / 16)).max()
-        return float(np.clip(min(wanted, self.relative * inradius), self.finest, self.coarsest))
+        return float(max(min(wanted, self.relative * inradius), self.finest))
 
 
 def fit_spheres(
@@ -93,20 +96,25 @@ def stick_out(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) ->
     return spheres[:, 3] - _Body(meshes).depth(spheres[:, :3])
 
 
-def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], finest: float = 2e-5) -> bool:
+def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], finest: float = 2e-6) -> bool:
     """Whether the spheres provably cover the surface of the union of the meshes.
 
-    Triangles that no one sphere holds are cut in four, until they are held or smaller than `finest` [m].
+    Triangles that no one sphere holds are cut in four, until all are held, or a corner is found that is in
+    no sphere, or they are smaller than `finest` [m].
     """
     triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
-    single = [_Body((mesh,)) for mesh in meshes]
+    single = [_Body((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
     while len(triangles):
         corners = triangles.reshape(-1, 3)
         gaps = _distances(corners, spheres[:, :3]) - spheres[:, 3]
         is_open = (gaps.reshape(len(triangles), 3, -1).max(1) > 0).all(1)
-        if len(meshes) > 1:
-            hidden = [(body.depth(corners).reshape(-1, 3) > 1e-9).all(1) for body in single]
-            is_open &= ~np.any(hidden, axis=0)
+        bare = gaps.min(1) > 0
+        for body in single:
+            hidden = body.depth(corners) > 1e-9
+            is_open &= ~hidden.reshape(-1, 3).all(1)
+            bare &= ~hidden
+        if bare.any():
+            return False
         triangles = triangles[is_open]
         if len(triangles) and np.linalg.norm(np.ptp(triangles, axis=1), axis=1).min() < finest:
             return False
@@ -256,7 +264,7 @@ def _with_radii(body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"]) -> F
     """Least radii with which each sphere holds its own cells; spheres without any are dropped."""
     radius = cells.farthest(centers)
     own = np.eye(len(centers), dtype=bool)[(radius - body.depth(centers)).argmin(1)]
-    radii = np.where(own, radius, 0.0).max(0) + 3e-6
+    radii = np.where(own, radius, 0.0).max(0) + MARGIN
     return np.concatenate([centers, radii[:, None]], axis=1)[own.any(0)]
 
 

@@ -39,20 +39,24 @@ def depths_at(centers, normals, offsets, starts):
 
 
 @njit(cache=True, fastmath=True)
+def squared_distance(a, i, b, j):
+    x, y, z = a[i, 0] - b[j, 0], a[i, 1] - b[j, 1], a[i, 2] - b[j, 2]
+    return x * x + y * y + z * z
+
+
+@njit(cache=True, fastmath=True)
 def assign(points, corners, centers, depths, owner, least, second):
     """For each cell the sphere that holds it with the least stick-out, that stick-out, and the next best."""
     for c in range(len(corners)):
         best, runner, mine = 1e9, 1e9, -1
         for i in range(len(centers)):
-            far = 0.0
-            for k in range(3):
-                p = corners[c, k]
-                dx, dy, dz = (
-                    points[p, 0] - centers[i, 0],
-                    points[p, 1] - centers[i, 1],
-                    points[p, 2] - centers[i, 2],
-                )
-                far = max(far, dx * dx + dy * dy + dz * dz)
+            # a first corner that is too far settles it: most spheres are
+            reach = runner + depths[i]
+            far = squared_distance(points, corners[c, 0], centers, i)
+            if reach <= 0.0 or far >= reach * reach:
+                continue
+            far = max(far, squared_distance(points, corners[c, 1], centers, i))
+            far = max(far, squared_distance(points, corners[c, 2], centers, i))
             needed = math.sqrt(far) - depths[i]
             if needed < best:
                 runner, best, mine = best, needed, i
@@ -100,11 +104,8 @@ def relax(points, corners, sharp, centers, rounds, enough, normals, offsets, sta
     cells, count = len(corners), len(centers)
     owner = np.empty(cells, np.int64)
     least, second = np.empty(cells), np.empty(cells)
-    first, rim, stamp = (
-        np.empty(len(points), np.int64),
-        np.empty(len(points), np.bool_),
-        np.empty(len(points), np.int64),
-    )
+    first, stamp = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
+    rim = np.empty(len(points), np.bool_)
     own = np.empty((len(points), 3))
     order, ends = np.empty(cells, np.int64), np.empty(count + 1, np.int64)
     centers = centers.copy()
