@@ -19,7 +19,7 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
     """A robot by its bundled name, the name that `robotdiffuse robot add` gave it, its folder, or its URDF.
 
     A URDF is looked up by its content among the robots that were added; a new or changed one is fitted with
-    spheres first, which takes about half a minute, and kept. `locked` holds joints at values (see
+    spheres first, which takes about a minute, and kept. `locked` holds joints at values (see
     Robot.with_locked). Raises InputError for an unknown name or bad input.
     """
     text = str(name)

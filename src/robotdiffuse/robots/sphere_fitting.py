@@ -79,15 +79,14 @@ def fit_spheres(
     # sticking out of a flat face by e, a sphere covers a disc of radius sqrt(2 r e); cells are much smaller
     disc = float(np.sqrt(2 * tolerance * true_body.depth(grid).max()))
     coarse, medium, fine = (_Cells.of(meshes, disc / cut) for cut in (4, 8, 16))
-    best = None
+    covers = []
     for _ in range(settings.starts):
         places = _inside_points(true_body, meshes, settings.candidates, rng)
         centers = _first_cover(body, coarse, places, tolerance, settings.rounds)
         for cells in (coarse, medium):
             centers = _thin_out(body, cells, centers, tolerance, settings)
-        if best is None or len(centers) < len(best):
-            best = centers
-    centers, _ = _relax(body, fine, best, settings.rounds, 0.0)
+        covers.append(centers)
+    centers, _ = _relax(body, fine, min(covers, key=len), settings.rounds, 0.0)
     return _without_holes(true_body, grid, _with_radii(body, fine, centers), tolerance)
 
 
