@@ -77,6 +77,8 @@ def generate(
     Interrupted at any moment, a second call goes on; a folder made with other settings is refused with
     InputError. `progress` is called with the numbers of finished shards and of all shards.
     """
+    if workers < 1:
+        raise InputError(f"workers is {workers}; it must be at least 1")
     _claim(settings, out)
     total = -(-settings.problems // settings.shard)
     missing = [i for i in range(total) if not _shard_file(out, i).exists()]

@@ -8,29 +8,23 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy import ndarray
-from scipy.spatial import KDTree
 
+from robotdiffuse.collision.near_pairs import no_tables, tabulate
+from robotdiffuse.collision.points import EMPTY, build_grid, cover, thin
+from robotdiffuse.robots.reach import motion_radii
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere, pose
 
-MESH_SPACING = 0.02
-"""Triangles of mesh obstacles are divided until no edge is longer [m]; each piece becomes a point."""
-THINNING = 0.5
-"""Edge of the thinning voxels of a point cloud, as a multiple of its point radius."""
-MAX_POINTS = 400_000
-"""Mesh obstacles are divided more coarsely rather than into more points than this."""
-GRID_BAND = 0.2
-"""Distances to points are exact up to this [m]; farther ones count as this, a lower bound."""
+ROUNDING = 4e-7
+"""Obstacles grow by this share of their coordinates: more than float32 rounds off."""
 
 
 class RobotArrays(NamedTuple):
     """Frames, spheres and pairs of a robot; groups are links with spheres, those of the fixed base first."""
 
     offsets: ndarray
-    """[dof, 12] rotation (row-major) and translation of `Robot.frame_offsets`."""
-    prismatic: ndarray
-    """[dof] 1 where the joint slides."""
+    """[dof, 13] rotation (row-major) and translation of `Robot.frame_offsets`; 1 where the joint slides."""
     spheres: ndarray
     """[n, 4] x y z radius in the frame of the group."""
     first: ndarray
@@ -40,7 +34,9 @@ class RobotArrays(NamedTuple):
     bounds: ndarray
     """[groups, 4] a sphere around all spheres of the group."""
     pairs: ndarray
-    """[pairs, 2] groups that are checked against each other."""
+    """[pairs, 4] groups that are checked against each other, a row of `near` or -1, and a bit there."""
+    near: ndarray
+    """[tables, ...] where pairs close to each other along the arm may touch: see `near_pairs.py`."""
 
 
 class SceneArrays(NamedTuple):
@@ -59,9 +55,12 @@ class SceneArrays(NamedTuple):
     cell_first: ndarray
     """[cells + 1] first point of each cell."""
     grid: ndarray
-    """[nx, ny, nz] lower bound of the distance from the voxel centre to the spheres of all points."""
+    """[nx * ny * nz] distance from each voxel's centre to the nearest point's; beyond the band a bound."""
+    nearest: ndarray
+    """[nx * ny * nz] the point that is nearest to each voxel's centre, -1 beyond the band."""
     grid_frame: ndarray
-    """[8] origin x y z, voxel edge, cell edge, largest point radius, number of cells in y, in z."""
+    """[14] origin x y z, edges of voxel and cell, largest and least radius of a point, band; nx, ny, nz; the
+    numbers of cells."""
 
 
 def robot_groups(robot: Robot) -> tuple[str, ...]:
@@ -81,19 +80,25 @@ def compile_robot(robot: Robot) -> RobotArrays:
         spheres.append(np.column_stack([centres, local[:, 3]]))
         bounds.append(_bounding_sphere(spheres[-1]))
     index = {link: i for i, link in enumerate(groups)}
-    offsets = np.concatenate(
-        [robot.frame_offsets[:, :3, :3].reshape(-1, 9), robot.frame_offsets[:, :3, 3]], axis=1
-    )
-    pairs = [(index[a], index[b]) for a, b in robot.checked_pairs()]
-    return RobotArrays(
+    T = robot.frame_offsets
+    slides = np.array(robot.prismatic, np.float64)
+    offsets = np.column_stack([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3], slides])
+    pairs = [(index[a], index[b]) for a, b in robot.checked_pairs() if a in index and b in index]
+    arrays = RobotArrays(
         offsets=np.ascontiguousarray(offsets, np.float32),
-        prismatic=np.array(robot.prismatic, np.int32),
         spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),
         bounds=np.array(bounds, np.float32).reshape(-1, 4),
-        pairs=np.array(pairs, np.int32).reshape(-1, 2),
+        pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
+        near=no_tables(),
     )
+    if not pairs:
+        return arrays
+    rows = [link for link in robot.link_names if link in robot.spheres]
+    levers = motion_radii(robot)[[rows.index(link) for link in groups]]
+    found, near = tabulate(arrays, robot.lower, robot.upper, levers)
+    return arrays._replace(pairs=found, near=near)
 
 
 @lru_cache(maxsize=16)
@@ -117,111 +122,62 @@ def _bounding_sphere(spheres: ndarray) -> ndarray:
     return np.append(centre, reach.max() + 1e-6)
 
 
-def compile_scene(scene: Scene, reach: float = np.inf) -> SceneArrays:
-    """The arrays of a scene; points farther than `reach` [m] from the base's origin are left out."""
+def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
+    """The arrays of a scene as far as the robot can get near it."""
+    largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
+    return compile_scene(scene, reach(robot), largest)
+
+
+def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> SceneArrays:
+    """The arrays of a scene around a robot that reaches so far from its base's origin [m].
+
+    Points well beyond are left out. `radius` is that of the robot's largest sphere [m].
+    """
     spheres, boxes, cylinders, capsules, points = [], [], [], [], []
     for shape in scene.shapes:
         match shape:
             case Sphere():
-                spheres.append([*shape.center, shape.radius])
+                spheres.append(_grown([*shape.center, shape.radius], slice(3, 4)))
             case Box():
-                boxes.append([*_frame(shape), *(shape.size / 2)])
+                boxes.append(_oriented(shape, shape.size / 2, (0, 1, 2), reach))
             case Cylinder():
-                cylinders.append([*_frame(shape), shape.radius, shape.height / 2, 0.0])
+                half = np.array([shape.radius, shape.radius, shape.height / 2])
+                cylinders.append(_oriented(shape, half, (2,), reach)[[*range(13), 14, 11]])
             case Capsule():
-                capsules.append([*_frame(shape), shape.radius, shape.height / 2, 0.0])
+                half = np.array([shape.radius, shape.radius, shape.height / 2])
+                capsules.append(_oriented(shape, half, (2,), reach)[[*range(13), 14, 11]])
             case PointCloud():
-                points.append(_thin(shape.points, shape.point_radius, reach))
+                points.append(thin(shape.points, shape.point_radius, reach))
             case Mesh():
-                points.append(_cover(shape.world_vertices[shape.faces], reach))
-    cloud = np.concatenate(points) if points else np.zeros((0, 4))
+                points.append(cover(shape.world_vertices[shape.faces], reach))
+    cloud = np.concatenate(points) if points else EMPTY
     return SceneArrays(
         np.array(spheres, np.float32).reshape(-1, 4),
         np.array(boxes, np.float32).reshape(-1, 15),
         np.array(cylinders, np.float32).reshape(-1, 15),
         np.array(capsules, np.float32).reshape(-1, 15),
-        *_grid(cloud.astype(np.float32)),
+        *build_grid(cloud, radius),
     )
 
 
-def _frame(shape: Box | Cylinder | Capsule) -> list[float]:
-    T = pose(shape)
-    return [*T[:3, 3], *T[:3, :3].T.ravel()]
+def _oriented(shape: Box | Cylinder | Capsule, half: ndarray, axes: tuple[int, ...], reach: float) -> ndarray:
+    """Centre, world-to-shape rotation and half extents, cropped along some axes to what the robot gets near.
+
+    A point within reach is as far from the rest of the shape as from all of it, and a floor of 1 km keeps its
+    precision in float32.
+    """
+    T, half, far = pose(shape), half.copy(), 2 * reach + 1
+    middle = -T[:3, :3].T @ T[:3, 3]
+    centre = np.zeros(3)
+    for axis in axes:
+        low, high = max(-half[axis], middle[axis] - far), min(half[axis], middle[axis] + far)
+        if low < high:
+            centre[axis], half[axis] = (low + high) / 2, (high - low) / 2
+    return _grown([*(T[:3, :3] @ centre + T[:3, 3]), *T[:3, :3].T.ravel(), *half], slice(12, 15))
 
 
-def _thin(points: ndarray, radius: float, reach: float) -> ndarray:
-    """One sphere per occupied voxel, large enough to hold the spheres of all points of the voxel."""
-    points = points[np.linalg.norm(points, axis=1) <= reach + radius]
-    if not len(points):
-        return np.zeros((0, 4))
-    keys = np.floor(points / (THINNING * radius)).astype(np.int64)
-    keys -= keys.min(axis=0)
-    _, which, counts = np.unique(
-        np.ravel_multi_index(tuple(keys.T), tuple(keys.max(axis=0) + 1)),
-        return_inverse=True,
-        return_counts=True,
-    )
-    centres = np.stack([np.bincount(which, points[:, i]) / counts for i in range(3)], axis=1)
-    extra = np.zeros(len(centres))
-    np.maximum.at(extra, which, np.linalg.norm(points - centres[which], axis=1))
-    return np.column_stack([centres, radius + extra])
-
-
-def _cover(triangles: ndarray, reach: float) -> ndarray:
-    """Spheres at the centroids of pieces of the triangles that together hold the whole surface."""
-    spacing = max(MESH_SPACING, float(np.sqrt(_area(triangles) / MAX_POINTS)))
-    done = []
-    while len(triangles):
-        edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
-        near = np.linalg.norm(triangles.mean(axis=1), axis=1) <= reach + edges.max(axis=1)
-        triangles, edges = triangles[near], edges[near]
-        small = edges.max(axis=1) <= spacing
-        done.append(triangles[small])
-        triangles, edges = triangles[~small], edges[~small]
-        # edge i joins corners i - 1 and i; split the longest one
-        longest = edges.argmax(axis=1)
-        rows = np.arange(len(triangles))
-        a, b = triangles[rows, longest - 1], triangles[rows, longest]
-        c = triangles[rows, (longest + 1) % 3]
-        middle = (a + b) / 2
-        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    pieces = np.concatenate(done) if done else np.zeros((0, 3, 3))
-    centres = pieces.mean(axis=1)
-    radii = np.linalg.norm(pieces - centres[:, None], axis=2).max(axis=1, initial=0.0)
-    return np.column_stack([centres, radii + 1e-4])
-
-
-def _area(triangles: ndarray) -> float:
-    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    return float(np.linalg.norm(normals, axis=1).sum() / 2)
-
-
-def _grid(cloud: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Points sorted by cell, first point of each cell, distance grid and its frame (see SceneArrays)."""
-    if not len(cloud):
-        return (
-            cloud.reshape(0, 4),
-            np.zeros(2, np.int32),
-            np.zeros((0, 0, 0), np.float32),
-            np.ones(8, np.float32),
-        )
-    radius = float(cloud[:, 3].max())
-    low = cloud[:, :3].min(axis=0) - radius - GRID_BAND
-    extent = cloud[:, :3].max(axis=0) + radius + GRID_BAND - low
-    # about two million voxels at most keep the grid within a cache-friendly 8 MB
-    voxel = max(0.02, float((extent.prod() / 2e6) ** (1 / 3)))
-    shape = np.ceil(extent / voxel).astype(int)
-    axes = [low[i] + voxel * (np.arange(shape[i]) + 0.5) for i in range(3)]
-    centres = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    tree = KDTree(cloud[:, :3])
-    bound = GRID_BAND + radius + voxel
-    nearest, _ = tree.query(centres, distance_upper_bound=bound, workers=1)
-    grid = (np.minimum(nearest, bound) - radius).astype(np.float32).reshape(shape)
-    cell = 2 * voxel
-    cells = np.ceil(extent / cell).astype(int)
-    where = np.ravel_multi_index(tuple(((cloud[:, :3] - low) / cell).astype(int).T), tuple(cells))
-    order = np.argsort(where, kind="stable")
-    edges = np.arange(int(np.prod(cells)) + 1)
-    first = np.asarray(np.searchsorted(where[order], edges), np.int32)
-    frame = np.array([*low, voxel, cell, radius, cells[1], cells[2]], np.float32)
-    return np.ascontiguousarray(cloud[order]), first, grid, frame
+def _grown(row: list[float], sizes: slice) -> ndarray:
+    """The row with its sizes larger by what rounding to float32 may take away."""
+    out = np.array(row)
+    out[sizes] += ROUNDING * (np.abs(out[:3]).max() + np.abs(out[sizes]).max())
+    return out

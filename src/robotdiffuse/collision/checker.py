@@ -5,7 +5,8 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import distance, lane_clearance, lanes
-from robotdiffuse.collision.arrays import compile_robot, compile_scene, reach, robot_groups
+from robotdiffuse.collision.arrays import compile_robot, compile_scene_for, robot_groups
+from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -22,28 +23,28 @@ class CollisionChecker:
         """`padding` [m] is added to the spheres' radii towards the scene."""
         self.robot, self.scene, self.padding = robot, scene, np.float32(padding)
         self.robot_arrays = compile_robot(robot)
-        self.scene_arrays = compile_scene(scene, reach(robot))
+        self.scene_arrays = compile_scene_for(robot, scene)
         groups = robot_groups(robot)
         self.links = tuple(link for link in groups if robot.link_frame(link) > 0)
         """The moving links with spheres, in the order of `link_clearances`."""
-        self.pairs = tuple((groups[a], groups[b]) for a, b in self.robot_arrays.pairs)
+        self.pairs = tuple((groups[a], groups[b]) for a, b in self.robot_arrays.pairs[:, :2])
         """The checked pairs of links, in the order of `pair_clearances`."""
 
     def free(self, q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
         """Whether each configuration is free of collision."""
-        return lanes.free_many(self.robot_arrays, self.scene_arrays, _float32(q), self.padding)
+        return lanes.free_many(self.robot_arrays, self.scene_arrays, self._rows(q), self.padding)
 
     def link_clearances(self, q: Float[ndarray, "n dof"], limit: float = 1.0) -> Float[ndarray, "n links"]:
         """Signed distance of each moving link to the scene [m], at most `limit`; the lower, the faster.
 
-        Towards point clouds and meshes at most 0.2 m less a sphere's radius.
+        Towards point clouds and meshes at most 0.3 m, and a lower bound beyond 0.1 m.
         """
         arrays = self.robot_arrays, self.scene_arrays
-        return lane_clearance.link_clearances(*arrays, _float32(q), np.float32(limit)) - self.padding
+        return lane_clearance.link_clearances(*arrays, self._rows(q), np.float32(limit)) - self.padding
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
         """Distance between the links of each checked pair [m], at most 1 m."""
-        return lane_clearance.pair_clearances(self.robot_arrays, _float32(q), distance.CAP)
+        return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), distance.CAP)
 
     def clearance(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n"]:
         """Least distance to the scene and between links [m], at most 1 m; negative in collision."""
@@ -60,11 +61,15 @@ class CollisionChecker:
         return lane_clearance.cost_gradients(
             self.robot_arrays,
             self.scene_arrays,
-            _float32(q),
+            self._rows(q),
             np.float32(margin) + self.padding,
             np.float32(self_margin),
         )
 
-
-def _float32(q: ndarray) -> ndarray:
-    return np.ascontiguousarray(q, np.float32)
+    def _rows(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+        """Compiled code trusts its arguments, so they are looked at here."""
+        if q.shape[1] != self.robot.dof:
+            raise InputError(f"q has {q.shape[1]} columns; it must have the {self.robot.dof} planned joints")
+        if not np.isfinite(q).all():
+            raise InputError("q holds values that are not finite; configurations must be numbers")
+        return np.ascontiguousarray(q, np.float32)

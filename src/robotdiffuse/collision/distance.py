@@ -7,7 +7,7 @@ refinement, and the clearances that the denoiser sees.
 import numpy as np
 
 from robotdiffuse.collision.compiled import allocation_free
-from robotdiffuse.collision.lanes import GRID_BAND_F
+from robotdiffuse.collision.point_grid import near_point
 
 CAP = np.float32(1.0)
 """Clearances beyond this [m] are reported as this."""
@@ -24,7 +24,7 @@ def frames_of(robot, q, frames):
     for j in range(len(q)):
         parent, child, offset = frames[j], frames[j + 1], robot.offsets[j]
         c, s, slide = np.cos(q[j]), np.sin(q[j]), _ZERO
-        if robot.prismatic[j]:
+        if robot.offsets[j, 12] > _ZERO:
             c, s, slide = _ONE, _ZERO, q[j]
         for k in range(3):
             r0, r1, r2 = parent[3 * k], parent[3 * k + 1], parent[3 * k + 2]
@@ -119,43 +119,12 @@ def _capsule(obstacle, x, y, z):
     return d - obstacle[12], nx, ny, nz
 
 
-@allocation_free()
-def points_distance(scene, x, y, z, limit):
-    """Distance to the nearest of the scene's points if below `limit`, else a lower bound of at least that."""
-    points, first, frame, grid = scene.points, scene.cell_first, scene.grid_frame, scene.grid
-    voxel, cell, largest = frame[3], frame[4], frame[5]
-    limit = min(limit, np.float32(GRID_BAND_F))
-    nx, ny, nz = grid.shape
-    i, j, k = (
-        int(np.floor((x - frame[0]) / voxel)),
-        int(np.floor((y - frame[1]) / voxel)),
-        int(np.floor((z - frame[2]) / voxel)),
-    )
-    if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
-        return np.float32(GRID_BAND_F), _ZERO, _ZERO, _ONE
-    if grid[i, j, k] - voxel * np.float32(0.8660254) > limit:
-        return limit, _ZERO, _ZERO, _ONE
-    my, mz = int(frame[6]), int(frame[7])
-    mx = (len(first) - 1) // (my * mz)
-    reach = limit + largest
-    i0, i1 = max(int((x - reach - frame[0]) / cell), 0), min(int((x + reach - frame[0]) / cell), mx - 1)
-    j0, j1 = max(int((y - reach - frame[1]) / cell), 0), min(int((y + reach - frame[1]) / cell), my - 1)
-    k0, k1 = max(int((z - reach - frame[2]) / cell), 0), min(int((z + reach - frame[2]) / cell), mz - 1)
-    best, bx, by, bz = limit, _ZERO, _ZERO, _ONE
-    for ci in range(i0, i1 + 1):
-        for cj in range(j0, j1 + 1):
-            row = (ci * my + cj) * mz
-            for p in range(first[row + k0], first[row + k1 + 1]):
-                dx, dy, dz = x - points[p, 0], y - points[p, 1], z - points[p, 2]
-                d = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
-                if d - points[p, 3] < best:
-                    best, bx, by, bz = d - points[p, 3], dx / d, dy / d, dz / d
-    return best, bx, by, bz
-
-
 @allocation_free(inline="always")
 def scene_distance(scene, x, y, z, limit):
-    """Signed distance of a point to the nearest obstacle if below `limit`, else `limit`; and its gradient."""
+    """Signed distance of a point to the nearest obstacle if below `limit` (else `limit`), and its gradient.
+
+    To point clouds up to a few millimetres too much.
+    """
     best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
     for k in range(len(scene.spheres)):
         d, nx, ny, nz = _sphere(scene.spheres[k], x, y, z)
@@ -174,7 +143,7 @@ def scene_distance(scene, x, y, z, limit):
         if d < best:
             best, bx, by, bz = d, nx, ny, nz
     if len(scene.points):
-        d, nx, ny, nz = points_distance(scene, x, y, z, best)
+        d, nx, ny, nz = near_point(scene, x, y, z, best)
         if d < best:
             best, bx, by, bz = d, nx, ny, nz
     return best, bx, by, bz
@@ -186,7 +155,7 @@ def _pull(robot, frames, frame, x, y, z, fx, fy, fz, sign, grad):
     for j in range(frame):
         axis = frames[j + 1]
         ax, ay, az = axis[2], axis[5], axis[8]
-        if robot.prismatic[j]:
+        if robot.offsets[j, 12] > _ZERO:
             grad[j] += sign * (ax * fx + ay * fy + az * fz)
         else:
             rx, ry, rz = x - axis[9], y - axis[10], z - axis[11]

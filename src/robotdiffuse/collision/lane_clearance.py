@@ -6,8 +6,9 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.compiled import allocation_free
-from robotdiffuse.collision.distance import cost_gradient_at, points_distance
+from robotdiffuse.collision.distance import cost_gradient_at
 from robotdiffuse.collision.lanes import W, place, place_frames
+from robotdiffuse.collision.point_grid import KEEP, points_distance, points_lower_bound
 
 _ZERO = np.float32(0.0)
 
@@ -81,14 +82,22 @@ def _to_round(at, s, obstacles, flat_ends, near, n, mark, out):
 
 
 @allocation_free()
-def _to_points(at, s, scene, row, limit, mark, out):
+def _bound_points(at, s, scene, radius, row, out):
+    """Lower bounds for a sphere's centre, to a row of `out`."""
     for i in range(W):
-        d, _, _, _ = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit)
-        out[row, i] = d if mark else min(out[row, i], d)
+        d = points_lower_bound(scene, at[s, i], at[s, W + i], at[s, 2 * W + i])
+        out[row, i] = min(d, KEEP + radius)
+
+
+@allocation_free()
+def _to_points(at, s, scene, radius, out):
+    for i in range(W):
+        limit = min(out[0, i], KEEP + radius)
+        out[0, i] = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit)
 
 
 @allocation_free(inline="always")
-def _to_scene(at, s, scene, near, limit, mark, out):
+def _to_scene(at, s, scene, radius, near, mark, out):
     n = 0
     _to_spheres(at, s, scene.spheres, near, n, mark, out)
     n += len(scene.spheres)
@@ -98,8 +107,11 @@ def _to_scene(at, s, scene, near, limit, mark, out):
     n += len(scene.cylinders)
     _to_round(at, s, scene.capsules, False, near, n, mark, out)
     n += len(scene.capsules)
-    if len(scene.points) and (mark or near[n]):
-        _to_points(at, s, scene, n if mark else 0, limit, mark, out)
+    if len(scene.points):
+        if mark:
+            _bound_points(at, s, scene, radius, n, out)
+        elif near[n]:
+            _to_points(at, s, scene, radius, out)
 
 
 @allocation_free(fastmath=True)
@@ -168,14 +180,15 @@ def count_obstacles(scene):
 
 
 @allocation_free(fastmath=True)
-def _mark_near(obstacles, radius, limit, near, bounds, least):
+def _mark_near(solids, obstacles, radius, limit, near, bounds, least):
     """Marks the obstacles that can be nearest to a group in any lane, from distances of its bounding sphere.
 
-    An obstacle at d from the centre is at least d - radius and at most d + radius away from the group.
+    An obstacle at d from the centre is at least d - radius and at most d + radius away from the group. Of the
+    points, which come after the solid ones, `bounds` holds but a lower bound.
     """
     for i in range(W):
         least[0, i] = limit
-    for k in range(obstacles):
+    for k in range(solids):
         for i in range(W):
             least[0, i] = min(least[0, i], bounds[k, i] + radius)
     count = 0
@@ -185,8 +198,6 @@ def _mark_near(obstacles, radius, limit, near, bounds, least):
             total += np.int32(bounds[k, i] - radius < least[0, i])
         near[k] = total > 0
         count += near[k]
-    for i in range(W):
-        least[0, i] = limit
     return count
 
 
@@ -205,18 +216,20 @@ def block_clearances(robot, scene, first, q, limit, work, best, out):
     `best` is scratch, [1, 16].
     """
     place_frames(robot, q, work.frames, work.centres)
-    obstacles = count_obstacles(scene) - (len(scene.points) == 0)
+    solids = count_obstacles(scene) - 1
+    obstacles = solids + (len(scene.points) > 0)
     for g in range(first, len(robot.frame)):
         radius = robot.bounds[g, 3]
-        _to_scene(work.centres, g, scene, work.near, limit + radius, True, work.bounds)
+        _to_scene(work.centres, g, scene, radius, work.near, True, work.bounds)
         for i in range(W):
             best[0, i] = limit
-        if _mark_near(obstacles, radius, limit, work.near, work.bounds, work.least) > 0:
+        if _mark_near(solids, obstacles, radius, limit, work.near, work.bounds, work.least) > 0:
             for s in range(robot.first[g], robot.first[g + 1]):
                 place(work.frames, robot.frame[g], robot.spheres, s, work.position, 0)
+                # what the spheres before have found limits what is looked for
                 for i in range(W):
-                    work.least[0, i] = limit + robot.spheres[s, 3]
-                _to_scene(work.position, 0, scene, work.near, limit + robot.spheres[s, 3], False, work.least)
+                    work.least[0, i] = best[0, i] + robot.spheres[s, 3]
+                _to_scene(work.position, 0, scene, robot.spheres[s, 3], work.near, False, work.least)
                 _write(work.least, robot.spheres[s, 3], best)
         for i in range(W):
             out[g - first, i] = best[0, i]

@@ -11,12 +11,13 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.compiled import allocation_free
+from robotdiffuse.collision.point_grid import W, touch_points
 
-W = 16
-"""Lanes: configurations per block."""
 _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
 _HALF = np.float32(0.5)
+HEAD, SIDE = 6, 130
+"""Numbers before the cells, and cells along each side, of a table of `near_pairs.py`."""
 _ZERO = np.float32(0.0)
 # sin(2 pi u) for |u| <= 1/4: Taylor coefficients, error below 6e-8
 _S1 = np.float32(6.283185307179586)
@@ -183,62 +184,8 @@ def _touch_each_other(a, s, b, t, reach, hits):
     return total
 
 
-@allocation_free()
-def point_touches(scene, x, y, z, radius):
-    """Whether a sphere touches one of the scene's points: distance grid first, then the cells around."""
-    grid, frame = scene.grid, scene.grid_frame
-    voxel = frame[3]
-    fx, fy, fz = (x - frame[0]) / voxel, (y - frame[1]) / voxel, (z - frame[2]) / voxel
-    i, j, k = int(np.floor(fx)), int(np.floor(fy)), int(np.floor(fz))
-    nx, ny, nz = grid.shape
-    if i < 0 or j < 0 or k < 0 or i >= nx or j >= ny or k >= nz:
-        # the grid reaches beyond the points by its band; spheres are smaller unless a link is huge
-        if radius <= np.float32(GRID_BAND_F):
-            return False
-    else:
-        ex, ey, ez = (fx - i - _HALF) * voxel, (fy - j - _HALF) * voxel, (fz - k - _HALF) * voxel
-        if grid[i, j, k] - np.sqrt(ex * ex + ey * ey + ez * ez) > radius:
-            return False
-    return _touches_points_near(scene, x, y, z, radius)
-
-
-GRID_BAND_F = 0.2
-
-
-@allocation_free()
-def _touches_points_near(scene, x, y, z, radius):
-    points, first, frame = scene.points, scene.cell_first, scene.grid_frame
-    cell, reach = frame[4], radius + frame[5]
-    ny, nz = int(frame[6]), int(frame[7])
-    nx = (len(first) - 1) // (ny * nz)
-    i0, i1 = max(int((x - reach - frame[0]) / cell), 0), min(int((x + reach - frame[0]) / cell), nx - 1)
-    j0, j1 = max(int((y - reach - frame[1]) / cell), 0), min(int((y + reach - frame[1]) / cell), ny - 1)
-    k0, k1 = max(int((z - reach - frame[2]) / cell), 0), min(int((z + reach - frame[2]) / cell), nz - 1)
-    if k0 > k1:
-        return False
-    for i in range(i0, i1 + 1):
-        for j in range(j0, j1 + 1):
-            row = (i * ny + j) * nz
-            for p in range(first[row + k0], first[row + k1 + 1]):
-                dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
-                r = radius + points[p, 3]
-                if dx * dx + dy * dy + dz * dz < r * r:
-                    return True
-    return False
-
-
-@allocation_free()
-def _touch_points(at, s, radius, scene, hits):
-    total = 0
-    for i in range(W):
-        if point_touches(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], radius):
-            hits[i] += 1
-            total += 1
-    return total
-
-
 @allocation_free(inline="always")
-def _touch_scene(at, s, radius, scene, near, mark, hits):
+def _touch_scene(at, s, radius, scene, near, mark, scratch, hits):
     """Touches of sphere s with the obstacles marked as near (with `mark`: with all, marking them)."""
     n = 0
     total = _touch_spheres(at, s, radius, scene.spheres, near, n, mark, hits)
@@ -250,7 +197,7 @@ def _touch_scene(at, s, radius, scene, near, mark, hits):
     total += _touch_round(at, s, radius, scene.capsules, False, near, n, mark, hits)
     n += len(scene.capsules)
     if len(scene.points) and (mark or near[n]):
-        touches = _touch_points(at, s, radius, scene, hits)
+        touches = touch_points(at, s, radius, scene, mark, scratch, hits)
         if mark:
             near[n] = touches > 0
         total += touches
@@ -279,7 +226,7 @@ class Workspace(NamedTuple):
     near: np.ndarray
     """[obstacles] whether the obstacle touches the group's bounding sphere."""
     scratch: np.ndarray
-    """[W] hits of bounding spheres, not read."""
+    """[W] hits of bounding spheres, not read; what the grid of points says."""
     hits: np.ndarray
     """[W] hits of each lane."""
 
@@ -314,7 +261,7 @@ def _place_group(robot, g, work):
 def place_frames(robot, q, frames, centres):
     """Frames of 16 configurations, and the centres of the bounding spheres of all groups."""
     for j in range(len(robot.offsets)):
-        if robot.prismatic[j]:
+        if robot.offsets[j, 12] > _ZERO:
             _slide(frames[j], frames[j + 1], robot.offsets[j], q[j])
         else:
             _turn(frames[j], frames[j + 1], robot.offsets[j], q[j])
@@ -329,12 +276,12 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
         if robot.frame[g] == 0:
             continue
         reach = robot.bounds[g, 3] + padding
-        if _touch_scene(work.centres, g, reach, scene, work.near, True, work.scratch) == 0:
+        if _touch_scene(work.centres, g, reach, scene, work.near, True, work.scratch, work.scratch) == 0:
             continue
         _place_group(robot, g, work)
         for s in range(robot.first[g], robot.first[g + 1]):
             reach = robot.spheres[s, 3] + padding
-            if _touch_scene(work.positions, s, reach, scene, work.near, False, work.hits) > 0:
+            if _touch_scene(work.positions, s, reach, scene, work.near, False, work.scratch, work.hits) > 0:
                 any_hit = True
                 if stop_at_first:
                     return True
@@ -343,12 +290,34 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
     return any_hit
 
 
+@allocation_free()
+def _open_pairs(robot, table, q):
+    """Bits of the table's pairs that may touch in any of 16 lanes; see `near_pairs.py`."""
+    row = robot.near[table]
+    first, second = q[np.int32(row[0])], q[np.int32(row[3])]
+    low1, per1, low2, per2 = row[1], row[2], row[4], row[5]
+    last = np.float32(SIDE - 1)
+    found = np.int32(0)
+    for i in range(W):
+        k = np.int32(min(max((first[i] - low1) * per1, _ZERO), last)) * np.int32(SIDE)
+        k += np.int32(min(max((second[i] - low2) * per2, _ZERO), last))
+        found |= np.int32(row[HEAD + k])
+    return found
+
+
 @allocation_free(inline="always")
-def _hits_itself(robot, stop_at_first, work):
+def _hits_itself(robot, q, stop_at_first, work):
     any_hit = False
+    known, opened = -1, np.int32(0)
     positions, centres, scratch, hits = work.positions, work.centres, work.scratch, work.hits
     spheres, bounds, first = robot.spheres, robot.bounds, robot.first
     for p in range(len(robot.pairs)):
+        table = robot.pairs[p, 2]
+        if table >= 0:
+            if table != known:
+                known, opened = table, _open_pairs(robot, table, q)
+            if not opened & robot.pairs[p, 3]:
+                continue
         a, b = robot.pairs[p, 0], robot.pairs[p, 1]
         if _touch_each_other(centres, a, centres, b, bounds[a, 3] + bounds[b, 3], scratch) == 0:
             continue
@@ -382,7 +351,7 @@ def block_hits(robot, scene, q, padding, stop_at_first, work):
     any_hit = _hits_scene(robot, scene, padding, stop_at_first, work)
     if any_hit and (stop_at_first or _all_lanes_hit(work.hits)):
         return True
-    return _hits_itself(robot, stop_at_first, work) or any_hit
+    return _hits_itself(robot, q, stop_at_first, work) or any_hit
 
 
 @njit(cache=True, nogil=True)

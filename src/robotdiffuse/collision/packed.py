@@ -68,6 +68,7 @@ def _packed_link_clearances(robot, empty, fixed_boxes, kinds, params, q, limit):
             empty.points,
             empty.cell_first,
             empty.grid,
+            empty.nearest,
             empty.grid_frame,
         )
         clearances_into(robot, scene, q[b], limit, work, out[b])

@@ -26,14 +26,14 @@ RETREAT_STEPS = 100
 class RRTConnectSettings:
     reach: float = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
-    resolution: float = 0.04
+    resolution: float = 0.05
     """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
     covers the rest, and a path that it refuses is searched again at half the distance."""
     clearance: float = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
     searches: int = 2
     """Paths found, the shortest of which is shortened: a search costs less than the shortcuts it saves."""
-    shortcuts: int = 30
+    shortcuts: int = 25
     """Attempts to shorten a path."""
     optimize_time: float = 0.0
     """Time spent on restarts and more shortcuts after the first path [s]; the shortest path is kept."""
