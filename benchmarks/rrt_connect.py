@@ -66,7 +66,7 @@ def motion_bench_maker(folder: Path, lengths: dict[str, dict[str, float]]) -> No
             try:
                 problem = entry.load()
             except InputError as error:
-                print(f"left out: {error}")
+                print(f"left out: {entry.name}: {str(error).partition(': ')[2]}")
                 continue
             count += 1
             assert isinstance(problem.goal, JointGoal)

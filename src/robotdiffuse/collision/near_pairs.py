@@ -5,7 +5,7 @@ whose bounding spheres overlap almost always (forearm and hand), a table over th
 may touch at all: one look-up in place of hundreds of distances.
 """
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int32
@@ -22,22 +22,13 @@ SLACK = 1e-5
 """More than what rounding does to a distance [m]."""
 
 
-class Groups(Protocol):
-    """What is needed of RobotArrays, whose module imports this one."""
-
-    frame: ndarray
-    pairs: ndarray
-
-    def _replace(self, *, pairs: ndarray) -> Any: ...
-
-
 def no_tables() -> Float32[ndarray, "0 width"]:
     """Tables for no pair."""
     return np.zeros((0, HEAD + SIDE**2), np.float32)
 
 
 def tabulate(
-    arrays: Groups,
+    arrays: Any,
     lower: Float[ndarray, "dof"],
     upper: Float[ndarray, "dof"],
     levers: Float[ndarray, "groups dof"],
@@ -45,7 +36,7 @@ def tabulate(
     """The robot's pairs with table and bit of those that depend on one or two joints, and the tables.
 
     A table holds the first joint, its low end and cells per unit, the same of the second joint, and the
-    cells: sums of the bits of the pairs that may touch there. `arrays` are the robot's without tables;
+    cells: sums of the bits of the pairs that may touch there. `arrays` are the RobotArrays without tables;
     `levers` how far a point of each group moves at most per unit of each joint [m].
     """
     pairs_found, tables = arrays.pairs.copy(), [no_tables()]

@@ -114,7 +114,8 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     voxel = np.float32(max(band / BAND_VOXELS, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
     shape = np.ceil(extent / voxel).astype(np.int32) + 1
     cells = (shape + 1) // 2
-    where = np.ravel_multi_index(tuple(((cloud[:, :3] - low) / (2 * voxel)).astype(int).T), tuple(cells))
+    index = ((cloud[:, :3] - low) / (2 * voxel)).astype(np.int64)
+    where = (index[:, 0] * cells[1] + index[:, 1]) * cells[2] + index[:, 2]
     order = np.argsort(where, kind="stable")
     points = np.ascontiguousarray(cloud[order])
     first = np.asarray(np.searchsorted(where[order], np.arange(int(np.prod(cells)) + 1)), np.int32)
