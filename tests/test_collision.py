@@ -197,8 +197,8 @@ def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
         assert not checker.free(q)[hit].any()
     else:
         np.testing.assert_allclose(found, right, atol=TOLERANCE)
-        clear = np.asarray(np.abs(right).min(axis=1) > TOLERANCE)
-        np.testing.assert_array_equal(checker.free(q)[clear], ~hit[clear])
+        clear = np.abs(right).min(axis=1) > TOLERANCE
+        np.testing.assert_array_equal(checker.free(q)[clear], np.logical_not(hit)[clear])
 
 
 def test_configurations_beyond_the_limits() -> None:

@@ -112,6 +112,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     low = cloud[:, :3].min(axis=0) - np.float32(band)
     extent = (cloud[:, :3].max(axis=0) - low).astype(np.float64) + band
     voxel = np.float32(max(band / BAND_VOXELS, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
+    band = max(band, 2 * float(voxel))
     shape = np.ceil(extent / voxel).astype(np.int32) + 1
     cells = (shape + 1) // 2
     index = ((cloud[:, :3] - low) / (2 * voxel)).astype(np.int64)
