@@ -54,7 +54,7 @@ _HOME = {
     "verify": "robotdiffuse.verify",
 }
 
-__all__ = ["__version__", *_HOME]
+__all__ = ["__version__", *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 class _Package(ModuleType):
