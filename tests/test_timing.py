@@ -95,6 +95,14 @@ def test_limits_rest_and_geometry(
     check(robot, p, time_parameterize(robot, p, valid, valid, settings), settings)
 
 
+def test_a_wide_reversal_keeps_its_velocity_limit() -> None:
+    """The path velocity of a rounded reversal peaks between grid points: it was 1.8 % too fast there."""
+    q = np.random.default_rng(0).uniform(-1, 1, (3, 7))[[0, 1, 0]]
+    settings = TimingSettings(velocity_scale=0.0625, corner_deviation=1.0)
+    p = path(arm(), q)
+    check(arm(), p, time_parameterize(arm(), p, always, always, settings), settings)
+
+
 @given(seed=st.integers(0, 2**32 - 1))
 def test_velocities_and_accelerations_are_the_derivatives(seed: int) -> None:
     robot = arm()

@@ -15,6 +15,8 @@ from robotdiffuse.types import Path, Trajectory
 
 SHRINKS = (0.25, 0.25, 0.0)
 """Factors on the deviation of a corner each time that its rounding is refused; 0: the motion stops there."""
+PARTS = 16
+"""Places in a grid interval where rates are looked at; at 4, a reversal was 1.8 % too fast between them."""
 SAME = 1e-6
 """Waypoints nearer to each other than this are one [rad]."""
 
@@ -244,7 +246,7 @@ def _excess(
     """How many times slower the motion must be (at least 1) to keep the limits between grid points too."""
     pull = np.diff(speeds**2) / (2 * np.diff(grid))
     worst = 1.0
-    for part in (0.0, 0.25, 0.5, 0.75, 1.0):
+    for part in np.linspace(0.0, 1.0, PARTS + 1):
         s = grid[:-1] + part * np.diff(grid)
         speed = np.sqrt(np.maximum(speeds[:-1] ** 2 + 2 * pull * part * np.diff(grid), 0))
         velocities, accelerations = _motion(line, s, speed, pull)
