@@ -33,5 +33,6 @@ def checked_modules() -> list[str]:
 
 install_import_hook(checked_modules(), "beartype.beartype")
 
-settings.register_profile("suite", deadline=None, max_examples=40)
+# the same examples at every run: a suite that fails by chance guards nothing
+settings.register_profile("suite", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("suite")
