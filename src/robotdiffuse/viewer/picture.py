@@ -41,9 +41,9 @@ ROBOT_ALBEDO = 0.86
 class PictureSettings:
     """Size and contents of the picture."""
 
-    width: int = 1440
+    width: int = 1280
     """[pixels]"""
-    height: int = 900
+    height: int = 800
     """[pixels]"""
     ghosts: int = 5
     """See-through arms between start and goal, the start included."""
