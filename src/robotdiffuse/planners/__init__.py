@@ -25,7 +25,7 @@ PLANNERS = {
     ),
     "rrt_connect": Entry(
         "robotdiffuse.planners.rrt_connect:RRTConnect",
-        "two trees grown towards each other, then shortcuts; restarts until the time is used",
+        "two trees grown towards each other, then shortcuts",
     ),
 }
 DEFAULT_PLANNER = "robotdiffuse"
