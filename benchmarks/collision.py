@@ -7,11 +7,15 @@ Prints the report that is kept in benchmarks/results/collision.txt. FOLDER holds
 """
 
 import argparse
+import os
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+
+# Threads that wait must not spin: on a busy machine they would take the time of those that work.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np
 import torch
