@@ -39,6 +39,7 @@ EXTRAS = {
     "pybullet_data": {"simulation"},
     "ompl": {"planners"},
     "ray": {"generation"},
+    "zarr": {"learning"},
     "viser": {"viewer"},
     "pinocchio": set(),
     "example_robot_data": set(),

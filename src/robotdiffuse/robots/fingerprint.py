@@ -1,0 +1,38 @@
+"""A short name for what a robot is: data made with one robot must not be used with another."""
+
+import hashlib
+import json
+
+import numpy as np
+
+from robotdiffuse.robots.bundle import LIMITS
+from robotdiffuse.robots.robot import Robot
+
+DIGITS = 9
+"""Numbers count up to this decimal: rotations from quaternions differ in the last bits by machine."""
+
+
+def robot_fingerprint(robot: Robot) -> str:
+    """SHA-256, the first 16 hex digits, of joints, limits, spheres, meshes, locked joints and allowed
+    collisions; not of the robot's name. The same in every process."""
+    digest = hashlib.sha256()
+
+    def add(names: object, *numbers: object) -> None:
+        digest.update(json.dumps(names).encode())
+        for values in numbers:
+            rounded = np.round(np.asarray(values, np.float64), DIGITS) + 0.0  # no negative zeros
+            digest.update(str(rounded.shape).encode() + rounded.tobytes())
+
+    add([robot.base, robot.tip])
+    for joint in robot.joints:
+        limits = [getattr(joint, name) for name in LIMITS]
+        add([joint.name, joint.kind, joint.parent, joint.child], joint.T_parent_joint, joint.axis, limits)
+    for link in sorted(robot.spheres):
+        add(link, robot.spheres[link])
+    for link in sorted(robot.meshes):
+        for mesh in robot.meshes[link]:
+            add(link, mesh.vertices, mesh.faces)
+    for name in sorted(robot.locked):
+        add(name, robot.locked[name])
+    add(sorted(sorted(pair) for pair in robot.allowed_collisions))
+    return digest.hexdigest()[:16]
