@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zarr
+from zarr.codecs import ZstdCodec
 
 from box_arm import box_arm
 from robotdiffuse.errors import InputError
@@ -99,10 +100,7 @@ def test_a_compressed_or_divided_array_is_read_too(tmp_path, arrays):
     write_shard(tmp_path, 0, arrays, {})
     group = zarr.open_group(shard_path(tmp_path, 0), mode="a")
     prints = dict(group["trajectories"].attrs)
-    for chunks, compressors in (
-        ((2, FRAMES, ARM.dof), None),
-        ((7, FRAMES, ARM.dof), zarr.codecs.ZstdCodec()),
-    ):
+    for rows, compressors in ((2, None), (7, ZstdCodec())):
         group.create_array(
             "trajectories",
             data=arrays["trajectories"],
@@ -172,7 +170,7 @@ def test_arrays_that_do_not_fit(tmp_path, arrays):
 def rewrite(store, name, change):
     """Replace an array of shard 0 behind the back of its fingerprints."""
     group = zarr.open_group(shard_path(store, 0), mode="a")
-    prints, data = dict(group[name].attrs), change(group[name][...])
+    prints, data = dict(group[name].attrs), change(zarr.open_array(shard_path(store, 0) / name)[...])
     group.create_array(name, data=data, chunks=data.shape, attributes=prints, overwrite=True)
 
 
