@@ -1,0 +1,147 @@
+"""The robot as PyBullet reads it: a URDF with convex meshes, masses and, for pictures, coloured surfaces."""
+
+from pathlib import Path
+from xml.etree import ElementTree as Xml
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
+from robotdiffuse.robots.visual import VisualMesh, load_visual
+
+LEAST_MASS, LEAST_INERTIA = 0.01, 1e-4
+"""Of links without geometry, or next to none [kg], [kg m^2]: PyBullet cannot move a link without mass."""
+CREASE = np.radians(38)
+"""Edges that bend more than this stay sharp in pictures."""
+
+
+def write_urdf(robot: Robot, folder: Path, density: float, look: bool) -> Path:
+    """The robot's tree with its convex meshes, each link of uniform density [kg/m^3]; the file in `folder`.
+
+    With `look`, links also get the surfaces that the viewer draws. Joints that planning does not move keep
+    their kind but lose their limits: published problems hold grippers wider open than their URDF allows.
+    """
+    root = Xml.Element("robot", name="robot")
+    looks = load_visual(robot) if look else {}
+    for link in robot.link_names:
+        element = Xml.SubElement(root, "link", name=link)
+        meshes = robot.meshes.get(link, ())
+        _add_inertia(element, meshes, density)
+        for i, mesh in enumerate(meshes):
+            file = folder / f"{link}_{i}.obj"
+            write_obj(file, mesh.vertices, mesh.faces)
+            _add_mesh(element, "collision", file)
+        _add_looks(element, looks.get(link, ()), folder / link)
+    for joint in robot.joints:
+        _add_joint(root, joint, joint.name in robot.joint_names)
+    file = folder / "robot.urdf"
+    Xml.indent(root)  # PyBullet misreads lines of more than 8 kB
+    Xml.ElementTree(root).write(file)
+    return file
+
+
+def write_obj(
+    file: Path,
+    vertices: Float[ndarray, "v 3"],
+    faces: Int[ndarray, "f 3"],
+    normals: Float[ndarray, "v 3"] | None = None,
+) -> None:
+    """A Wavefront file of a triangle mesh; with normals, a renderer shades it smoothly."""
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in vertices.tolist()]
+    if normals is None:
+        lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+    else:
+        lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in normals.tolist()]
+        lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in (faces + 1).tolist()]
+    file.write_text("\n".join(lines) + "\n")
+
+
+def write_shaded(file: Path, vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]) -> None:
+    """A Wavefront file with normals: smooth but for sharp edges."""
+    import trimesh
+
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    smooth = trimesh.graph.smooth_shade(solid, angle=CREASE)
+    write_obj(
+        file, np.array(smooth.vertices), np.array(smooth.faces, np.int64), np.array(smooth.vertex_normals)
+    )
+
+
+def mass_properties(
+    meshes: tuple[ConvexMesh, ...], density: float
+) -> tuple[float, Float[ndarray, "3"], Float[ndarray, "3 3"]]:
+    """Mass [kg], its centre [m] and inertia about that [kg m^2] of solids in the link frame.
+
+    Where solids overlap, their masses add up.
+    """
+    import trimesh
+
+    parts = []
+    for mesh in meshes:
+        solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).mass_properties
+        sign = np.sign(solid.volume)  # negative for faces that look inwards
+        parts.append((sign * density * solid.volume, solid.center_mass, sign * density * solid.inertia))
+    total = float(sum(mass for mass, _, _ in parts))
+    if total < LEAST_MASS:
+        return LEAST_MASS, np.zeros(3), LEAST_INERTIA * np.eye(3)
+    center = sum((mass * at for mass, at, _ in parts), np.zeros(3)) / total
+    inertia = LEAST_INERTIA * np.eye(3)
+    for mass, at, own in parts:
+        arm = at - center
+        inertia = inertia + own + mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    return total, center, inertia
+
+
+def _add_inertia(element: Xml.Element, meshes: tuple[ConvexMesh, ...], density: float) -> None:
+    mass, center, I = mass_properties(meshes, density)  # noqa: E741 (the symbol of inertia)
+    inertial = Xml.SubElement(element, "inertial")
+    Xml.SubElement(inertial, "origin", xyz=_numbers(center))
+    Xml.SubElement(inertial, "mass", value=_numbers([mass]))
+    entries = {"ixx": I[0, 0], "ixy": I[0, 1], "ixz": I[0, 2], "iyy": I[1, 1], "iyz": I[1, 2], "izz": I[2, 2]}
+    Xml.SubElement(inertial, "inertia", {key: _numbers([value]) for key, value in entries.items()})
+
+
+def _add_mesh(element: Xml.Element, use: str, file: Path) -> Xml.Element:
+    parent = Xml.SubElement(element, use)
+    Xml.SubElement(Xml.SubElement(parent, "geometry"), "mesh", filename=str(file))
+    return parent
+
+
+def _add_looks(element: Xml.Element, meshes: tuple[VisualMesh, ...], stem: Path) -> None:
+    """One visual for each colour: PyBullet's renderer knows no colours of faces."""
+    for i, mesh in enumerate(meshes):
+        palette, color = np.unique(mesh.colors, axis=0, return_inverse=True)
+        for k, rgb in enumerate(palette):
+            file = stem.with_name(f"{stem.name}_look_{i}_{k}.obj")
+            write_shaded(file, mesh.vertices, mesh.faces[color.reshape(-1) == k])
+            visual = _add_mesh(element, "visual", file)
+            material = Xml.SubElement(visual, "material", name=f"color_{rgb[0]}_{rgb[1]}_{rgb[2]}")
+            Xml.SubElement(material, "color", rgba=_numbers([*(rgb / 255.0), 1.0]))
+
+
+def _add_joint(root: Xml.Element, joint: Joint, planned: bool) -> None:
+    element = Xml.SubElement(root, "joint", name=joint.name, type=joint.kind)
+    Xml.SubElement(element, "parent", link=joint.parent)
+    Xml.SubElement(element, "child", link=joint.child)
+    T = joint.T_parent_joint
+    Xml.SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(_rpy(T[:3, :3])))
+    if joint.kind in MOVING_KINDS:
+        Xml.SubElement(element, "axis", xyz=_numbers(joint.axis))
+        # to Bullet, a lower limit above the upper one means none
+        lower, upper = (joint.lower, joint.upper) if planned else (1.0, -1.0)
+        limits = {"lower": lower, "upper": upper, "velocity": 1.0, "effort": 1.0}
+        Xml.SubElement(element, "limit", {key: _numbers([value]) for key, value in limits.items()})
+
+
+def _rpy(rotation: Float[ndarray, "3 3"]) -> tuple[float, float, float]:
+    """URDF's roll, pitch, yaw of a rotation matrix; in gimbal lock with roll 0."""
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
+    if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:
+        return 0.0, float(pitch), float(np.arctan2(-rotation[0, 1], rotation[1, 1]))
+    roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+    return float(roll), float(pitch), float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
+def _numbers(values: object) -> str:
+    return " ".join(f"{value:.17g}" for value in np.asarray(values, float))

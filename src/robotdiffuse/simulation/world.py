@@ -1,0 +1,194 @@
+"""A robot and obstacles in a PyBullet world of its own, without a window: shared by all of this folder."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pybullet
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
+from robotdiffuse.simulation.model import write_obj, write_shaded, write_urdf
+
+MARGIN = 0.001
+"""What Bullet adds around each convex mesh [m]; its own call to set this has no effect."""
+DENSITY = 1000.0
+"""Of all links, of which URDFs tell us no masses [kg/m^3]. It gives a Panda 19.7 kg; a real one has 18."""
+OBSTACLE_COLORS = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
+FURNITURE_COLOR = (0xCD, 0xC0, 0xAC)
+FURNITURE_SIZE = 0.7
+"""Obstacles with a longer side than this are walls and tables, in a quiet colour [m]."""
+
+
+class World:
+    """A robot, its base fixed, and obstacles that can be replaced. Close it, or use it in a `with`.
+
+    Collisions are switched on for exactly the pairs that the project checks: links that a planned joint moves
+    against obstacles, and links on different frames unless they are allowed to touch.
+    """
+
+    def __init__(self, robot: Robot, scene: Scene, look: bool = False, density: float = DENSITY) -> None:
+        """`look`: give robot and obstacles coloured surfaces, for cameras and pictures; loading takes longer.
+
+        `density` of all links [kg/m^3]. Raises InputError for a shape that PyBullet lacks (point clouds).
+        """
+        self.robot = robot
+        self._look = look
+        self.client = pybullet.connect(pybullet.DIRECT)
+        # Bullet would take a file of the same name for the same mesh
+        pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self.client)
+        flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
+        with TemporaryDirectory() as folder:
+            urdf = write_urdf(robot, Path(folder), density, look)
+            self.body: int = pybullet.loadURDF(
+                str(urdf), useFixedBase=True, flags=flags, physicsClientId=self.client
+            )
+        self.links: dict[str, int] = {robot.base: -1}
+        """PyBullet's index of each link, and of the joint that moves it."""
+        indices: dict[str, int] = {}
+        for index in range(pybullet.getNumJoints(self.body, physicsClientId=self.client)):
+            info = pybullet.getJointInfo(self.body, index, physicsClientId=self.client)
+            indices[info[1].decode()] = index
+            self.links[info[12].decode()] = index
+        self.joints: list[int] = [indices[name] for name in robot.joint_names]
+        self.held: dict[int, float] = {
+            indices[joint.name]: robot.locked.get(joint.name, 0.0)
+            for joint in robot.joints
+            if joint.kind in MOVING_KINDS and joint.name not in robot.joint_names
+        }
+        """Values of the joints that planning does not move, by PyBullet's index."""
+        solid = [link for link in robot.link_names if robot.meshes.get(link)]
+        self.moving: list[str] = [link for link in solid if robot.link_frame(link) > 0]
+        """Links with geometry that a planned joint moves."""
+        self.pairs: list[tuple[str, str]] = [
+            (a, b)
+            for i, a in enumerate(solid)
+            for b in solid[i + 1 :]
+            if robot.link_frame(a) != robot.link_frame(b)
+            and frozenset((a, b)) not in robot.allowed_collisions
+        ]
+        """Links that are checked against each other."""
+        self._filter_links(solid)
+        for index, value in self.held.items():
+            pybullet.resetJointState(self.body, index, value, physicsClientId=self.client)
+        self.obstacles: dict[str, int] = {}
+        """PyBullet's number of each obstacle, by name."""
+        try:
+            self.set_scene(scene)
+        except InputError:
+            self.close()
+            raise
+
+    def __enter__(self) -> "World":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End PyBullet's world."""
+        if pybullet.isConnected(self.client):
+            pybullet.disconnect(self.client)
+
+    def set_scene(self, scene: Scene) -> None:
+        """Replace all obstacles; the robot stays, which saves loading its meshes.
+
+        Raises InputError for a shape that PyBullet lacks; the world then has no obstacles.
+        """
+        for body in self.obstacles.values():
+            pybullet.removeBody(body, physicsClientId=self.client)
+        self.obstacles = {}
+        unmoved = [index for link, index in self.links.items() if self.robot.link_frame(link) == 0]
+        for i, shape in enumerate(scene.shapes):
+            body = self._add(shape, OBSTACLE_COLORS[i % len(OBSTACLE_COLORS)])
+            self.obstacles[shape.name] = body
+            for index in unmoved:
+                pybullet.setCollisionFilterPair(self.body, body, index, -1, 0, physicsClientId=self.client)
+
+    def place(self, q: Float[ndarray, "dof"]) -> None:
+        """Put the arm at a configuration, at rest."""
+        pybullet.resetJointStatesMultiDof(
+            self.body, self.joints, q[:, None].tolist(), physicsClientId=self.client
+        )
+
+    def _filter_links(self, solid: list[str]) -> None:
+        checked = {frozenset(pair) for pair in self.pairs}
+        for i, a in enumerate(solid):
+            for b in solid[i + 1 :]:
+                if frozenset((a, b)) not in checked:
+                    indices = self.links[a], self.links[b]
+                    pybullet.setCollisionFilterPair(
+                        self.body, self.body, *indices, 0, physicsClientId=self.client
+                    )
+
+    def _add(self, shape: Shape, color: tuple[int, int, int]) -> int:
+        xyz, wxyz = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+        look = -1
+        with TemporaryDirectory() as folder:
+            file = Path(folder) / "obstacle.obj"
+            match shape:
+                case Sphere():
+                    what = {"shapeType": pybullet.GEOM_SPHERE, "radius": shape.radius}
+                    xyz = shape.center
+                case Box():
+                    what = {"shapeType": pybullet.GEOM_BOX, "halfExtents": (shape.size / 2).tolist()}
+                    xyz, wxyz = shape.center, shape.wxyz
+                case Cylinder() | Capsule():
+                    kind = pybullet.GEOM_CYLINDER if isinstance(shape, Cylinder) else pybullet.GEOM_CAPSULE
+                    what = {"shapeType": kind, "radius": shape.radius, "height": shape.height}
+                    xyz, wxyz = shape.center, shape.wxyz
+                case Mesh():
+                    write_obj(file, shape.vertices, shape.faces)
+                    flags = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
+                    what = {"shapeType": pybullet.GEOM_MESH, "fileName": str(file), "flags": flags}
+                    xyz, wxyz = shape.xyz, shape.wxyz
+                case _:
+                    raise InputError(
+                        f"{shape.name} is a {shape.kind}; PyBullet has no such shape, only solids and meshes"
+                    )
+            collision = pybullet.createCollisionShape(**what, physicsClientId=self.client)
+            if self._look:
+                look = self._add_look(shape, color, file)
+        return pybullet.createMultiBody(
+            baseCollisionShapeIndex=collision,
+            baseVisualShapeIndex=look,
+            basePosition=xyz.tolist(),
+            baseOrientation=[*wxyz[1:], wxyz[0]],
+            physicsClientId=self.client,
+        )
+
+    def _add_look(self, shape: Shape, color: tuple[int, int, int], file: Path) -> int:
+        """Surfaces of our own making: PyBullet's spheres and cylinders are coarse."""
+        vertices, faces = _surface(shape)
+        write_shaded(file, vertices, faces)
+        rgb = FURNITURE_COLOR if np.ptp(vertices, axis=0).max() > FURNITURE_SIZE else color
+        return pybullet.createVisualShape(
+            pybullet.GEOM_MESH,
+            fileName=str(file),
+            rgbaColor=[*(channel / 255 for channel in rgb), 1.0],
+            physicsClientId=self.client,
+        )
+
+
+def _surface(shape: Shape) -> tuple[ndarray, ndarray]:
+    """Vertices and faces in the shape's own frame; round ones to 0.2 mm for a radius of 0.25 m."""
+    import trimesh
+
+    match shape:
+        case Sphere():
+            solid = trimesh.creation.icosphere(subdivisions=5, radius=shape.radius)
+        case Box():
+            solid = trimesh.creation.box(shape.size)
+        case Cylinder():
+            solid = trimesh.creation.cylinder(shape.radius, shape.height, sections=96)
+        case Capsule():
+            solid = trimesh.creation.capsule(shape.height, shape.radius, count=(64, 64))
+            solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
+        case _:
+            assert isinstance(shape, Mesh)
+            return shape.vertices, shape.faces
+    return np.array(solid.vertices, np.float64), np.array(solid.faces, np.int64)
