@@ -16,13 +16,11 @@ from numpy import ndarray
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.simulation.world import MARGIN, World
+from robotdiffuse.simulation.world import World
 from robotdiffuse.types import Path
 
 FAR = 10.0
 """Distances are looked for up to this [m]."""
-OTHER_BODY, DISTANCE = 2, 8
-"""Columns of PyBullet's contact points."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ class PyBulletOracle:
             pybullet.resetJointStatesMultiDof(body, joints, row, physicsClientId=client)
             pybullet.performCollisionDetection(physicsClientId=client)
             points = pybullet.getContactPoints(body, physicsClientId=client)
-            if points and min(map(self._distance, points)) <= -tolerance:
+            if points and min(map(world.gap, points)) <= -tolerance:
                 found = self.nearest(q[i], -tolerance)
                 if found is not None:
                     return replace(found, at=float(i))
@@ -125,9 +123,6 @@ class PyBulletOracle:
         found = self.check_frames(frames, tolerance)
         return None if found is None else replace(found, at=float(places[int(found.at)]))
 
-    def _distance(self, point: tuple) -> float:
-        return point[DISTANCE] + (2 * MARGIN if point[OTHER_BODY] == self._world.body else MARGIN)
-
     def _nearer(
         self, best: OracleContact | None, within: float, link: str, other: str, body: int, index: int
     ) -> OracleContact | None:
@@ -136,5 +131,5 @@ class PyBulletOracle:
         points = pybullet.getClosestPoints(
             world.body, body, max(reach, 0.0), world.links[link], index, physicsClientId=world.client
         )
-        distance = min(map(self._distance, points), default=np.inf)
+        distance = min(map(world.gap, points), default=np.inf)
         return OracleContact(link, other, float(distance)) if distance <= reach else best

@@ -18,6 +18,8 @@ MARGIN = 0.001
 """What Bullet adds around each convex mesh [m]; its own call to set this has no effect."""
 DENSITY = 1000.0
 """Of all links, of which URDFs tell us no masses [kg/m^3]. It gives a Panda 19.7 kg; a real one has 18."""
+OTHER, LINK, OTHER_LINK, DISTANCE = 2, 3, 4, 8
+"""Columns of PyBullet's contact points: the second body, the links of both, their distance."""
 OBSTACLE_COLORS = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
 FURNITURE_COLOR = (0xCD, 0xC0, 0xAC)
 FURNITURE_SIZE = 0.7
@@ -37,16 +39,16 @@ class World:
         `density` of all links [kg/m^3]. Raises InputError for a shape that PyBullet lacks (point clouds).
         """
         self.robot = robot
-        self._look = look
+        self.look = look
         self.client = pybullet.connect(pybullet.DIRECT)
         # Bullet would take a file of the same name for the same mesh
         pybullet.setPhysicsEngineParameter(enableFileCaching=0, physicsClientId=self.client)
         flags = pybullet.URDF_USE_SELF_COLLISION | pybullet.URDF_USE_SELF_COLLISION_INCLUDE_PARENT
-        with TemporaryDirectory() as folder:
-            urdf = write_urdf(robot, Path(folder), density, look)
-            self.body: int = pybullet.loadURDF(
-                str(urdf), useFixedBase=True, flags=flags, physicsClientId=self.client
-            )
+        self._folder = TemporaryDirectory()
+        urdf = write_urdf(robot, Path(self._folder.name), density, look)
+        self.body: int = pybullet.loadURDF(
+            str(urdf), useFixedBase=True, flags=flags, physicsClientId=self.client
+        )
         self.links: dict[str, int] = {robot.base: -1}
         """PyBullet's index of each link, and of the joint that moves it."""
         indices: dict[str, int] = {}
@@ -93,6 +95,7 @@ class World:
         """End PyBullet's world."""
         if pybullet.isConnected(self.client):
             pybullet.disconnect(self.client)
+            self._folder.cleanup()
 
     def set_scene(self, scene: Scene) -> None:
         """Replace all obstacles; the robot stays, which saves loading its meshes.
@@ -115,6 +118,23 @@ class World:
             self.body, self.joints, q[:, None].tolist(), physicsClientId=self.client
         )
 
+    def touching(self) -> list[tuple[str, str, float]]:
+        """What Bullet's last look for collisions found: link, obstacle or other link, signed distance [m]."""
+        links = {index: link for link, index in self.links.items()}
+        obstacles = {body: name for name, body in self.obstacles.items()}
+        return [
+            (
+                links[point[LINK]],
+                links[point[OTHER_LINK]] if point[OTHER] == self.body else obstacles[point[OTHER]],
+                self.gap(point),
+            )
+            for point in pybullet.getContactPoints(self.body, physicsClientId=self.client)
+        ]
+
+    def gap(self, point: tuple) -> float:
+        """Signed distance of one of PyBullet's contact points, without the margins of meshes [m]."""
+        return float(point[DISTANCE] + (2 * MARGIN if point[OTHER] == self.body else MARGIN))
+
     def _filter_links(self, solid: list[str]) -> None:
         checked = {frozenset(pair) for pair in self.pairs}
         for i, a in enumerate(solid):
@@ -128,31 +148,30 @@ class World:
     def _add(self, shape: Shape, color: tuple[int, int, int]) -> int:
         xyz, wxyz = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
         look = -1
-        with TemporaryDirectory() as folder:
-            file = Path(folder) / "obstacle.obj"
-            match shape:
-                case Sphere():
-                    what = {"shapeType": pybullet.GEOM_SPHERE, "radius": shape.radius}
-                    xyz = shape.center
-                case Box():
-                    what = {"shapeType": pybullet.GEOM_BOX, "halfExtents": (shape.size / 2).tolist()}
-                    xyz, wxyz = shape.center, shape.wxyz
-                case Cylinder() | Capsule():
-                    kind = pybullet.GEOM_CYLINDER if isinstance(shape, Cylinder) else pybullet.GEOM_CAPSULE
-                    what = {"shapeType": kind, "radius": shape.radius, "height": shape.height}
-                    xyz, wxyz = shape.center, shape.wxyz
-                case Mesh():
-                    write_obj(file, shape.vertices, shape.faces)
-                    flags = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
-                    what = {"shapeType": pybullet.GEOM_MESH, "fileName": str(file), "flags": flags}
-                    xyz, wxyz = shape.xyz, shape.wxyz
-                case _:
-                    raise InputError(
-                        f"{shape.name} is a {shape.kind}; PyBullet has no such shape, only solids and meshes"
-                    )
-            collision = pybullet.createCollisionShape(**what, physicsClientId=self.client)
-            if self._look:
-                look = self._add_look(shape, color, file)
+        file = Path(self._folder.name) / "obstacle.obj"
+        match shape:
+            case Sphere():
+                what = {"shapeType": pybullet.GEOM_SPHERE, "radius": shape.radius}
+                xyz = shape.center
+            case Box():
+                what = {"shapeType": pybullet.GEOM_BOX, "halfExtents": (shape.size / 2).tolist()}
+                xyz, wxyz = shape.center, shape.wxyz
+            case Cylinder() | Capsule():
+                kind = pybullet.GEOM_CYLINDER if isinstance(shape, Cylinder) else pybullet.GEOM_CAPSULE
+                what = {"shapeType": kind, "radius": shape.radius, "height": shape.height}
+                xyz, wxyz = shape.center, shape.wxyz
+            case Mesh():
+                write_obj(file, shape.vertices, shape.faces)
+                flags = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
+                what = {"shapeType": pybullet.GEOM_MESH, "fileName": str(file), "flags": flags}
+                xyz, wxyz = shape.xyz, shape.wxyz
+            case _:
+                raise InputError(
+                    f"{shape.name} is a {shape.kind}; PyBullet has no such shape, only solids and meshes"
+                )
+        collision = pybullet.createCollisionShape(**what, physicsClientId=self.client)
+        if self.look:
+            look = self._add_look(shape, color, file)
         return pybullet.createMultiBody(
             baseCollisionShapeIndex=collision,
             baseVisualShapeIndex=look,
