@@ -99,7 +99,6 @@ class Light(NamedTuple):
 
     direction: tuple[float, float, float] = (0.6, -0.8, 1.4)
     """Towards the light."""
-    shadow: bool = False
     ambient: float = 0.6
     diffuse: float = 0.35
     specular: float = 0.05
@@ -126,7 +125,7 @@ def take(world: World, camera: DepthCamera, light: Light = DAYLIGHT) -> RawImage
         view,
         projection,
         lightDirection=light.direction,
-        shadow=int(light.shadow),
+        shadow=0,
         lightAmbientCoeff=light.ambient,
         lightDiffuseCoeff=light.diffuse,
         lightSpecularCoeff=light.specular,

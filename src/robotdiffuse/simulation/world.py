@@ -5,7 +5,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pybullet
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
@@ -171,7 +171,10 @@ class World:
                 )
         collision = pybullet.createCollisionShape(**what, physicsClientId=self.client)
         if self.look:
-            look = self._add_look(shape, color, file)
+            # of our own making: PyBullet's spheres and cylinders are coarse
+            vertices, faces = _surface(shape)
+            large = np.ptp(vertices, axis=0).max() > FURNITURE_SIZE
+            look = self._add_look(vertices, faces, FURNITURE_COLOR if large else color)
         return pybullet.createMultiBody(
             baseCollisionShapeIndex=collision,
             baseVisualShapeIndex=look,
@@ -180,20 +183,33 @@ class World:
             physicsClientId=self.client,
         )
 
-    def _add_look(self, shape: Shape, color: tuple[int, int, int], file: Path) -> int:
-        """Surfaces of our own making: PyBullet's spheres and cylinders are coarse."""
-        vertices, faces = _surface(shape)
+    def add_surface(
+        self,
+        vertices: Float[ndarray, "v 3"],
+        faces: Int[ndarray, "f 3"],
+        color: tuple[int, int, int],
+        xyz: Float[ndarray, "3"],
+    ) -> None:
+        """Something to be seen that nothing collides with, for good; `color` in sRGB, 0 to 255."""
+        look = self._add_look(vertices, faces, color)
+        pybullet.createMultiBody(
+            baseVisualShapeIndex=look, basePosition=xyz.tolist(), physicsClientId=self.client
+        )
+
+    def _add_look(
+        self, vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"], color: tuple[int, int, int]
+    ) -> int:
+        file = Path(self._folder.name) / "look.obj"  # read when a body is made of it
         write_shaded(file, vertices, faces)
-        rgb = FURNITURE_COLOR if np.ptp(vertices, axis=0).max() > FURNITURE_SIZE else color
         return pybullet.createVisualShape(
             pybullet.GEOM_MESH,
             fileName=str(file),
-            rgbaColor=[*(channel / 255 for channel in rgb), 1.0],
+            rgbaColor=[*(channel / 255 for channel in color), 1.0],
             physicsClientId=self.client,
         )
 
 
-def _surface(shape: Shape) -> tuple[ndarray, ndarray]:
+def _surface(shape: Shape) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
     """Vertices and faces in the shape's own frame; round ones to 0.2 mm for a radius of 0.25 m."""
     import trimesh
 
