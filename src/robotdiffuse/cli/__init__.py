@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli import data, plan, planners, robot, train, view
+from robotdiffuse.cli import data, plan, planners, robot, simulate, train, view
 from robotdiffuse.errors import InputError
 
 SOLVED, NO_PLAN, BAD_INPUT, STOPPED = 0, 1, 2, 130
@@ -16,6 +16,7 @@ COMMANDS = (
     plan.add_demo,
     view.add_view,
     view.add_verify,
+    simulate.add,
     planners.add,
     robot.add,
     data.add,

@@ -1,0 +1,78 @@
+"""robotdiffuse simulate"""
+
+import argparse
+from typing import TYPE_CHECKING
+
+from robotdiffuse.cli.view import read
+from robotdiffuse.errors import InputError
+
+if TYPE_CHECKING:
+    from robotdiffuse.simulation.replay import Replay
+
+ENDINGS = (".gif", ".png")
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    parser = commands.add_parser(
+        "simulate",
+        help="replay a result under PyBullet's position control",
+        description="Replay the motion of a result file under PyBullet's position control; print tracking "
+        "errors and contacts. Exit status: 0 free of contacts, 1 contacts, 2 bad input.",
+    )
+    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
+    parser.add_argument(
+        "--out",
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="film (.gif) or picture (.png) of the replay; repeatable",
+    )
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    from rich.console import Console
+
+    from robotdiffuse.paths.export import check_output
+
+    try:
+        from robotdiffuse.simulation import replay, write_gif, write_png
+    except ModuleNotFoundError as error:
+        if error.name != "pybullet":
+            raise
+        raise InputError(
+            "simulate needs PyBullet, whose wheels stop at Python 3.11: pip install 'robotdiffuse[sim]'"
+        ) from None
+    outputs = [check_output(file, ENDINGS) for file in arguments.out]
+    result, problem = read(arguments.result)
+    if result.trajectory is None:
+        raise InputError(f"{arguments.result} holds a path without times; a replay needs a trajectory")
+    done = replay(problem.robot, problem.scene, result.trajectory)
+    print_replay(problem.robot.name, result.trajectory.duration, done)
+    for file in outputs:
+        write = write_gif if file.suffix.lower() == ".gif" else write_png
+        with Console(stderr=True).status(f"drawing {file}"):
+            write(problem.robot, problem.scene, done, file)
+        print(f"wrote {file}")
+    return 0 if done.free else 1
+
+
+def print_replay(robot: str, duration: float, done: "Replay") -> None:
+    """Tracking errors and contacts, as tables."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    title = f"{robot}: {'free' if done.free else 'contact'}, {duration:.2f} s"
+    table = Table("", "greatest", "RMS", title=title, title_justify="left")
+    for name, most, rms in zip(done.joint_names, done.max_errors, done.rms_errors, strict=True):
+        table.add_row(f"error of {name}", f"{1e3 * most:.3f} mrad", f"{1e3 * rms:.3f} mrad")
+    rms = float((done.tip_errors**2).mean() ** 0.5)
+    table.add_row("error of the tip", f"{1e3 * done.tip_errors.max():.3f} mm", f"{1e3 * rms:.3f} mm")
+    console.print(table)
+    if not done.free:
+        table = Table("link", "touches", "at", "depth")
+        for contact in done.contacts:
+            row = (contact.link, contact.other, f"{contact.time:.2f} s", f"{1e3 * contact.depth:.1f} mm")
+            table.add_row(*row)
+        console.print(table)
