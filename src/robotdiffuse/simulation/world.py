@@ -18,8 +18,8 @@ MARGIN = 0.001
 """What Bullet adds around each convex mesh [m]; its own call to set this has no effect."""
 DENSITY = 1000.0
 """Of all links, of which URDFs tell us no masses [kg/m^3]. It gives a Panda 19.7 kg; a real one has 18."""
-OTHER, LINK, OTHER_LINK, DISTANCE = 2, 3, 4, 8
-"""Columns of PyBullet's contact points: the second body, the links of both, their distance."""
+OTHER, LINK, OTHER_LINK, DISTANCE, FORCE = 2, 3, 4, 8, 9
+"""Columns of PyBullet's contact points: the second body, links of both, their distance, the normal force."""
 OBSTACLE_COLORS = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
 FURNITURE_COLOR = (0xCD, 0xC0, 0xAC)
 FURNITURE_SIZE = 0.7
@@ -119,7 +119,7 @@ class World:
         )
 
     def touching(self) -> list[tuple[str, str, float]]:
-        """What Bullet's last look for collisions found: link, obstacle or other link, signed distance [m]."""
+        """What pushed on what in the last step: link, obstacle or other link, signed distance [m]."""
         links = {index: link for link, index in self.links.items()}
         obstacles = {body: name for name, body in self.obstacles.items()}
         return [
@@ -129,6 +129,7 @@ class World:
                 self.gap(point),
             )
             for point in pybullet.getContactPoints(self.body, physicsClientId=self.client)
+            if point[FORCE] > 0 or self.gap(point) < 0
         ]
 
     def gap(self, point: tuple) -> float:
