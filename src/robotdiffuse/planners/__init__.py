@@ -27,6 +27,10 @@ PLANNERS = {
         "robotdiffuse.planners.rrt_connect:RRTConnect",
         "two trees grown towards each other, then shortcuts",
     ),
+    "shared_tree_rrt_star": Entry(
+        "robotdiffuse.planners.shared_tree:SharedTreeRRTStar",
+        "the paper's planner for data: one tree, all goals, near-optimal, 5 cm away from obstacles",
+    ),
 }
 DEFAULT_PLANNER = "robotdiffuse"
 

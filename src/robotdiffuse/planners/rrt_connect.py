@@ -49,9 +49,16 @@ class RRTConnectSettings:
                 raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must not be negative")
 
 
-def search_space(checker: CollisionChecker, resolution: float, padding: float = 0.0) -> kernel.Space:
-    """What the compiled search needs; `resolution` and `padding` [m] as in its docstring."""
+def search_space(
+    checker: CollisionChecker,
+    resolution: float,
+    padding: float = 0.0,
+    near_ends: Float[ndarray, "m dof+1"] | None = None,
+) -> kernel.Space:
+    """What the compiled search needs; `resolution`, `padding` [m] and `near_ends` as in its docstring."""
     robot = checker.robot
+    ends = np.zeros((0, robot.dof + 1)) if near_ends is None else near_ends.copy()
+    ends[:, -1] += checker.padding
     return kernel.Space(
         checker.robot_arrays,
         checker.scene_arrays,
@@ -60,6 +67,7 @@ def search_space(checker: CollisionChecker, resolution: float, padding: float = 
         levers(robot),
         np.float32(resolution),
         checker.padding + np.float32(padding),
+        ends.astype(np.float32),
     )
 
 

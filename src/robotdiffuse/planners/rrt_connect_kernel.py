@@ -15,6 +15,10 @@ from robotdiffuse.collision.compiled import allocation_free
 from robotdiffuse.collision.lanes import W, block_hits, make_workspace
 
 _ONE = np.float32(1.0)
+RELAXATION_SLOPE = np.float32(0.1)
+"""How the padding grows with the distance from an end that is closer to the scene [m/rad]."""
+RELAXATION_STEP = np.float32(0.1)
+"""Near such an end the padding changes in steps of this length [rad]."""
 
 
 class Space(NamedTuple):
@@ -32,6 +36,8 @@ class Space(NamedTuple):
     """No point of the arm moves further than this between two checks [m]."""
     padding: np.float32
     """Added to the radii of the spheres towards the scene [m]."""
+    near_ends: np.ndarray
+    """[m, dof + 1] ends that are closer to the scene than `padding`, and the padding that they allow [m]."""
 
 
 class Trees(NamedTuple):
@@ -56,6 +62,14 @@ def random(state):
     return np.float32((x * np.uint64(2685821657736338717)) >> np.uint64(40)) * np.float32(5.9604645e-08)
 
 
+@allocation_free(fastmath=True)
+def distance(a, b):
+    total = np.float32(0.0)
+    for j in range(len(a)):
+        total += (a[j] - b[j]) * (a[j] - b[j])
+    return np.sqrt(total)
+
+
 @allocation_free()
 def motion_free(space, a, b, block, work):
     """Whether the straight motion from a to b is free; b is checked, a is not.
@@ -63,18 +77,52 @@ def motion_free(space, a, b, block, work):
     Each block of 16 takes configurations spread over the whole motion, so that a collision anywhere tends to
     show in the first block (the rake of W. Thomason et al., "Motions in Microseconds", ICRA 2024).
     """
+    if len(space.near_ends) == 0:
+        return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, block, work)
+    length = distance(a, b)
+    pieces = max(int(np.ceil(length / RELAXATION_STEP)), 1)
+    first, first_padding = 0, padding_at(space, a, b, np.float32(0.5) / np.float32(pieces))
+    for k in range(1, pieces + 1):
+        padding = np.float32(-1.0)
+        if k < pieces:
+            padding = padding_at(space, a, b, (np.float32(k) + np.float32(0.5)) / np.float32(pieces))
+        if padding != first_padding:
+            s, t = np.float32(first) / np.float32(pieces), np.float32(k) / np.float32(pieces)
+            if not _stretch_free(space, a, b, s, t, first_padding, block, work):
+                return False
+            first, first_padding = k, padding
+    return True
+
+
+@allocation_free()
+def padding_at(space, a, b, share):
+    """The padding asked for at a share of the way from a to b: near an end that is closer to the scene, what
+    that end allows and RELAXATION_SLOPE more for each radian away from it."""
+    padding, dof = space.padding, len(a)
+    for m in range(len(space.near_ends)):
+        total = np.float32(0.0)
+        for j in range(dof):
+            d = a[j] + share * (b[j] - a[j]) - space.near_ends[m, j]
+            total += d * d
+        padding = min(padding, space.near_ends[m, dof] + RELAXATION_SLOPE * np.sqrt(total))
+    return padding
+
+
+@allocation_free()
+def _stretch_free(space, a, b, s, t, padding, block, work):
+    """Whether the part of the motion after the share s and up to the share t is free."""
     dof = len(a)
     travel = np.float32(0.0)
     for j in range(dof):
-        travel += abs(b[j] - a[j]) * space.levers[j]
+        travel += (t - s) * abs(b[j] - a[j]) * space.levers[j]
     blocks = max(int(np.ceil(travel / space.resolution / np.float32(W))), 1)
-    step = _ONE / np.float32(blocks * W)
+    step = (t - s) / np.float32(blocks * W)
     for k in range(blocks):
         for j in range(dof):
-            origin, delta = a[j], b[j] - a[j]
+            origin, delta = a[j] + s * (b[j] - a[j]), b[j] - a[j]
             for i in range(W):
                 block[j, i] = origin + np.float32(i * blocks + (blocks - k)) * step * delta
-        if block_hits(space.robot, space.scene, block, space.padding, True, work):
+        if block_hits(space.robot, space.scene, block, padding, True, work):
             return False
     return True
 
@@ -87,14 +135,6 @@ def motions_free(space, path):
     for i in range(len(path) - 1):
         out[i] = motion_free(space, path[i], path[i + 1], block, work)
     return out
-
-
-@allocation_free(fastmath=True)
-def _distance(a, b):
-    total = np.float32(0.0)
-    for j in range(len(a)):
-        total += (a[j] - b[j]) * (a[j] - b[j])
-    return np.sqrt(total)
 
 
 @allocation_free(fastmath=True)
@@ -140,8 +180,8 @@ def search(space, trees, reach, iterations, state):
         for j in range(dof):
             target[j] = space.lower[j] + random(state) * (space.upper[j] - space.lower[j])
         near = _nearest(nodes, tree, sizes[tree], target)
-        distance = _distance(nodes[tree, near], target)
-        share = min(reach / max(distance, np.float32(1e-6)), _ONE)
+        gap = distance(nodes[tree, near], target)
+        share = min(reach / max(gap, np.float32(1e-6)), _ONE)
         for j in range(dof):
             new[j] = nodes[tree, near, j] + share * (target[j] - nodes[tree, near, j])
         if not motion_free(space, nodes[tree, near], new, block, work):
@@ -152,9 +192,9 @@ def search(space, trees, reach, iterations, state):
         other = 1 - tree
         near = _nearest(nodes, other, sizes[other], new)
         while sizes[other] < nodes.shape[1]:
-            distance = _distance(nodes[other, near], new)
-            last = distance <= reach
-            share = _ONE if last else reach / distance
+            gap = distance(nodes[other, near], new)
+            last = gap <= reach
+            share = _ONE if last else reach / gap
             for j in range(dof):
                 target[j] = nodes[other, near, j] + share * (new[j] - nodes[other, near, j])
             if not motion_free(space, nodes[other, near], target, block, work):
@@ -197,7 +237,7 @@ def path_length(path):
     """Sum of the lengths of the segments [rad]."""
     total = np.float32(0.0)
     for i in range(len(path) - 1):
-        total += _distance(path[i], path[i + 1])
+        total += distance(path[i], path[i + 1])
     return total
 
 
@@ -273,7 +313,7 @@ def _skip(space, path, out, block, work):
 def _place_at(points, n, length, out):
     """Writes the place at a length along the path; returns the index of its segment."""
     for i in range(n - 1):
-        d = _distance(points[i], points[i + 1])
+        d = distance(points[i], points[i + 1])
         if length <= d or i == n - 2:
             share = min(length / max(d, np.float32(1e-9)), _ONE)
             for j in range(points.shape[1]):
@@ -289,7 +329,7 @@ def _pull_in(space, points, n, trial, block, work, state):
     i = 1 + int(random(state) * np.float32(n - 2))
     i = min(i, n - 2)
     before, after = points[i - 1], points[i + 1]
-    d1, d2 = _distance(before, points[i]), _distance(points[i], after)
+    d1, d2 = distance(before, points[i]), distance(points[i], after)
     share = d1 / max(d1 + d2, np.float32(1e-9))
     pull = np.float32(0.5) + np.float32(0.5) * random(state)
     for _ in range(4):
