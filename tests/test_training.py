@@ -12,9 +12,9 @@ from box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning import training
+from robotdiffuse.learning.batches import load_data, random_scenes
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, save_encoder
 from robotdiffuse.learning.config import EncoderTraining, PlannerTraining
-from robotdiffuse.learning.dataset import load_data, random_scenes
 from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
 from robotdiffuse.learning.training import moving_links, train_encoder, train_planner

@@ -12,9 +12,9 @@ from torch.nn import functional
 
 from robotdiffuse.collision.arrays import compile_robot, robot_groups
 from robotdiffuse.collision.packed import packed_link_clearances
+from robotdiffuse.learning.batches import Batch, Batches, fast_bf16, load_data, random_scenes
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_encoder, save_model
 from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, settings_to_json
-from robotdiffuse.learning.dataset import Batch, Batches, fast_bf16, load_data, random_scenes
 from robotdiffuse.learning.encoders import PointAutoencoder
 from robotdiffuse.learning.encoders.point_autoencoder import chamfer, nearest, pick
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
