@@ -128,6 +128,56 @@ def test_a_single_waypoint_is_checked() -> None:
     assert found.distance == pytest.approx(-0.1, abs=0.001)
 
 
+def test_frames_give_what_single_configurations_give() -> None:
+    robot, scene = far_pairs_only(example_robot("panda")), every_shape()
+    rng = np.random.default_rng(3)
+    ends = rng.uniform(robot.lower, robot.upper, (24, robot.dof))
+    hits = 0
+    with PyBulletOracle(robot, scene) as oracle:
+        for a, b in zip(ends[::2], ends[1::2], strict=True):
+            frames = a + np.linspace(0, 1, 60)[:, None] * (b - a)
+            for tolerance in (0.0, 0.001, 0.02):
+                single = [oracle.collides(q, tolerance) for q in frames]
+                found = oracle.check_frames(frames, tolerance)
+                assert (found is not None) == any(single)
+                if found is not None:
+                    assert found.at == single.index(True)
+                    hits += 1
+    assert 10 < hits < 36
+
+
+def test_scenes_are_replaced_and_the_robot_stays() -> None:
+    robot, q = box_arm(), np.zeros((1, 3))
+    blocked, clear = Scene([Sphere(vector(1.2, 0, 0), 0.1)]), Scene([Box(vector(0, 1, 0), vector(1, 0.1, 1))])
+    with PyBulletOracle(robot, clear) as oracle:
+        for _ in range(3):
+            assert oracle.check_frames(q) is None
+            oracle.set_scene(blocked)
+            found = oracle.check_frames(q)
+            assert found is not None and found.other == "sphere"
+            oracle.set_scene(clear)
+        with pytest.raises(InputError, match="PyBullet has no such shape"):
+            oracle.set_scene(Scene([Sphere(vector(1.2, 0, 0), 0.1), PointCloud(np.zeros((1, 3)))]))
+        oracle.set_scene(Scene())
+        assert oracle.check_frames(q) is None
+
+
+def test_obstacles_at_links_that_do_not_move_are_nothing() -> None:
+    robot = far_pairs_only(example_robot("panda"))
+    q = np.array([[0, -0.785, 0, -2.356, 0, 1.571, 0.785]])
+    with PyBulletOracle(robot, Scene([Box(vector(0, 0, -0.05), vector(2, 2, 0.12), name="floor")])) as oracle:
+        assert oracle.check_frames(q) is None
+        assert oracle.nearest(q[0], 0.0) is None
+
+
+def test_a_tolerance_is_not_negative() -> None:
+    with (
+        PyBulletOracle(box_arm(), Scene()) as oracle,
+        pytest.raises(InputError, match=r"tolerance is -0\.1; it must not be negative"),
+    ):
+        oracle.check_frames(np.zeros((1, 3)), -0.1)
+
+
 def test_point_clouds_are_refused() -> None:
     with pytest.raises(InputError, match="point_cloud is a point_cloud; PyBullet has no such shape"):
         PyBulletOracle(box_arm(), Scene([PointCloud(np.zeros((1, 3)))]))

@@ -105,17 +105,19 @@ def write_gif(
     from PIL import Image
 
     duration = float(run.times[-1])
-    count = int(np.clip(np.ceil(duration * settings.rate), 2, settings.most_frames))
+    # GIF counts in hundredths of a second
+    delay = max(round(100 / settings.rate), int(np.ceil(100 * duration / (settings.most_frames - 1))))
+    shares = np.append(np.arange(0, 100 * duration, delay) / (100 * duration), 1.0)
     with World(robot, scene, look=True) as world:
         camera = _prepare(world, run, settings)
         shots = [
             Image.fromarray(_reduced(_shot(world, q, camera).rgb, settings.oversampling))
-            for q in _at(run, np.linspace(0, 1, count))
+            for q in _at(run, shares)
         ]
-    strip = Image.fromarray(np.concatenate([np.asarray(shots[i]) for i in (0, count // 2, -1)]))
+    strip = Image.fromarray(np.concatenate([np.asarray(shots[i]) for i in (0, len(shots) // 2, -1)]))
     palette = strip.quantize(settings.colors, method=Image.Quantize.MEDIANCUT)
     frames = [shot.quantize(palette=palette, dither=Image.Dither.NONE) for shot in shots]
-    durations = [max(20, round(100 * duration / count) * 10)] * (count - 1) + [1000]
+    durations = [10 * delay] * (len(frames) - 1) + [1000]
     _save(frames[0], file, save_all=True, append_images=frames[1:], duration=durations, loop=0)
 
 
