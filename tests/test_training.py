@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -12,16 +13,19 @@ from box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning import training
-from robotdiffuse.learning.batches import load_data, random_scenes
+from robotdiffuse.learning.batches import load_data, random_scenes, resample_evenly
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, save_encoder
 from robotdiffuse.learning.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
+from robotdiffuse.learning.shards import shard_path, split_of, write_manifest, write_shard
 from robotdiffuse.learning.training import moving_links, train_encoder, train_planner
 from robotdiffuse.learning.training_run import TrainingRun
 from robotdiffuse.scenes.sampling import BOX, SPHERE, sample_surfaces_batch
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
+from stores import FRAMES as STORED
+from stores import manifest_of, random_arrays
 
 SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
 SMALL_DENOISER = TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8)
@@ -39,20 +43,19 @@ def arm(monkeypatch):
 def data(tmp_path, arm):
     """Two shards of bows to the side that the obstacle lies on; too far for clearances to tell."""
     folder = tmp_path / "data"
-    folder.mkdir()
     rng = np.random.default_rng(0)
+    write_manifest(folder, manifest_of(arm))
     for i, n in enumerate((100, 60)):
         side = rng.choice([-1.0, 1.0], n)
         ends = rng.uniform(-1.5, 1.5, (2, n, 1, arm.dof))
-        s = np.linspace(0, 1, FRAMES)[:, None]
+        s = np.linspace(0, 1, STORED)[:, None]
         q = ends[0] * (1 - s) + ends[1] * s + 0.5 * side[:, None, None] * np.sin(np.pi * s)
-        kinds, params = np.zeros((n, 2 + i), np.int8), np.zeros((n, 2 + i, 10), np.float32)
+        arrays = random_arrays(arm, n, rng)
+        kinds, params = np.zeros_like(arrays["obstacle_kinds"]), np.zeros_like(arrays["obstacle_params"])
         kinds[:, 0] = SPHERE
-        params[:, 0, :4] = np.stack([0 * side, 0.5 * side, 0 * side + 1, 0 * side + 0.2], -1)
-        trivial = rng.random(n) < 0.3
-        np.savez(
-            folder / f"shard_{i}.npz", q=q.astype(np.float32), kinds=kinds, params=params, trivial=trivial
-        )
+        params[:, 0, :4] = np.stack([0.01 * rng.random(n), 0.5 * side, 0 * side + 1, 0 * side + 0.2], -1)
+        arrays |= {"trajectories": q, "obstacle_kinds": kinds, "obstacle_params": params}
+        write_shard(folder, i, arrays, {})
     torch.manual_seed(0)
     save_encoder(PointAutoencoder(SMALL_ENCODER), tmp_path / "encoder", {})
     return folder
@@ -135,13 +138,13 @@ def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
 
 def test_planner_learns_which_side(tmp_path, data, arm):
     out = tmp_path / "out"
-    report = train_planner(planner_settings(data, samples=16 * 250, point_weight=0.01), str(out))
+    report = train_planner(planner_settings(data, samples=16 * 300, point_weight=0.01), str(out))
     rows = read_log(out)
     assert float(rows[-1]["loss"]) < 0.3 * float(rows[0]["loss"])
-    assert report["samples"] == 4000
+    assert report["samples"] == 4800
     model = load_model(out, arm)
     about = json.loads((out / "model.json").read_text())
-    assert about["training"]["trajectories"] == 160
+    assert about["training"]["trajectories"] == len(load_data(str(data), arm, model.encoder, FRAMES, print))
     rng = np.random.default_rng(0)
     start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
     for side in (-1.0, 1.0):
@@ -164,8 +167,7 @@ def test_codes_are_kept_beside_the_data(data, arm):
     first = load_data(str(data), arm, encoder, FRAMES, said.append)
     kept = sorted((data / "codes").iterdir())
     assert len(kept) == 2
-    assert "160 trajectories" in said[-1]
-    assert first.kinds.shape == (160, 3)
+    assert f"{len(first)} trajectories" in said[-1]
     kept[0].write_bytes(b"damaged")
     again = load_data(str(data), arm, encoder, FRAMES, said.append)
     np.testing.assert_array_equal(again.codes, first.codes)
@@ -232,28 +234,41 @@ def test_damaged_checkpoint_is_named(tmp_path, data):
         train_planner(planner_settings(data), str(tmp_path / "out"))
 
 
-@pytest.mark.parametrize("case", ["none", "damaged", "missing", "frames", "nan", "rows"])
+def test_splits_and_frames(data, arm):
+    """Training and validation share no scene, the test split stays out, and frames are even again."""
+    loaded = load_data(str(data), arm, load_encoder(data.parent / "encoder"), FRAMES, print)
+    kept, held_out = loaded.split(1000)
+    assert set(split_of(kept.kinds, kept.params)) == {0}
+    assert set(split_of(held_out.kinds, held_out.params)) == {1}
+    assert 120 < len(kept) + len(held_out) == len(loaded) < 160
+    assert len(loaded.split(2)[1]) == 2
+    steps = np.linalg.norm(np.diff(kept.q, axis=1), axis=2)
+    np.testing.assert_allclose(steps / steps.mean(1, keepdims=True), 1, atol=2e-3)
+
+
+def test_resampling():
+    q = np.array([[[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [3.0, 1.0]], [[1.0, 2.0]] * 4], np.float32)
+    even = resample_evenly(q, 5)
+    np.testing.assert_allclose(even[0], [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]], atol=1e-6)
+    np.testing.assert_array_equal(even[1], q[1, [0] * 5])
+    assert resample_evenly(q[:0], 5).shape == (0, 5, 2)
+
+
+@pytest.mark.parametrize("case", ["none", "damaged", "robot"])
 def test_bad_data_give_one_line(case, data, arm):
-    file = data / "shard_1.npz"
-    arrays = dict(np.load(file))
+    message = {
+        "none": "holds no shard",
+        "damaged": r"shard_00001\.zarr",
+        "robot": "use the robot of the data",
+    }
     if case == "none":
-        for shard in data.glob("*.npz"):
-            shard.unlink()
+        for i in (0, 1):
+            shutil.rmtree(shard_path(data, i))
     elif case == "damaged":
-        file.write_bytes(file.read_bytes()[:5000])
-    else:
-        if case == "missing":
-            del arrays["trivial"]
-        elif case == "frames":
-            arrays["q"] = arrays["q"][:, :40]
-        elif case == "nan":
-            arrays["q"][3, 4, 1] = np.nan
-        elif case == "rows":
-            arrays["kinds"] = arrays["kinds"][:-1]
-        np.savez(file, **arrays)
-    encoder = load_encoder(data.parent / "encoder")
-    with pytest.raises(InputError, match="holds no shard" if case == "none" else "shard_1.npz") as caught:
-        load_data(str(data), arm, encoder, FRAMES, lambda text: None)
+        shutil.rmtree(shard_path(data, 1) / "line_free")
+    robot = replace(arm, spheres={}) if case == "robot" else arm
+    with pytest.raises(InputError, match=message[case]) as caught:
+        load_data(str(data), robot, load_encoder(data.parent / "encoder"), FRAMES, print)
     assert "\n" not in str(caught.value)
 
 

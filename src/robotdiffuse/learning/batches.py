@@ -1,11 +1,10 @@
-"""Training data: shards of planned trajectories, and random scenes as packed arrays."""
+"""What training draws from: planned trajectories with the codes of their scenes, and random scenes."""
 
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path as FilePath
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import fingerprint, write_atomically
 from robotdiffuse.learning.encoders import PointAutoencoder
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.shards import SPLITS, Shard, check_shard, read_manifest, shard_indices, split_of
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import BOX, SPHERE, sample_surfaces_batch
 
@@ -63,16 +63,18 @@ class TrajectoryData:
     """z of each scene, float16."""
     digest: str
     """SHA-256 of the shards, the first 16 digits."""
+    validation: int
+    """So many rows, the last, are of the split for validation; the others are of that for training."""
 
     def __len__(self) -> int:
         return len(self.q)
 
-    def split(self, held_out: int) -> "tuple[TrajectoryData, TrajectoryData]":
-        """All but the last rows, and the last rows."""
-        cut = len(self) - held_out
-        return self._rows(slice(None, cut)), self._rows(slice(cut, None))
+    def split(self, most: int) -> "tuple[TrajectoryData, TrajectoryData]":
+        """The rows for training, and at most so many of those for validation."""
+        cut = len(self) - self.validation
+        return self._rows(slice(None, cut), 0), self._rows(slice(cut, cut + most), min(most, self.validation))
 
-    def _rows(self, rows: slice) -> "TrajectoryData":
+    def _rows(self, rows: slice, validation: int) -> "TrajectoryData":
         return TrajectoryData(
             self.q[rows],
             self.kinds[rows],
@@ -80,88 +82,77 @@ class TrajectoryData:
             self.trivial[rows],
             self.codes[rows],
             self.digest,
+            validation,
         )
 
 
 def load_data(
     folder: str, robot: Robot, encoder: PointAutoencoder, frames: int, report: Callable[[str], None]
 ) -> TrajectoryData:
-    """All shards (*.npz) of a folder, with the codes of their scenes.
+    """The rows for training and validation of a data set, at `frames` frames, with the codes of their scenes.
 
     Codes are kept beside the shards, in files named by shard and encoder; where the folder cannot be written
     they are made each time. `report` is told what is being done. Raises InputError, naming the file, if there
-    is no shard, or one is damaged or for another robot.
+    is no data set, a shard is damaged, or the robot is another.
     """
-    files = sorted(FilePath(folder).glob("*.npz"))
-    if not files:
-        raise InputError(
-            f"data folder {folder} holds no shard (*.npz); make some with: robotdiffuse data generate"
-        )
-    parts: list[tuple[ndarray, ...]] = []
-    digest = hashlib.sha256()
+    manifest, indices = read_manifest(folder), shard_indices(folder)
+    manifest.check_robot(robot)
+    if not indices:
+        raise InputError(f"data folder {folder} holds no shard; make some with: robotdiffuse data generate")
+    parts: dict[str, list[tuple[ndarray, ...]]] = {"train": [], "validation": []}
+    digest, rows = hashlib.sha256(), 0
     encoder_print = fingerprint(encoder)
-    widest = 0
-    for i, file in enumerate(files):
-        arrays, shard_print = _read_shard(file, robot.dof, frames)
-        digest.update(shard_print.encode())
-        codes = _cached_codes(file, arrays, encoder, f"{shard_print}-{encoder_print}")
-        parts.append((*arrays, codes))
-        widest = max(widest, arrays[1].shape[1])
-        report(f"data: {i + 1} of {len(files)} shards, {sum(len(part[0]) for part in parts):,} trajectories")
-    q, trivial, codes = (np.concatenate([part[i] for part in parts]) for i in (0, 3, 4))
-    kinds = np.concatenate([_widen(part[1], widest) for part in parts])
-    params = np.concatenate([_widen(part[2], widest) for part in parts])
-    return TrajectoryData(q, kinds, params, trivial, codes, digest.hexdigest()[:16])
+    for i, index in enumerate(indices):
+        shard = check_shard(folder, index, manifest)
+        digest.update(shard.fingerprint.encode())
+        split = split_of(shard["obstacle_kinds"], shard["obstacle_params"])
+        codes = _cached_codes(FilePath(folder), shard, encoder, f"{shard.fingerprint}-{encoder_print}")
+        for name, found in parts.items():
+            of = split == SPLITS.index(name)
+            q = resample_evenly(shard["trajectories"][of], frames)
+            kinds, params = shard["obstacle_kinds"][of], shard["obstacle_params"][of]
+            found.append((q, kinds, params, shard["line_free"][of], codes[of]))
+            rows += len(q)
+        report(f"data: {i + 1} of {len(indices)} shards, {rows:,} trajectories")
+    ordered = parts["train"] + parts["validation"]
+    q, kinds, params, trivial, codes = (np.concatenate(arrays) for arrays in zip(*ordered, strict=True))
+    validation = sum(len(part[0]) for part in parts["validation"])
+    return TrajectoryData(q, kinds, params, trivial, codes, digest.hexdigest()[:16], validation)
 
 
-def _widen(array: ndarray, columns: int) -> ndarray:
-    missing = [(0, 0)] * array.ndim
-    missing[1] = (0, columns - array.shape[1])
-    return np.pad(array, missing)
-
-
-def _read_shard(
-    file: FilePath, dof: int, frames: int
-) -> tuple[tuple[ndarray, ndarray, ndarray, ndarray], str]:
-    try:
-        with np.load(file) as shard:
-            q, kinds, params = shard["q"], shard["kinds"], shard["params"]
-            trivial = shard["trivial"]
-        shard_print = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-    except KeyError as error:
-        raise InputError(
-            f"shard {file} has no array {error.args[0]}; it needs q, kinds, params, trivial"
-        ) from None
-    except (OSError, ValueError, EOFError, BadZipFile) as error:
-        raise InputError(f"shard {file} is damaged: {error}") from None
-    if q.ndim != 3 or q.shape[1:] != (frames, dof):
-        raise InputError(
-            f"shard {file}: q has shape {q.shape}; it must be n x {frames} frames x {dof} joints"
-        )
-    n = len(q)
-    if kinds.shape[0] != n or params.shape != (*kinds.shape, 10) or trivial.shape != (n,):
-        raise InputError(
-            f"shard {file}: kinds {kinds.shape}, params {params.shape}, trivial {trivial.shape} do not fit"
-        )
-    if not (np.isfinite(q).all() and np.isfinite(params).all()):
-        raise InputError(f"shard {file} holds numbers that are not finite")
-    return (
-        q.astype(np.float32), kinds.astype(np.int8), params.astype(np.float32), trivial.astype(bool)
-    ), shard_print  # fmt: skip
+def resample_evenly(q: Float32[ndarray, "n stored dof"], frames: int) -> Float32[ndarray, "n {frames} dof"]:
+    """Each trajectory at `frames` places, evenly spaced in joint-space length; the ends are kept exactly."""
+    n, stored = q.shape[:2]
+    steps = np.linalg.norm(np.diff(q, axis=1), axis=2).astype(np.float64)
+    at = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1)], axis=1)
+    at /= np.maximum(at[:, -1:], np.finfo(np.float64).tiny)
+    wanted = np.linspace(0.0, 1.0, frames)
+    # rows one after the other, two apart, are one rising list
+    row = 2.0 * np.arange(n)[:, None]
+    after = np.searchsorted((at + row).reshape(-1), (wanted + row).reshape(-1), side="right").reshape(n, -1)
+    after = np.clip(after - np.arange(n)[:, None] * stored, 1, stored - 1)[..., None]
+    low, high = (np.take_along_axis(at, i[..., 0], 1) for i in (after - 1, after))
+    share = ((wanted - low) / np.maximum(high - low, np.finfo(np.float64).tiny)).clip(0, 1)
+    share = share.astype(np.float32)[..., None]
+    below, above = (np.take_along_axis(q, i, 1) for i in (after - 1, after))
+    even = below + share * (above - below)
+    even[:, 0], even[:, -1] = q[:, 0], q[:, -1]
+    return even
 
 
 def _cached_codes(
-    file: FilePath, arrays: tuple[ndarray, ...], encoder: PointAutoencoder, key: str
+    folder: FilePath, shard: Shard, encoder: PointAutoencoder, key: str
 ) -> Float[ndarray, "n code"]:
-    cache = file.parent / "codes" / f"{key}.npy"
+    cache = folder / "codes" / f"{key}.npy"
     if cache.is_file():
         try:
             codes = np.load(cache)
-            if len(codes) == len(arrays[0]):
+            if len(codes) == len(shard):
                 return codes
         except (OSError, ValueError, EOFError):
             pass  # damaged: made again below
-    codes = encode_scenes(encoder, arrays[1], arrays[2], np.random.default_rng(int(key[:8], 16)))
+    rng = np.random.default_rng(int(key[:8], 16))
+    codes = encode_scenes(encoder, shard["obstacle_kinds"], shard["obstacle_params"], rng)
     try:
         buffer = BytesIO()
         np.save(buffer, codes)
@@ -178,7 +169,7 @@ def encode_scenes(
     rng: np.random.Generator,
 ) -> Float[ndarray, "n code"]:
     """z of each packed scene from a random cloud, as float16."""
-    codes = []
+    codes = [np.zeros((0, encoder.settings.code), np.float16)]
     for i in range(0, len(kinds), 256):
         part = slice(i, i + 256)
         clouds = sample_surfaces_batch(kinds[part], params[part], CODE_POINTS, rng, encoder.settings.region)

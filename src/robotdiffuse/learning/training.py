@@ -31,7 +31,7 @@ QUERIES = 96
 DISTANCE_CAP = 0.5
 """Reconstructed distances are capped [m]."""
 HELD_OUT = 2000
-"""Most trajectories kept aside for validation; never more than a fiftieth of the data."""
+"""Most trajectories of the split for validation that are looked at."""
 FLOOR = Scene([Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")])
 """Part of every scene of the data, as in ROP."""
 POINT_UNIT = 0.1
@@ -136,7 +136,7 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     data = load_data(
         settings.data, robot, encoder, model.config.frames, lambda text: print(text, file=sys.stderr)
     )
-    kept, held_out = data.split(min(HELD_OUT, len(data) // 50))
+    kept, held_out = data.split(HELD_OUT)
     hard = kept.q[~kept.trivial]
     model.fit_statistics((hard if len(hard) else kept.q)[:20_000], settings.smooth_noise)
     run = TrainingRun(
