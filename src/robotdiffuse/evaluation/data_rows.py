@@ -1,0 +1,51 @@
+"""Rows of a data set as problems and motions again."""
+
+import numpy as np
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.shards import Manifest, Shard
+from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.rop import RopSettings, floor_box, unpack_scene
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.types import Path
+
+
+def family_names(manifest: Manifest) -> tuple[str, ...]:
+    """Names of the families, in the order of the numbers in `family`."""
+    return tuple(manifest.families)
+
+
+def family_settings(manifest: Manifest, family: int) -> RopSettings:
+    """What the scenes of a family were drawn from. Raises InputError for a family that is not in the manifest."""
+    names = family_names(manifest)
+    if not 0 <= family < len(names):
+        raise InputError(f"family is {family}; the manifest has {len(names)}: {', '.join(names)}")
+    fields = manifest.families[names[family]]
+    try:
+        return RopSettings(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
+    except TypeError as error:
+        raise InputError(f"families.{names[family]} in the manifest: {error}") from None
+
+
+def scene_of(manifest: Manifest, shard: Shard, row: int) -> Scene:
+    """The scene of a row: the family's floor first, if it has one, then the obstacles."""
+    floor = floor_box(family_settings(manifest, int(shard["family"][row])))
+    obstacles = unpack_scene(shard["obstacle_kinds"][row], shard["obstacle_params"][row]).shapes
+    return Scene([*([] if floor is None else [floor]), *obstacles])
+
+
+def problem_of(manifest: Manifest, robot: Robot, shard: Shard, row: int) -> Problem:
+    """The problem that a row solves, with all its goal configurations.
+
+    Raises InputError if the row makes no problem, such as a start out of limits.
+    """
+    goals = np.asarray(shard["goals"][row], np.float64)
+    goals = goals[~np.isnan(goals).any(axis=1)]
+    start = np.asarray(shard["start"][row], np.float64)
+    return Problem(robot, scene_of(manifest, shard, row), start, JointGoal(goals))
+
+
+def motion_of(robot: Robot, shard: Shard, row: int) -> Path:
+    """The frames of a row as a path."""
+    return Path(robot.joint_names, np.asarray(shard["trajectories"][row], np.float64))
