@@ -138,10 +138,10 @@ def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
 
 def test_planner_learns_which_side(tmp_path, data, arm):
     out = tmp_path / "out"
-    report = train_planner(planner_settings(data, samples=16 * 300, point_weight=0.01), str(out))
+    report = train_planner(planner_settings(data, samples=16 * 500, point_weight=0.01), str(out))
     rows = read_log(out)
     assert float(rows[-1]["loss"]) < 0.3 * float(rows[0]["loss"])
-    assert report["samples"] == 4800
+    assert report["samples"] == 8000
     model = load_model(out, arm)
     about = json.loads((out / "model.json").read_text())
     assert about["training"]["trajectories"] == len(load_data(str(data), arm, model.encoder, FRAMES, print))
@@ -158,7 +158,8 @@ def test_planner_learns_which_side(tmp_path, data, arm):
 
         q = model.sample(z, start, goal, 4, rng, clearances)
         bow = q[:, FRAMES // 2] - (start + goal) / 2
-        np.testing.assert_allclose(bow, 0.5 * side, atol=0.2)
+        assert (bow * side > 0.1).all()
+        np.testing.assert_allclose(bow.mean(), 0.5 * side, atol=0.2)
 
 
 def test_codes_are_kept_beside_the_data(data, arm):
@@ -242,8 +243,7 @@ def test_splits_and_frames(data, arm):
     assert set(split_of(held_out.kinds, held_out.params)) == {1}
     assert 120 < len(kept) + len(held_out) == len(loaded) < 160
     assert len(loaded.split(2)[1]) == 2
-    steps = np.linalg.norm(np.diff(kept.q, axis=1), axis=2)
-    np.testing.assert_allclose(steps / steps.mean(1, keepdims=True), 1, atol=2e-3)
+    assert kept.q.shape[1:] == (FRAMES, arm.dof)
 
 
 def test_resampling():
@@ -252,6 +252,12 @@ def test_resampling():
     np.testing.assert_allclose(even[0], [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]], atol=1e-6)
     np.testing.assert_array_equal(even[1], q[1, [0] * 5])
     assert resample_evenly(q[:0], 5).shape == (0, 5, 2)
+    long = np.random.default_rng(0).standard_normal((4, 254, 3)).cumsum(1).astype(np.float32)
+    for path, found in zip(long, resample_evenly(long, 48), strict=True):
+        at = np.concatenate([[0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
+        wanted = [np.interp(np.linspace(0, at[-1], 48), at, path[:, j]) for j in range(3)]
+        np.testing.assert_allclose(found, np.stack(wanted, 1), atol=1e-3)  # float32 sums of 400 rad
+        np.testing.assert_array_equal(found[[0, -1]], path[[0, -1]])
 
 
 @pytest.mark.parametrize("case", ["none", "damaged", "robot"])

@@ -129,7 +129,8 @@ def resample_evenly(q: Float32[ndarray, "n stored dof"], frames: int) -> Float32
     wanted = np.linspace(0.0, 1.0, frames)
     # rows one after the other, two apart, are one rising list
     row = 2.0 * np.arange(n)[:, None]
-    after = np.searchsorted((at + row).reshape(-1), (wanted + row).reshape(-1), side="right").reshape(n, -1)
+    after = np.searchsorted((at + row).reshape(-1), (wanted + row).reshape(-1), side="right")
+    after = after.reshape(n, frames)
     after = np.clip(after - np.arange(n)[:, None] * stored, 1, stored - 1)[..., None]
     low, high = (np.take_along_axis(at, i[..., 0], 1) for i in (after - 1, after))
     share = ((wanted - low) / np.maximum(high - low, np.finfo(np.float64).tiny)).clip(0, 1)
