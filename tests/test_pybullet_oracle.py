@@ -156,10 +156,9 @@ def test_scenes_are_replaced_and_the_robot_stays() -> None:
             found = oracle.check_frames(q)
             assert found is not None and found.other == "sphere"
             oracle.set_scene(clear)
-        with pytest.raises(InputError, match="PyBullet has no such shape"):
-            oracle.set_scene(Scene([Sphere(vector(1.2, 0, 0), 0.1), PointCloud(np.zeros((1, 3)))]))
-        oracle.set_scene(Scene())
-        assert oracle.check_frames(q) is None
+        oracle.set_scene(Scene([PointCloud(np.zeros((0, 3))), PointCloud(vector(1.2, 0, 0)[None])]))
+        found = oracle.check_frames(q)
+        assert found is not None and found.other == "point_cloud_2"
 
 
 def test_obstacles_at_links_that_do_not_move_are_nothing() -> None:
@@ -178,6 +177,17 @@ def test_a_tolerance_is_not_negative() -> None:
         oracle.check_frames(np.zeros((1, 3)), -0.1)
 
 
-def test_point_clouds_are_refused() -> None:
-    with pytest.raises(InputError, match="point_cloud is a point_cloud; PyBullet has no such shape"):
-        PyBulletOracle(box_arm(), Scene([PointCloud(np.zeros((1, 3)))]))
+def test_point_clouds_agree_with_coal() -> None:
+    robot, rng = far_pairs_only(example_robot("panda")), np.random.default_rng(4)
+    ball = rng.normal(size=(400, 3))
+    points = vector(0.4, 0.2, 0.5) + 0.25 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    scene = Scene([PointCloud(points, 0.02)])
+    exact = ExactCollision(robot, scene)
+    q = rng.uniform(robot.lower, robot.upper, (40, robot.dof))
+    with PyBulletOracle(robot, scene) as oracle:
+        for row in q:
+            right = min(d.distance for d in (*exact.link_distances(row), *exact.pair_distances(row)))
+            if right > 0:
+                assert oracle.distance(row) == pytest.approx(right, abs=TOLERANCE)
+            if abs(right) > TOLERANCE:
+                assert (oracle.check_frames(row[None], 0.0) is not None) == (right < 0)

@@ -156,6 +156,17 @@ def test_cameras_are_merged_and_thinned_and_obstacles_left_out() -> None:
     assert problem.scene.shapes == (two,)
 
 
+def test_a_point_cloud_is_seen_as_points() -> None:
+    points = np.array([[0.0, 0.1, 0.4], [0.0, -0.1, 0.5], [0.2, 0.0, 0.3]])
+    cloud = PointCloud(points, 0.03)
+    with World(box_arm(), Scene([cloud]), look=True) as world:
+        world.place(AWAY)
+        seen = point_cloud(world, [CAMERA], np.random.default_rng(0), voxel=1e-4).points
+    nearest = np.linalg.norm(seen[:, None] - points, axis=2)
+    assert set(nearest.argmin(axis=1)) == {0, 1, 2}
+    assert nearest.min(axis=1).max() < 0.0301
+
+
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -275,8 +286,6 @@ def test_what_cannot_be_replayed() -> None:
     trajectory = motion(robot, np.zeros(3), np.ones(3))
     with pytest.raises(InputError, match="the trajectory moves a, b, c; planar plans j0, j1, j2"):
         replay(robot, Scene(), replace(trajectory, joint_names=("a", "b", "c")))
-    with pytest.raises(InputError, match="PyBullet has no such shape"):
-        replay(robot, Scene([PointCloud(np.zeros((1, 3)))]), trajectory)
     for name, value in (("time_step", 0.01), ("position_gain", 0.0), ("force", -1.0), ("settle", -1.0)):
         with pytest.raises(InputError, match=f"replay.{name} is {value}"):
             ReplaySettings(**{name: value})

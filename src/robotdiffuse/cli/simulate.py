@@ -73,6 +73,6 @@ def print_replay(robot: str, duration: float, done: "Replay") -> None:
     if not done.free:
         table = Table("link", "touches", "at", "depth")
         for contact in done.contacts:
-            row = (contact.link, contact.other, f"{contact.time:.2f} s", f"{1e3 * contact.depth:.1f} mm")
-            table.add_row(*row)
+            depth = f"{1e3 * contact.depth:.1f} mm" if contact.depth > 0 else "none: closer than 2 mm"
+            table.add_row(contact.link, contact.other, f"{contact.time:.2f} s", depth)
         console.print(table)

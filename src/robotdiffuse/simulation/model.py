@@ -1,4 +1,4 @@
-"""The robot as PyBullet reads it: a URDF with convex meshes, masses and, for pictures, coloured surfaces."""
+"""What PyBullet reads from files: the robot with its masses, point clouds, coloured surfaces."""
 
 from pathlib import Path
 from xml.etree import ElementTree as Xml
@@ -35,10 +35,28 @@ def write_urdf(robot: Robot, folder: Path, density: float, look: bool) -> Path:
         _add_looks(element, looks.get(link, ()), folder / link)
     for joint in robot.joints:
         _add_joint(root, joint, joint.name in robot.joint_names)
-    file = folder / "robot.urdf"
-    Xml.indent(root)  # PyBullet misreads lines of more than 8 kB
-    Xml.ElementTree(root).write(file)
-    return file
+    return _write_tree(root, folder / "robot.urdf")
+
+
+def write_points_urdf(
+    points: Float[ndarray, "n 3"], radius: float, color: tuple[int, int, int] | None, folder: Path
+) -> Path:
+    """One link of a sphere for each point; with a colour, to be seen as octahedra. The file in `folder`."""
+    root = Xml.Element("robot", name="points")
+    element = Xml.SubElement(root, "link", name="points")
+    _add_inertia(element, (), 0.0)
+    for point in points:
+        collision = Xml.SubElement(element, "collision")
+        Xml.SubElement(collision, "origin", xyz=_numbers(point))
+        Xml.SubElement(Xml.SubElement(collision, "geometry"), "sphere", radius=_numbers([radius]))
+    if color is not None and len(points):
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+        many = np.array(faces) + 6 * np.arange(len(points))[:, None, None]
+        vertices = (points[:, None] + radius * axes).reshape(-1, 3)
+        write_obj(folder / "points.obj", vertices, many.reshape(-1, 3), np.tile(axes, (len(points), 1)))
+        _add_color(_add_mesh(element, "visual", folder / "points.obj"), np.array(color))
+    return _write_tree(root, folder / "points.urdf")
 
 
 def write_obj(
@@ -115,9 +133,18 @@ def _add_looks(element: Xml.Element, meshes: tuple[VisualMesh, ...], stem: Path)
         for k, rgb in enumerate(palette):
             file = stem.with_name(f"{stem.name}_look_{i}_{k}.obj")
             write_shaded(file, mesh.vertices, mesh.faces[color.reshape(-1) == k])
-            visual = _add_mesh(element, "visual", file)
-            material = Xml.SubElement(visual, "material", name=f"color_{rgb[0]}_{rgb[1]}_{rgb[2]}")
-            Xml.SubElement(material, "color", rgba=_numbers([*(rgb / 255.0), 1.0]))
+            _add_color(_add_mesh(element, "visual", file), rgb)
+
+
+def _add_color(visual: Xml.Element, rgb: ndarray) -> None:
+    material = Xml.SubElement(visual, "material", name=f"color_{rgb[0]}_{rgb[1]}_{rgb[2]}")
+    Xml.SubElement(material, "color", rgba=_numbers([*(rgb / 255.0), 1.0]))
+
+
+def _write_tree(root: Xml.Element, file: Path) -> Path:
+    Xml.indent(root)  # PyBullet misreads lines of more than 8 kB
+    Xml.ElementTree(root).write(file)
+    return file
 
 
 def _add_joint(root: Xml.Element, joint: Joint, planned: bool) -> None:

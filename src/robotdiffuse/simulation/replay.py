@@ -108,7 +108,7 @@ def replay(robot: Robot, scene: Scene, trajectory: Trajectory, settings: ReplayS
     """Simulate a trajectory from its first row to the last, and then `settings.settle` seconds of rest.
 
     An arm that hits an obstacle is held back by it; the simulation goes on to the end. Raises InputError for
-    a trajectory of other joints and for a shape that PyBullet lacks (point clouds).
+    a trajectory of other joints.
     """
     if trajectory.joint_names != robot.joint_names:
         raise InputError(

@@ -8,11 +8,10 @@ import pybullet
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
-from robotdiffuse.simulation.model import write_obj, write_shaded, write_urdf
+from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.simulation.model import write_obj, write_points_urdf, write_shaded, write_urdf
 
 MARGIN = 0.001
 """What Bullet adds around each convex mesh [m]; its own call to set this has no effect."""
@@ -36,7 +35,7 @@ class World:
     def __init__(self, robot: Robot, scene: Scene, look: bool = False, density: float = DENSITY) -> None:
         """`look`: give robot and obstacles coloured surfaces, for cameras and pictures; loading takes longer.
 
-        `density` of all links [kg/m^3]. Raises InputError for a shape that PyBullet lacks (point clouds).
+        `density` of all links [kg/m^3].
         """
         self.robot = robot
         self.look = look
@@ -79,11 +78,7 @@ class World:
             pybullet.resetJointState(self.body, index, value, physicsClientId=self.client)
         self.obstacles: dict[str, int] = {}
         """PyBullet's number of each obstacle, by name."""
-        try:
-            self.set_scene(scene)
-        except InputError:
-            self.close()
-            raise
+        self.set_scene(scene)
 
     def __enter__(self) -> "World":
         return self
@@ -98,10 +93,7 @@ class World:
             self._folder.cleanup()
 
     def set_scene(self, scene: Scene) -> None:
-        """Replace all obstacles; the robot stays, which saves loading its meshes.
-
-        Raises InputError for a shape that PyBullet lacks; the world then has no obstacles.
-        """
+        """Replace all obstacles; the robot stays, which saves loading its meshes."""
         for body in self.obstacles.values():
             pybullet.removeBody(body, physicsClientId=self.client)
         self.obstacles = {}
@@ -147,42 +139,45 @@ class World:
                     )
 
     def _add(self, shape: Shape, color: tuple[int, int, int]) -> int:
-        xyz, wxyz = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+        if isinstance(shape, PointCloud):
+            return self._add_points(shape, color)
+        if isinstance(shape, Mesh):
+            file = Path(self._folder.name) / "obstacle.obj"
+            write_obj(file, shape.vertices, shape.faces)
+            flags = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
+            what = {"shapeType": pybullet.GEOM_MESH, "fileName": str(file), "flags": flags}
+            xyz, wxyz = shape.xyz, shape.wxyz
+        elif isinstance(shape, Sphere):
+            what = {"shapeType": pybullet.GEOM_SPHERE, "radius": shape.radius}
+            xyz, wxyz = shape.center, IDENTITY
+        elif isinstance(shape, Box):
+            what = {"shapeType": pybullet.GEOM_BOX, "halfExtents": (shape.size / 2).tolist()}
+            xyz, wxyz = shape.center, shape.wxyz
+        else:
+            assert isinstance(shape, Cylinder | Capsule)
+            kind = pybullet.GEOM_CYLINDER if isinstance(shape, Cylinder) else pybullet.GEOM_CAPSULE
+            what = {"shapeType": kind, "radius": shape.radius, "height": shape.height}
+            xyz, wxyz = shape.center, shape.wxyz
         look = -1
-        file = Path(self._folder.name) / "obstacle.obj"
-        match shape:
-            case Sphere():
-                what = {"shapeType": pybullet.GEOM_SPHERE, "radius": shape.radius}
-                xyz = shape.center
-            case Box():
-                what = {"shapeType": pybullet.GEOM_BOX, "halfExtents": (shape.size / 2).tolist()}
-                xyz, wxyz = shape.center, shape.wxyz
-            case Cylinder() | Capsule():
-                kind = pybullet.GEOM_CYLINDER if isinstance(shape, Cylinder) else pybullet.GEOM_CAPSULE
-                what = {"shapeType": kind, "radius": shape.radius, "height": shape.height}
-                xyz, wxyz = shape.center, shape.wxyz
-            case Mesh():
-                write_obj(file, shape.vertices, shape.faces)
-                flags = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
-                what = {"shapeType": pybullet.GEOM_MESH, "fileName": str(file), "flags": flags}
-                xyz, wxyz = shape.xyz, shape.wxyz
-            case _:
-                raise InputError(
-                    f"{shape.name} is a {shape.kind}; PyBullet has no such shape, only solids and meshes"
-                )
-        collision = pybullet.createCollisionShape(**what, physicsClientId=self.client)
         if self.look:
             # of our own making: PyBullet's spheres and cylinders are coarse
             vertices, faces = _surface(shape)
             large = np.ptp(vertices, axis=0).max() > FURNITURE_SIZE
             look = self._add_look(vertices, faces, FURNITURE_COLOR if large else color)
         return pybullet.createMultiBody(
-            baseCollisionShapeIndex=collision,
+            baseCollisionShapeIndex=pybullet.createCollisionShape(**what, physicsClientId=self.client),
             baseVisualShapeIndex=look,
             basePosition=xyz.tolist(),
             baseOrientation=[*wxyz[1:], wxyz[0]],
             physicsClientId=self.client,
         )
+
+    def _add_points(self, cloud: PointCloud, color: tuple[int, int, int]) -> int:
+        """One body of as many spheres; only from a URDF does PyBullet take more than 16."""
+        file = write_points_urdf(
+            cloud.points, cloud.point_radius, color if self.look else None, Path(self._folder.name)
+        )
+        return pybullet.loadURDF(str(file), useFixedBase=True, physicsClientId=self.client)
 
     def add_surface(
         self,
