@@ -1,7 +1,7 @@
 """Plan on what depth cameras see of a scene, and judge the motion by the scene itself (needs PyBullet).
 
 What no camera sees is not there for the planner: the back of the ball, what the arm hides, what is out of
-view. With one camera the motion runs through the unseen half of the ball; with two it is free.
+view. With one camera the motion is likely to run through the unseen half of the ball; with two it is free.
 """
 
 import numpy as np

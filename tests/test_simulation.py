@@ -1,5 +1,6 @@
 """Depth cameras, replay and pictures in PyBullet's world."""
 
+import runpy
 import sys
 from pathlib import Path as FilePath
 
@@ -356,6 +357,15 @@ def test_command(tmp_path: FilePath, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["simulate", file]) == 1
     printed = capsys.readouterr().out
     assert "panda: contact" in printed and "panda_hand" in printed and "sphere" in printed
+
+
+def test_example(capsys: pytest.CaptureFixture[str]) -> None:
+    runpy.run_path(str(FilePath(__file__).parents[1] / "examples" / "depth_camera.py"))
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(",")[0] for line in lines[::3]] == ["1 camera(s)", "2 camera(s)"]
+    assert all("solved" in line for line in lines[::3])
+    assert all(line.startswith("  in the whole scene: ") for line in lines[1::3])
+    assert all(line.startswith("  in simulation: ") for line in lines[2::3])
 
 
 def test_command_without_pybullet(
