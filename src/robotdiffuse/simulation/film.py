@@ -1,8 +1,8 @@
 """Pictures (.png) and films (.gif) of a replay, by PyBullet's software renderer."""
 
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pybullet
@@ -10,14 +10,12 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.paths.export import write_atomically
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.camera import DepthCamera, Light, RawImage, render, take
 from robotdiffuse.simulation.replay import Replay
 from robotdiffuse.simulation.world import World
-
-if TYPE_CHECKING:
-    from PIL.Image import Image as Picture
 
 LIGHT = Light(direction=(0.5, -0.7, 1.6), ambient=0.62, diffuse=0.42, specular=0.04)
 FLOOR_COLORS = ((0xF0, 0xF1, 0xF3), (0xE4, 0xE6, 0xEA))
@@ -92,7 +90,9 @@ def write_png(
         over = (ghost.bodies == world.body) & (ghost.depth < nearest)
         pixels[over] = GHOST * ghost.rgb[over] + (1 - GHOST) * pixels[over]
         nearest = np.where(over, ghost.depth, nearest)
-    _save(Image.fromarray(_reduced(pixels, settings.oversampling)), file)
+    content = BytesIO()
+    Image.fromarray(_reduced(pixels, settings.oversampling)).save(content, "PNG")
+    write_atomically(Path(file), content.getvalue())
 
 
 def write_gif(
@@ -118,14 +118,9 @@ def write_gif(
     palette = strip.quantize(settings.colors, method=Image.Quantize.MEDIANCUT)
     frames = [shot.quantize(palette=palette, dither=Image.Dither.NONE) for shot in shots]
     durations = [10 * delay] * (len(frames) - 1) + [1000]
-    _save(frames[0], file, save_all=True, append_images=frames[1:], duration=durations, loop=0)
-
-
-def _save(image: "Picture", file: str | Path, **options: Any) -> None:
-    try:
-        image.save(file, **options)
-    except OSError as error:
-        raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
+    content = BytesIO()
+    frames[0].save(content, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    write_atomically(Path(file), content.getvalue())
 
 
 def _at(run: Replay, shares: "Float[ndarray, 'n'] | tuple[float, ...]") -> Float[ndarray, "n dof"]:
