@@ -341,6 +341,15 @@ def _map(path: FilePath, array: Any) -> ndarray:
     return np.memmap(file, array.dtype, "r", shape=array.shape)
 
 
+def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> None:
+    """Raises InputError, naming shard and array, if rows are not of the shapes that the manifest says."""
+    for name, array in shard.arrays.items():
+        row = tuple(getattr(manifest, s) if isinstance(s, str) else s for s in ARRAYS[name][1])
+        if array.shape[1:] != row:
+            where = f"shard {shard_path(folder, shard.index)}, array {name}"
+            raise InputError(f"{where} has rows of shape {array.shape[1:]}; the manifest says {row}")
+
+
 def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard:
     """Read a shard and check everything that needs no robot: shapes, types, numbers and fingerprints.
 
@@ -349,12 +358,10 @@ def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard
     shard, path = read_shard(folder, index), shard_path(folder, index)
     if ("times" in shard.arrays) != (manifest.timing == "time"):
         raise InputError(f"shard {path}, array times: it must be there only where timing is time")
+    check_shapes(folder, shard, manifest)
     group, prints = _open(path), {}
     for name, array in shard.arrays.items():
         where = f"shard {path}, array {name}"
-        row = tuple(getattr(manifest, s) if isinstance(s, str) else s for s in ARRAYS[name][1])
-        if array.shape[1:] != row:
-            raise InputError(f"{where} has rows of shape {array.shape[1:]}; the manifest says {row}")
         prints[name] = _array_fingerprint(array)
         if prints[name] != group[name].attrs.get("fingerprint"):
             raise InputError(f"{where} is damaged: its fingerprint is not the one that was written")
