@@ -1,4 +1,4 @@
-"""Checks of a data set: every shard whole, and its motions judged anew, by our judge and by PyBullet on meshes.
+"""Checks of a data set: every shard whole, its motions judged anew, by our judge and by PyBullet on meshes.
 
 Nothing of what the factory said is taken on trust: a problem is rebuilt from its row alone.
 """
@@ -99,7 +99,7 @@ class DataCheck:
     examples: tuple[Finding, ...]
     """The first few of each kind, by shard and row."""
     least_clearance: float
-    """The least recorded distance between arm and obstacles of the motions that were judged [m]; nan if none."""
+    """The least recorded distance between arm and obstacles of the judged motions [m]; nan if none."""
     seconds: float
     """Wall time."""
 
@@ -119,10 +119,11 @@ def check_data(
 ) -> DataCheck:
     """Check the structure of every shard, and `count` random motions (all by default).
 
-    Each motion is judged on a problem that is rebuilt from its row: ends, limits, collision by the judge, and by
-    PyBullet on meshes at and between the frames; and what is recorded of it is compared with what is measured.
-    `robot`: that of the data, by default found by the name in the manifest. The motions and the findings do
-    not depend on `workers` (processes). `progress` is called with the numbers of judged motions and of all.
+    Each motion is judged on a problem that is rebuilt from its row: ends, limits, collision by the judge, and
+    by PyBullet on meshes at and between the frames; and what is recorded of it is compared with what is
+    measured. `robot`: that of the data, by default found by the name in the manifest. The motions and the
+    findings do not depend on `workers` (processes). `progress` is called with the numbers of judged motions
+    and of all.
     Raises InputError if there is no data set, for another robot than that of the data, and if PyBullet is
     wanted but not installed.
     """

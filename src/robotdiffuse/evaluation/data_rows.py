@@ -1,5 +1,7 @@
 """Rows of a data set as problems and motions again."""
 
+from typing import Any
+
 import numpy as np
 
 from robotdiffuse.errors import InputError
@@ -17,13 +19,16 @@ def family_names(manifest: Manifest) -> tuple[str, ...]:
 
 
 def family_settings(manifest: Manifest, family: int) -> RopSettings:
-    """What the scenes of a family were drawn from. Raises InputError for a family that is not in the manifest."""
+    """What the scenes of a family were drawn from. Raises InputError if the manifest has no such family."""
     names = family_names(manifest)
     if not 0 <= family < len(names):
         raise InputError(f"family is {family}; the manifest has {len(names)}: {', '.join(names)}")
-    fields = manifest.families[names[family]]
+    fields: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in manifest.families[names[family]].items()
+    }
     try:
-        return RopSettings(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
+        return RopSettings(**fields)
     except TypeError as error:
         raise InputError(f"families.{names[family]} in the manifest: {error}") from None
 

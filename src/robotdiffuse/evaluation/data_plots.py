@@ -1,0 +1,381 @@
+"""The plots of the page on a data set, as SVG. All need matplotlib, which the core install lacks."""
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.data_report import REASONS, DataColumns, DataSummary
+from robotdiffuse.scenes.sampling import BOX, SPHERE
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Colormap
+    from matplotlib.figure import Figure
+
+INK, SOFT, LINE, FAINT = "#222b38", "#6b7684", "#d9dde2", "#eef0f3"
+START, GOAL = "#4f7fd9", "#10a37f"
+"""As in the replay."""
+FAMILIES = ("#4f7fd9", "#e09a5f", "#8d76c4", "#5aa7a7")
+OUTCOMES = {"solved": "#10a37f", "unsolved": "#d97b5c", "refused": "#c94f4f", "thinned": "#b9c0c9"}
+GRADES = ("#dfe3e8", "#a9c1ec", "#6b95de", "#34599f")
+"""From easy to hard."""
+DETOURS = ((1.05, "up to 5 % longer"), (1.25, "up to 25 %"), (np.inf, "more"))
+WIDTHS = {4: 4.1, 6: 6.25, 12: 12.7}
+"""Of a plot by the columns of the page that it spans [inch]; so text is of one size everywhere."""
+ABOVE: dict[str, Any] = {
+    "loc": "lower left",
+    "bbox_to_anchor": (0.0, 0.98),
+    "ncols": 4,
+    "columnspacing": 1.2,
+    "handletextpad": 0.5,
+    "borderpad": 0.0,
+    "borderaxespad": 0.3,
+}
+"""Where legends are."""
+BINS = 50
+TAIL = 0.995
+"""Histograms end at this quantile; what is beyond is in the last bar."""
+POINTS_PER_OBSTACLE = 64
+MOST_OBSTACLES = 20_000
+MOST_TIPS = 2_500
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """One look for all plots. Raises InputError if matplotlib is missing."""
+    try:
+        import matplotlib
+    except ImportError:
+        raise InputError(
+            'the page needs matplotlib, which is not installed: pip install "robotdiffuse[data]"'
+        ) from None
+    look: dict[Any, Any] = {
+        "svg.fonttype": "none",
+        "svg.hashsalt": "robotdiffuse",
+        "font.size": 8.0,
+        "text.color": INK,
+        "axes.edgecolor": LINE,
+        "axes.labelcolor": SOFT,
+        "axes.labelsize": 8.0,
+        "axes.titlesize": 8.5,
+        "axes.titlecolor": INK,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.axisbelow": True,
+        "xtick.color": LINE,
+        "ytick.color": LINE,
+        "xtick.labelcolor": SOFT,
+        "ytick.labelcolor": SOFT,
+        "xtick.labelsize": 7.5,
+        "ytick.labelsize": 7.5,
+        "xtick.major.size": 3.0,
+        "ytick.major.size": 0.0,
+        "legend.frameon": False,
+        "legend.fontsize": 7.5,
+        "legend.handlelength": 0.9,
+        "legend.handleheight": 0.9,
+        "figure.constrained_layout.use": True,
+    }
+    with matplotlib.rc_context(look):
+        yield
+
+
+def _figure(width: int, height: float) -> "Figure":
+    from matplotlib.figure import Figure
+
+    return Figure((WIDTHS[width], height))
+
+
+def _svg(figure: "Figure") -> str:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", transparent=True, dpi=220, metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def outcomes(summary: DataSummary) -> str:
+    """Bars of what became of the problems."""
+    figure = _figure(4, 2.3)
+    axes = figure.subplots()
+    tried = max(1, summary.counts.get("tried", 0))
+    values = [summary.counts.get(name, 0) for name in REASONS]
+    axes.barh(REASONS, values, color=[OUTCOMES[name] for name in REASONS], height=0.62)
+    for i, value in enumerate(values):
+        axes.text(value + 0.015 * tried, i, f"{value:,}  ({100 * value / tried:.1f} %)", va="center")
+    axes.set_xlim(0, 1.42 * max(1, *values))
+    axes.invert_yaxis()
+    axes.spines[["bottom"]].set_visible(False)
+    axes.set_xticks([])
+    axes.tick_params(axis="y", labelsize=8.5, labelcolor=INK)
+    return _svg(figure)
+
+
+def lengths(columns: DataColumns) -> str:
+    """Histogram of the path lengths by family."""
+    figure = _figure(4, 2.3)
+    axes = figure.subplots()
+    values = columns.all["cost"]
+    _histogram(axes, columns, values, np.linspace(0, _end(values), BINS))
+    axes.set_xlabel("length [rad]")
+    return _svg(figure)
+
+
+def clearances(columns: DataColumns, safety_distance: float) -> str:
+    """Histogram of the clearances by family, with the safety distance marked."""
+    figure = _figure(4, 2.3)
+    axes = figure.subplots()
+    values = 100 * columns.all["clearance"]
+    _histogram(axes, columns, values, np.linspace(0, max(_end(values), 120 * safety_distance), BINS))
+    axes.axvline(100 * safety_distance, color=INK, linewidth=1, linestyle=(0, (3, 2)))
+    place = axes.get_xaxis_transform()
+    axes.text(100 * safety_distance + 0.15, 0.8, "safety\ndistance", transform=place, fontsize=7.5)
+    axes.set_xlabel("clearance [cm]")
+    return _svg(figure)
+
+
+def detours(columns: DataColumns) -> str:
+    """Histogram of the detours, on a logarithmic scale, of motions whose straight line is not free."""
+    figure = _figure(4, 2.3)
+    axes = figure.subplots()
+    blocked = ~columns.all["line_free"]
+    values = columns.all["detour"]
+    end = max(1.5, _end(values[blocked])) if blocked.any() else 2.0
+    _histogram(axes, columns, values, np.linspace(1, end, BINS), blocked)
+    axes.set_yscale("log")
+    _percent(axes)
+    axes.set_xlabel("length / straight line")
+    return _svg(figure)
+
+
+def difficulty(columns: DataColumns) -> str:
+    """Shares by detour and by narrowest clearance, a bar for each family."""
+    rows = columns.all
+    free, detour, clearance = rows["line_free"], rows["detour"], 100 * rows["clearance"]
+    low = [(~free) & (detour <= edge) for edge, _ in DETOURS]
+    by_detour = [free, low[0], low[1] & ~low[0], low[2] & ~low[1]]
+    edges = (np.inf, 5.0, 2.0, 1.0)
+    by_clearance = [
+        (clearance < high) & (clearance >= lowest)
+        for high, lowest in zip(edges, (*edges[1:], -np.inf), strict=True)
+    ]
+    figure = _figure(4, 2.3)
+    top, bottom = figure.subplots(2, 1)
+    _shares(top, columns, by_detour, ("line free", *(text for _, text in DETOURS)))
+    _shares(bottom, columns, by_clearance, ("over 5 cm", "2 to 5", "1 to 2", "below 1"))
+    return _svg(figure)
+
+
+def goals(columns: DataColumns) -> str:
+    """Numbers of goals that are given and reached, and the excess cost of those that are not the best."""
+    costs = columns.sample["goal_costs"].astype(np.float64)
+    given, reached = (~np.isnan(costs)).sum(axis=1), np.isfinite(costs).sum(axis=1)
+    figure = _figure(4, 2.3)
+    left, right = figure.subplots(1, 2)
+    most = costs.shape[1]
+    at = np.arange(1, most + 1)
+    shares = [100 * np.bincount(n, minlength=most + 1)[1:] / len(costs) for n in (given, reached)]
+    left.bar(at - 0.2, shares[0], 0.4, color="#c3cad3", label="given")
+    left.bar(at + 0.2, shares[1], 0.4, color=GOAL, label="reached")
+    left.set_xlabel("goals")
+    left.set_xticks([1, *range(5, most + 1, 5)])
+    left.legend(**ABOVE)
+    _percent(left)
+    best = np.nanmin(np.where(np.isinf(costs), np.nan, costs), axis=1, keepdims=True)
+    excess = 100 * (costs / best - 1)
+    others = excess[np.isfinite(costs) & (excess > 0)]
+    if len(others):
+        bins = np.linspace(0, float(np.quantile(others, 0.98)), 30)
+        weights = np.full(len(others), 100 / len(others))
+        right.hist(others.clip(0, bins[-1]), bins, weights=weights, color=GOAL, alpha=0.85)
+    right.set_xlabel("excess cost of the others [%]")
+    right.set_xlim(left=0)
+    _percent(right)
+    return _svg(figure)
+
+
+def joints(columns: DataColumns) -> str:
+    """A histogram for each joint between its limits: all frames, and the ends."""
+    manifest, q = columns.manifest, columns.sample["trajectories"]
+    columns_of_panels = min(7, manifest.dof)
+    rows = -(-manifest.dof // columns_of_panels)
+    figure = _figure(12, 1.95 * rows)
+    panels = figure.subplots(rows, columns_of_panels, squeeze=False).reshape(-1)
+    for panel in panels[manifest.dof :]:
+        panel.set_axis_off()
+    for j, panel in enumerate(panels[: manifest.dof]):
+        low, high = manifest.lower[j], manifest.upper[j]
+        bins = np.linspace(low, high, 41)
+        panel.hist(q[..., j].reshape(-1), bins, density=True, color="#ccd4de", label="all frames")
+        for values, color, label in ((q[:, 0, j], START, "start"), (q[:, -1, j], GOAL, "goal")):
+            panel.hist(
+                values, bins[::2], density=True, histtype="step", color=color, linewidth=1.3, label=label
+            )
+        margin = 0.06 * (high - low)
+        panel.set_xlim(low - margin, high + margin)
+        for limit, side in ((low, -1), (high, 1)):
+            panel.axvspan(limit, limit + side * margin, color="#f3dcd3", linewidth=0)
+        panel.set_xticks([low, high], [f"{low:.2f}", f"{high:.2f}"])
+        panel.set_title(manifest.joint_names[j])
+        panel.set_yticks([])
+        panel.spines[["left"]].set_visible(False)
+        panel.set_xlabel("[rad]", labelpad=1)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3)
+    return _svg(figure)
+
+
+def obstacles(columns: DataColumns) -> str:
+    """Density of the obstacles' volume, seen from above and from the side."""
+    points = _obstacle_points(columns)
+    reach = max(1.0, 1.05 * float(np.abs(points).max(initial=0.0)))
+    figure = _figure(6, 3.0)
+    for axes, (name, across) in zip(_views(figure), (("top", 1), ("side", 2)), strict=True):
+        low, high = (-reach, reach) if across == 1 else (0.0, 1.25 * reach)
+        cells = [64, round(64 * (high - low) / (2 * reach))]
+        counts, *_ = np.histogram2d(points[:, 0], points[:, across], cells, [[-reach, reach], [low, high]])
+        axes.imshow(
+            counts.T / max(1.0, counts.max()),
+            origin="lower",
+            extent=(-reach, reach, low, high),
+            cmap=_ramp(),
+            interpolation="bicubic",
+        )
+        _finish_view(axes, name, across)
+    return _svg(figure)
+
+
+def tips(positions: dict[str, Float[ndarray, "n 3"]]) -> str:
+    """Where the tip is at both ends, seen from above and from the side."""
+    figure = _figure(6, 3.0)
+    reach = 1.05 * max(0.2, *(float(np.abs(p).max(initial=0.0)) for p in positions.values()))
+    for axes, (name, across) in zip(_views(figure), (("top", 1), ("side", 2)), strict=True):
+        for (end, points), color in zip(positions.items(), (START, GOAL), strict=True):
+            few = points[:: -(-len(points) // MOST_TIPS)] if len(points) else points
+            size = 3.0 if len(few) > 800 else 6.0
+            axes.scatter(
+                few[:, 0], few[:, across], size, color, alpha=0.45, linewidths=0, label=end, rasterized=True
+            )
+        axes.set_xlim(-reach, reach)
+        axes.set_ylim(*((-reach, reach) if across == 1 else (0, 1.25 * reach)))
+        axes.set_aspect("equal")
+        _finish_view(axes, name, across)
+        if across == 1:
+            axes.legend(loc="upper left", handletextpad=0.2, markerscale=2, borderpad=0)
+    return _svg(figure)
+
+
+def _views(figure: "Figure") -> tuple["Axes", "Axes"]:
+    top, side = figure.subplots(1, 2)
+    return top, side
+
+
+def _finish_view(axes: "Axes", name: str, across: int) -> None:
+    from matplotlib.ticker import MultipleLocator
+
+    axes.set_anchor("S")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MultipleLocator(0.5))
+    axes.plot(0, 0, "+", color=INK, markersize=8, markeredgewidth=1.2, clip_on=False)
+    axes.set_title(f"from the {name}")
+    axes.set_xlabel("x [m]")
+    axes.set_ylabel("y [m]" if across == 1 else "z [m]")
+
+
+def _ramp() -> "Colormap":
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("obstacles", ["#ffffff", "#f3d3bd", "#d97b5c", "#7f3a2b"])
+
+
+def _obstacle_points(columns: DataColumns) -> Float[ndarray, "n 3"]:
+    """Points spread evenly in the obstacles, as many in each; turned cubes are taken as if they were not."""
+    kinds, params = columns.sample["obstacle_kinds"], columns.sample["obstacle_params"]
+    rows = params[kinds > 0].astype(np.float64)
+    kinds = kinds[kinds > 0]
+    step = max(1, -(-len(rows) // MOST_OBSTACLES))
+    rows, kinds = rows[::step], kinds[::step]
+    cube = np.random.default_rng(0).uniform(-1, 1, (8 * POINTS_PER_OBSTACLE, 3))
+    ball = cube[np.linalg.norm(cube, axis=1) <= 1][:POINTS_PER_OBSTACLE]
+    spheres, boxes = rows[kinds == SPHERE], rows[kinds == BOX]
+    return np.concatenate(
+        [
+            (spheres[:, None, :3] + spheres[:, None, 3:4] * ball).reshape(-1, 3),
+            (boxes[:, None, :3] + boxes[:, None, 3:6] / 2 * cube[:POINTS_PER_OBSTACLE]).reshape(-1, 3),
+        ]
+    )
+
+
+def _present(columns: DataColumns) -> list[tuple[str, str, ndarray]]:
+    """Name, colour and rows of the families that occur."""
+    return [
+        (name, FAMILIES[i % len(FAMILIES)], columns.all["family"] == i)
+        for i, name in enumerate(columns.manifest.families)
+        if (columns.all["family"] == i).any()
+    ]
+
+
+def _end(values: Float[ndarray, "n"]) -> float:
+    return float(max(np.quantile(values, TAIL), 1e-3))
+
+
+def _histogram(
+    axes: "Axes",
+    columns: DataColumns,
+    values: Float[ndarray, "n"],
+    bins: Float[ndarray, "b"],
+    chosen: ndarray | None = None,
+) -> None:
+    """Stacked by family, in percent of all that is shown; what is out of the bins is in the last ones."""
+    chosen = np.ones(len(values), bool) if chosen is None else chosen
+    families = _present(columns)
+    parts = [values[rows & chosen].clip(bins[0], bins[-1]) for _, _, rows in families]
+    weights = [np.full(len(part), 100 / max(1, chosen.sum())) for part in parts]
+    colors, labels = [color for _, color, _ in families], [name for name, _, _ in families]
+    axes.hist(parts, bins.tolist(), weights=weights, stacked=True, color=colors, label=labels)
+    axes.set_xlim(bins[0], bins[-1])
+    _percent(axes)
+    if len(families) > 1:
+        axes.legend(**ABOVE)
+
+
+def _percent(axes: "Axes") -> None:
+    from matplotlib.ticker import FuncFormatter
+
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} %"))
+    axes.grid(axis="y", color=FAINT, linewidth=0.8)
+    axes.spines[["left"]].set_visible(False)
+
+
+def _shares(axes: "Axes", columns: DataColumns, classes: list[ndarray], labels: tuple[str, ...]) -> None:
+    """A bar of 100 % for each family, cut by classes."""
+    families = _present(columns)
+    left = np.zeros(len(families))
+    names = [name for name, _, _ in families]
+    for chosen, color, label in zip(classes, GRADES, labels, strict=True):
+        shares = np.array([100 * chosen[rows].mean() for _, _, rows in families])
+        axes.barh(names, shares, left=left, color=color, height=0.62, label=label)
+        for i, share in enumerate(shares):
+            if share >= 9:
+                dark = color in GRADES[2:]
+                axes.text(
+                    left[i] + share / 2,
+                    i,
+                    f"{share:.0f} %",
+                    ha="center",
+                    va="center",
+                    fontsize=7.5,
+                    color="white" if dark else INK,
+                )
+        left += shares
+    axes.set_xlim(0, 100)
+    axes.invert_yaxis()
+    axes.set_xticks([])
+    axes.spines[["bottom", "left"]].set_visible(False)
+    axes.tick_params(axis="y", labelcolor=INK)
+    axes.legend(**ABOVE)
