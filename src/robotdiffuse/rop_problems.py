@@ -46,6 +46,19 @@ def sample_problem(robot: Robot, settings: RopSettings, rng: Generator) -> Probl
     )
 
 
+def free_configuration(
+    robot: Robot, settings: RopSettings, checker: CollisionChecker, rng: Generator
+) -> Float[ndarray, "dof"] | None:
+    """A configuration by the rule of `sample_problem`; None if a number of draws found none."""
+    for _ in range(BATCHES):
+        q = rng.uniform(robot.lower, robot.upper, (BATCH, robot.dof))
+        q = q[tip_in_region(robot, settings, q)]
+        q = q[checker.free(q)] if len(q) else q
+        if len(q):
+            return q[0]
+    return None
+
+
 def base_spheres(robot: Robot) -> Float[ndarray, "m 4"]:
     """Collision spheres, x y z radius, of the links that no planned joint moves, in the base frame [m]."""
     parts = [np.zeros((0, 4))]

@@ -39,3 +39,22 @@ def assignment(text: str) -> tuple[str, float]:
     if not name or not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=NUMBER")
     return name, value
+
+
+def not_negative(text: str) -> float:
+    """A finite number of at least 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
+    return value
+
+
+def share(text: str) -> float:
+    """A number from 0 to 1."""
+    value = not_negative(text)
+    if value > 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not between 0 and 1")
+    return value

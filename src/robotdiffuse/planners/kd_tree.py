@@ -1,7 +1,7 @@
 """A compiled k-d tree that grows by one point at a time: the near neighbours of the sampling planners.
 
-J. L. Bentley, "Multidimensional binary search trees used for associative searching", CACM 1975, with buckets at
-the leaves; a query descends nearest side first and keeps the exact distance to each cell (S. Arya and
+J. L. Bentley, "Multidimensional binary search trees used for associative searching", CACM 1975, with buckets
+at the leaves; a query descends nearest side first and keeps the exact distance to each cell (S. Arya and
 D. Mount, "Algorithms for fast vector quantization", DCC 1993).
 """
 
@@ -110,7 +110,10 @@ def _split(tree, points, cell):
         tree.bucket[cell, k] = moved
     # the middle, moved to a place where neighbours differ
     middle = BUCKET // 2
-    while middle < BUCKET and points[tree.bucket[cell, middle], axis] <= points[tree.bucket[cell, middle - 1], axis]:
+    while (
+        middle < BUCKET
+        and points[tree.bucket[cell, middle], axis] <= points[tree.bucket[cell, middle - 1], axis]
+    ):
         middle += 1
     if middle == BUCKET:
         middle = BUCKET // 2

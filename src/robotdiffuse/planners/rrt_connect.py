@@ -53,7 +53,7 @@ def search_space(
     checker: CollisionChecker,
     resolution: float,
     padding: float = 0.0,
-    near_ends: Float[ndarray, "m dof+1"] | None = None,
+    near_ends: Float[ndarray, "m columns"] | None = None,
 ) -> kernel.Space:
     """What the compiled search needs; `resolution`, `padding` [m] and `near_ends` as in its docstring."""
     robot = checker.robot

@@ -14,7 +14,7 @@ from numba import njit
 from robotdiffuse.collision.compiled import allocation_free
 from robotdiffuse.collision.lanes import W, block_hits, make_workspace
 
-_ONE = np.float32(1.0)
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 RELAXATION_SLOPE = np.float32(0.1)
 """How the padding grows with the distance from an end that is closer to the scene [m/rad]."""
 RELAXATION_STEP = np.float32(0.1)
@@ -81,11 +81,12 @@ def motion_free(space, a, b, block, work):
         return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, block, work)
     length = distance(a, b)
     pieces = max(int(np.ceil(length / RELAXATION_STEP)), 1)
-    first, first_padding = 0, padding_at(space, a, b, np.float32(0.5) / np.float32(pieces))
+    half = np.float32(0.5) * length / np.float32(pieces)
+    first, first_padding = 0, padding_near(space, a, b, np.float32(0.5) / np.float32(pieces), half)
     for k in range(1, pieces + 1):
         padding = np.float32(-1.0)
         if k < pieces:
-            padding = padding_at(space, a, b, (np.float32(k) + np.float32(0.5)) / np.float32(pieces))
+            padding = padding_near(space, a, b, (np.float32(k) + np.float32(0.5)) / np.float32(pieces), half)
         if padding != first_padding:
             s, t = np.float32(first) / np.float32(pieces), np.float32(k) / np.float32(pieces)
             if not _stretch_free(space, a, b, s, t, first_padding, block, work):
@@ -95,16 +96,18 @@ def motion_free(space, a, b, block, work):
 
 
 @allocation_free()
-def padding_at(space, a, b, share):
-    """The padding asked for at a share of the way from a to b: near an end that is closer to the scene, what
-    that end allows and RELAXATION_SLOPE more for each radian away from it."""
+def padding_near(space, a, b, share, around):
+    """The padding asked for within `around` [rad] of the place at a share of the way from a to b: near an end
+    that is closer to the scene, what that end allows and RELAXATION_SLOPE more for each radian from it."""
     padding, dof = space.padding, len(a)
     for m in range(len(space.near_ends)):
         total = np.float32(0.0)
         for j in range(dof):
             d = a[j] + share * (b[j] - a[j]) - space.near_ends[m, j]
             total += d * d
-        padding = min(padding, space.near_ends[m, dof] + RELAXATION_SLOPE * np.sqrt(total))
+        padding = min(
+            padding, space.near_ends[m, dof] + RELAXATION_SLOPE * max(np.sqrt(total) - around, _ZERO)
+        )
     return padding
 
 

@@ -1,24 +1,24 @@
-"""Shared-Tree Informed RRT*, the planner that makes the paper's data: one tree, many goals, a safety distance.
+"""Shared-Tree Informed RRT*, the paper's planner for data: one tree, many goals, a safety distance.
 
 What is in the paper's section on data sets, and where it is here:
 
-- *Shared spanning tree*: one tree from the start is searched towards all goal configurations of a target pose at
-  once; every goal keeps its own best cost, the cheapest one is returned. Goals are not taken in turn, as in the
-  authors' code, but drawn by promise (`kernel.draw_goal`).
+- *Shared spanning tree*: one tree from the start is searched towards all goal configurations of a target
+  pose at once; every goal keeps its own best cost, the cheapest one is returned. Goals are not taken in
+  turn, as in the authors' code, but drawn by promise (`kernel.draw_goal`).
 - *Informed*: samples come from the prolate hyperspheroid of the drawn goal (`kernel.sample_hyperspheroid`;
   J. Gammell et al., IROS 2014). The authors reject uniform samples instead.
-- *RRT\\**: choose-parent and rewiring among the k nearest nodes, k = e (1 + 1/d) ln n, which asymptotic optimality
-  needs (S. Karaman and E. Frazzoli, IJRR 2011; `kernel.add_node`). The authors rewire within a fixed radius of 1.2
-  and have choose-parent commented out. Neighbours come from a k-d tree.
-- *Node security defence*: nodes and edges keep a safety distance to obstacles; near a start or goal that is itself
-  closer it is relaxed in steps (`rrt_connect_kernel.padding_at`), and where no path is found the whole distance is
-  lowered stepwise. The authors enlarge the obstacles by 5 cm. What was kept is recorded.
-- *Cost*: joint-space length. The authors' is that of the end effector plus a little for orientation, which makes
-  detours of the joints cheap.
+- *RRT\\**: choose-parent and rewiring among the k nearest nodes, k = e (1 + 1/d) ln n, which asymptotic
+  optimality needs (S. Karaman and E. Frazzoli, IJRR 2011; `kernel.add_node`). The authors rewire within a
+  fixed radius of 1.2 and have choose-parent commented out. Neighbours come from a k-d tree.
+- *Node security defence*: nodes and edges keep a safety distance to obstacles; near a start or goal that is
+  itself closer it is relaxed in steps (`rrt_connect_kernel.padding_near`), and where no path is found the
+  whole distance is lowered stepwise. The authors enlarge the obstacles by 5 cm. What was kept is recorded.
+- *Cost*: joint-space length. The authors' is that of the end effector plus a little for orientation, which
+  makes detours of the joints cheap.
 
-Beyond the paper, because it brings the cost down within milliseconds: each round also asks RRT-Connect for one
-path, shortens it, and grafts it onto the tree if it is the shortest to its goal, and shortens the best path; so the
-hyperspheroids shrink early. Both only add branches, so the tree stays one of RRT*.
+Beyond the paper, because it brings the cost down within milliseconds: each round also asks RRT-Connect for
+one path, shortens it, and grafts it onto the tree if it is the shortest to its goal, and shortens the best
+path; so the hyperspheroids shrink early. Both only add branches, so the tree stays one of RRT*.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ from robotdiffuse.planners.rrt_connect import Ends, random_state, search_space
 from robotdiffuse.problem import Problem
 from robotdiffuse.types import PlanResult
 
-END_MARGIN = 0.001
+END_MARGIN = 0.0005
 """What an end that is closer than the safety distance keeps less than it has [m]."""
 
 
@@ -45,9 +45,10 @@ END_MARGIN = 0.001
 class SharedTreeSettings:
     safety_distance: float = 0.05
     """Distance to obstacles that nodes and edges keep [m]; the default is what the authors' scenes imply."""
-    levels: int = 5
-    """Steps in which the safety distance is lowered to zero where no path is found."""
-    level_rounds: int = 4
+    steps: int = 5
+    """Steps in which the safety distance is lowered to zero where no path is found; one more is what the
+    start has, and one what the goal farthest from obstacles has."""
+    step_rounds: int = 4
     """Rounds without a path before it is lowered."""
     reach: float = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
@@ -64,7 +65,7 @@ class SharedTreeSettings:
     rounds: int = 100_000
     """Most rounds."""
     improvement: float = 0.005
-    """The search ends when the best cost fell by less than this share in the last `patience` rounds; 0: never."""
+    """The search ends when the best cost fell by less than this share in `patience` rounds; 0: never."""
     patience: int = 20
     """See `improvement`."""
     capacity: int = 2_000
@@ -72,10 +73,10 @@ class SharedTreeSettings:
 
     def __post_init__(self) -> None:
         for name in ("reach", "resolution", "growth", "connect_iterations", "rounds", "patience", "capacity",
-                     "level_rounds"):  # fmt: skip
+                     "step_rounds"):  # fmt: skip
             if not getattr(self, name) > 0:
                 raise InputError(f"shared_tree_rrt_star.{name} is {getattr(self, name)}; it must be positive")
-        for name in ("safety_distance", "levels", "shortcuts", "improvement"):
+        for name in ("safety_distance", "steps", "shortcuts", "improvement"):
             if getattr(self, name) < 0:
                 raise InputError(
                     f"shared_tree_rrt_star.{name} is {getattr(self, name)}; it must not be negative"
@@ -87,7 +88,7 @@ class SharedTreeSettings:
 
 
 class SharedTreeSearch:
-    """One search: ends, tree and what was found so far. Same state, same search, however long it may take."""
+    """One search: ends, tree, and what was found so far. The same state gives the same search."""
 
     def __init__(
         self,
@@ -105,8 +106,9 @@ class SharedTreeSearch:
         self._tree = kernel.make_tree(self.start, self.goals, settings.capacity + len(goals))
         self.costs: list[float] = []
         """The best cost after each round [rad], infinite while there is no path."""
-        self._level = settings.levels
-        self._enter_level()
+        self._distances = self._safety_distances()
+        self._step = 0
+        self._enter_step()
 
     @property
     def cost(self) -> float:
@@ -134,7 +136,7 @@ class SharedTreeSearch:
 
     @property
     def finished(self) -> bool:
-        """Whether the settings say that it is enough: no path can be shorter, or it hardly improves any more."""
+        """Whether it is enough by the settings: no path can be shorter, or it hardly improves any more."""
         settings, costs = self.settings, self.costs
         if self.cost < np.inf:
             if not any(kernel.goal_is_open(self._tree, g, self.cost) for g in range(len(self.goals))):
@@ -143,7 +145,7 @@ class SharedTreeSearch:
                 before = costs[-1 - settings.patience]
                 if before < np.inf and before - costs[-1] < settings.improvement * before:
                     return True
-        elif self._level == 0 and self._rounds_at_level >= 3 * settings.level_rounds:
+        elif self._step == len(self._distances) - 1 and self._rounds_at_step >= 3 * settings.step_rounds:
             # nothing at any distance: three times the usual number of rounds, then it is given up
             return settings.improvement > 0
         return len(costs) >= settings.rounds
@@ -164,21 +166,28 @@ class SharedTreeSearch:
             if path is not None:
                 self._graft(path, self.best_goal)
         self.costs.append(self.cost)
-        self._rounds_at_level += 1
-        if self.best_goal < 0 and self._level > 0 and self._rounds_at_level >= settings.level_rounds:
-            self._level -= 1
-            self._enter_level()
+        self._rounds_at_step += 1
+        last = self._step == len(self._distances) - 1
+        if self.best_goal < 0 and not last and self._rounds_at_step >= settings.step_rounds:
+            self._step += 1
+            self._enter_step()
 
-    def _enter_level(self) -> None:
-        """Set the safety distance of the level; what the tree holds stays valid, as distances only fall."""
-        settings = self.settings
-        self.safety_distance = settings.safety_distance * self._level / max(settings.levels, 1)
+    def _safety_distances(self) -> list[float]:
+        """What is tried, falling [m]."""
+        most, steps = self.settings.safety_distance, max(self.settings.steps, 1)
+        ends = (self._clearances[0], self._clearances[1:].max())
+        between = {max(float(distance) - END_MARGIN, 0.0) for distance in ends if distance < most}
+        return sorted({most * step / steps for step in range(steps + 1)} | between, reverse=True)
+
+    def _enter_step(self) -> None:
+        """Set the safety distance of the step; what the tree holds stays valid, as distances only fall."""
+        self.safety_distance = self._distances[self._step]
         """Distance to obstacles that is kept but near ends that are closer themselves [m]."""
-        self._rounds_at_level = 0
+        self._rounds_at_step = 0
         close = self._clearances < self.safety_distance
         allowed = np.maximum(self._clearances[close] - END_MARGIN, 0.0)
         near_ends = np.column_stack([self._ends[close], allowed])
-        self._space = search_space(self.checker, settings.resolution, self.safety_distance, near_ends)
+        self._space = search_space(self.checker, self.settings.resolution, self.safety_distance, near_ends)
         for g, goal in enumerate(self.goals):
             line = np.stack([self.start, goal])
             if connect.motions_free(self._space, line)[0]:
@@ -253,6 +262,6 @@ class SharedTreeRRTStar:
 def _reason(search: SharedTreeSearch) -> str:
     reached = int(np.isfinite(search.goal_costs).sum())
     return (
-        f"solved by {SharedTreeRRTStar.name}: {len(search.costs)} rounds, {reached} of {len(search.goals)} goals "
-        f"reached, {100 * search.safety_distance:.0f} cm of safety distance kept away from the ends"
+        f"solved by {SharedTreeRRTStar.name}: {len(search.costs)} rounds, {reached} of {len(search.goals)} "
+        f"goals reached, {100 * search.safety_distance:.0f} cm of safety distance kept away from the ends"
     )

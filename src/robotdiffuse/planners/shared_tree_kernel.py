@@ -13,7 +13,7 @@ from robotdiffuse.planners.rrt_connect_kernel import distance, motion_free, path
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _INFINITY = np.float32(np.inf)
 NEIGHBOURS = 64
-"""Most near neighbours that are looked at; e (1 + 1 / dof) ln n stays below it for 10^8 nodes in 7 dimensions."""
+"""Most near neighbours that are looked at; e (1 + 1 / dof) ln n is below it up to 10^8 nodes of 7 joints."""
 GAIN = np.float32(1e-4)
 """Costs must fall by more than this share to count: less is rounding."""
 PESSIMISM = np.float32(0.5)
@@ -123,9 +123,9 @@ def goal_is_open(tree, g, best):
 def draw_goal(tree, state):
     """A goal drawn by its promise; -1 if no path can be shortened.
 
-    Promise: by how much the best path would fall if the goal's own path lost its hoped-for share of the excess
-    over the straight line; while no goal is reached, nearness. Searches for the goal alone that found nothing
-    lower it.
+    Promise: by how much the best path would fall if the goal's own path lost its hoped-for share of the
+    excess over the straight line; while no goal is reached, nearness. Searches for the goal alone that found
+    nothing lower it.
     """
     best = best_cost(tree)
     total, chosen = _ZERO, -1
@@ -294,8 +294,8 @@ def _neighbour_count(size, dof):
 
 @allocation_free()
 def add_node(space, tree, q, scratch):
-    """RRT*'s extension to q: the cheapest free way from the near nodes, then those near nodes that are reached
-    more cheaply through q are hung under it. Returns the node, or -1 if q is of no use or cannot be reached."""
+    """RRT*'s extension to q: the cheapest free way from the near nodes; then those near nodes that q reaches
+    more cheaply are hung under it. Returns the node; -1 if q is of no use or cannot be reached."""
     near, best = scratch.near, best_cost(tree)
     count = kd_tree.query(tree.near, tree.nodes, q, _neighbour_count(tree.size[0], len(q)), near)
     remaining = _remaining(tree, q, best)

@@ -78,6 +78,14 @@ ROP_DENSE = RopSettings(obstacles=(3, 12), sphere_radius=(0.08, 0.2), cube_side=
 """More and smaller obstacles of varied size: about half of these problems are not trivial."""
 
 
+def floor_box(settings: RopSettings) -> Box | None:
+    """The floor of the scenes, with its top at z = 0; None if they have none."""
+    if not settings.floor:
+        return None
+    size = (settings.floor_size, settings.floor_size, settings.floor_thickness)
+    return Box((0.0, 0.0, -settings.floor_thickness / 2), size, name="floor")
+
+
 def sample_scene(
     settings: RopSettings, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None
 ) -> Scene:
@@ -87,10 +95,8 @@ def sample_scene(
     (see `base_spheres`), as no robot could stand inside an obstacle. The floor is not held against them.
     Raises InputError if the settings leave no place for an obstacle.
     """
-    shapes: list[Shape] = []
-    if settings.floor:
-        size = (settings.floor_size, settings.floor_size, settings.floor_thickness)
-        shapes.append(Box((0.0, 0.0, -settings.floor_thickness / 2), size, name="floor"))
+    floor = floor_box(settings)
+    shapes: list[Shape] = [] if floor is None else [floor]
     low, high = settings.obstacles
     for _ in range(int(rng.integers(low, high + 1))):
         for _ in range(MAX_TRIES):

@@ -1,0 +1,96 @@
+"""robotdiffuse data generate"""
+
+import argparse
+import os
+
+from robotdiffuse.cli.arguments import count, natural, not_negative, share
+
+
+def add_generate(actions: argparse._SubParsersAction) -> None:
+    parser = actions.add_parser(
+        "generate",
+        help="plan many random problems",
+        description="Solve many random problems by Shared-Tree Informed RRT*, and keep what the judge passes "
+        "in shards. Ctrl-C or a crash loses at most the shards in hand; the same command goes on.",
+    )
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")
+    parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF (default: panda)")
+    parser.add_argument("--trajectories", type=count, metavar="N", help="motions to make (default: 140000)")
+    parser.add_argument("--seed", type=natural, metavar="N", help="random seed (default: 0)")
+    parser.add_argument("--dense-share", type=share, metavar="P", help="share of rop_dense (default: 0)")
+    parser.add_argument(
+        "--trivial-share",
+        type=share,
+        metavar="P",
+        help="share to keep of what the straight line solves (default: 1, the paper's)",
+    )
+    parser.add_argument("--target", metavar="KIND", help="position (default) or pose of the tip")
+    parser.add_argument("--frames", type=count, metavar="N", help="frames of a motion (default: 254)")
+    parser.add_argument(
+        "--timing", metavar="KIND", help="frames even in arc length (arc, default) or in time"
+    )
+    parser.add_argument(
+        "--safety-distance", type=not_negative, metavar="M", help="to obstacles [m] (default: 0.05)"
+    )
+    parser.add_argument("--shard", type=count, metavar="N", help="motions in a shard (default: 500)")
+    parser.add_argument(
+        "--workers",
+        type=count,
+        default=os.cpu_count() or 1,
+        metavar="N",
+        help="processes (default: all cores)",
+    )
+    parser.add_argument("--cluster", metavar="NAME", help="ray: on the cluster that RAY_ADDRESS names")
+    parser.set_defaults(run=run_generate)
+
+
+SETTINGS = (
+    "robot",
+    "trajectories",
+    "seed",
+    "dense_share",
+    "trivial_share",
+    "target",
+    "frames",
+    "timing",
+    "shard",
+)
+
+
+def run_generate(arguments: argparse.Namespace) -> int:
+    from dataclasses import replace
+    from pathlib import Path
+
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from robotdiffuse.generation import GenerationSettings, generate
+
+    given = {name: getattr(arguments, name) for name in SETTINGS if getattr(arguments, name) is not None}
+    settings = GenerationSettings(**given)
+    if arguments.safety_distance is not None:
+        search = replace(settings.search, safety_distance=arguments.safety_distance)
+        settings = replace(settings, search=search)
+    console = Console(stderr=True)
+    columns = (
+        *Progress.get_default_columns()[:2],
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("trajectories", rate="", total=settings.trajectories)
+        first: list[int] = []
+
+        def show(done: int, _total: int) -> None:
+            if not first:
+                first.append(done)
+                bar.reset(task, completed=done)
+            elapsed = bar.tasks[0].elapsed or 0.0
+            rate = f"{(done - first[0]) / elapsed:.0f}/s" if done > first[0] and elapsed > 0 else ""
+            bar.update(task, completed=done, rate=rate)
+
+        made = generate(settings, Path(arguments.out), arguments.workers, arguments.cluster, show)
+    print(f"{made:,} trajectories of {settings.frames} frames in {arguments.out}")
+    return 0

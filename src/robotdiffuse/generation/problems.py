@@ -1,0 +1,109 @@
+"""Random problems as in the paper: a scene, a start, a target of the tip, goals by inverse kinematics."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float32
+from numpy import ndarray
+from numpy.random import Generator
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError
+from robotdiffuse.generation.settings import FAMILIES, GenerationSettings
+from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.rop_problems import base_spheres, free_configuration
+from robotdiffuse.scenes.rop import RopSettings, sample_scene
+from robotdiffuse.scenes.scene import Scene
+
+SCENES = 100
+"""Scenes given up, for want of a start or of a goal, before the settings are called impossible."""
+POSITION_ONLY = InverseKinematicsSettings(position_only=True)
+
+
+@dataclass(frozen=True, eq=False)
+class TargetProblem:
+    """A problem whose goals all bring the tip to one target."""
+
+    family: int
+    """In the order of FAMILIES."""
+    scene: Scene
+    """The floor first, if the family has one."""
+    start: Float32[ndarray, "dof"]
+    goals: Float32[ndarray, "k dof"]
+    T_base_tip: Float[ndarray, "4 4"]
+    """The target; where only its position is given, the orientation is that of the first goal."""
+
+
+def draw_problem(settings: GenerationSettings, robot: Robot, rng: Generator) -> TargetProblem:
+    """A random problem; the same state of `rng` gives the same one.
+
+    Target `position`: the positions of the tip at start and goal are uniform in the family's region, as the
+    authors' are; configurations come from inverse kinematics. Target `pose`: the start, and the configuration
+    whose tip pose is the target, are uniform among the free ones with the tip in the region. Scenes that
+    leave no start or no goal are drawn anew. Raises InputError if the settings leave none at all.
+    """
+    family = int(rng.random() < settings.dense_share)
+    rules = list(FAMILIES.values())[family]
+    keep_out = base_spheres(robot)
+    for _ in range(SCENES):
+        scene = sample_scene(rules, rng, keep_out)
+        checker = CollisionChecker(robot, scene)
+        ends = _by_position if settings.target == "position" else _by_pose
+        found = ends(robot, rules, checker, settings.goals, rng)
+        if found is not None:
+            return TargetProblem(family, scene, *found)
+    raise InputError(
+        f"no free start and goal in {SCENES} scenes of {list(FAMILIES)[family]} for {robot.name}: its tip "
+        f"{robot.tip} cannot be where these scenes want it"
+    )
+
+
+_Ends = tuple[Float32[ndarray, "dof"], Float32[ndarray, "k dof"], Float[ndarray, "4 4"]]
+
+
+def _by_position(
+    robot: Robot, rules: RopSettings, checker: CollisionChecker, count: int, rng: Generator
+) -> _Ends | None:
+    start = _reaching(robot, _random_position(rules, rng), 1, checker, rng, POSITION_ONLY)
+    if not len(start):
+        return None
+    goals = _reaching(robot, _random_position(rules, rng), count, checker, rng, POSITION_ONLY)
+    if not len(goals):
+        return None
+    return start[0], goals, link_pose(robot, goals[0].astype(np.float64), robot.tip)
+
+
+def _by_pose(
+    robot: Robot, rules: RopSettings, checker: CollisionChecker, count: int, rng: Generator
+) -> _Ends | None:
+    start, goal = (free_configuration(robot, rules, checker, rng) for _ in range(2))
+    if start is None or goal is None:
+        return None
+    T_base_tip = link_pose(robot, goal, robot.tip)
+    goals = _reaching(robot, T_base_tip, count, checker, rng, InverseKinematicsSettings())
+    if not len(goals):
+        goals = goal[None].astype(np.float32)
+    return start.astype(np.float32), goals, T_base_tip
+
+
+def _random_position(rules: RopSettings, rng: Generator) -> Float[ndarray, "4 4"]:
+    T_base_tip = np.eye(4)
+    T_base_tip[:3, 3] = [rng.uniform(*rules.tip_x), rng.uniform(*rules.tip_y), rng.uniform(*rules.tip_z)]
+    return T_base_tip
+
+
+def _reaching(
+    robot: Robot,
+    T_base_tip: Float[ndarray, "4 4"],
+    count: int,
+    checker: CollisionChecker,
+    rng: Generator,
+    settings: InverseKinematicsSettings,
+) -> Float32[ndarray, "k dof"]:
+    """Free configurations, rounded to what the data hold, so that the judge sees exactly these."""
+    q = inverse_kinematics(
+        robot, robot.tip, T_base_tip, count, rng=rng, accept=checker.free, settings=settings
+    )
+    return q.astype(np.float32)

@@ -1,0 +1,67 @@
+"""What a data set is made of."""
+
+from dataclasses import dataclass, field
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.planners.shared_tree import SharedTreeSettings
+from robotdiffuse.scenes.rop import ROP, ROP_DENSE, RopSettings
+
+FAMILIES: dict[str, RopSettings] = {"rop": ROP, "rop_dense": ROP_DENSE}
+"""Families of scenes by name; rows of the data hold the number in this order."""
+TARGETS = ("position", "pose")
+TIMINGS = ("arc", "time")
+SLOTS = max(family.obstacles[1] for family in FAMILIES.values())
+"""Most obstacles of a scene."""
+
+
+@dataclass(frozen=True)
+class GenerationSettings:
+    """The same settings give the same data, whatever the number of workers and of interruptions."""
+
+    robot: str = "panda"
+    """Bundled name, or path to a URDF."""
+    trajectories: int = 140_000
+    """Solved and verified motions to make, each in a scene of its own (the paper: 0.14 million)."""
+    seed: int = 0
+    dense_share: float = 0.0
+    """Share of problems from `rop_dense`; the others are from `rop`, the paper's."""
+    trivial_share: float = 1.0
+    """Share that is kept of the problems that the straight line solves; 1 is the paper's distribution."""
+    target: str = "position"
+    """What is given of the tip's goal: its position alone, as in the paper, or the whole pose."""
+    goals: int = 10
+    """Most goal configurations of a target, found by inverse kinematics (the paper's k)."""
+    frames: int = 254
+    """Frames of a trajectory (the authors' number)."""
+    timing: str = "arc"
+    """How frames are spaced: evenly in joint-space length (arc), or in time by toppra (time)."""
+    shard: int = 500
+    """Trajectories in a shard: what an interruption may lose."""
+    search: SharedTreeSettings = field(
+        default=SharedTreeSettings(
+            resolution=0.02, improvement=0.01, patience=6, step_rounds=5, connect_iterations=800
+        )
+    )
+    """How problems are solved: quicker than a user's default, at 1 % more length."""
+
+    def __post_init__(self) -> None:
+        for name, least in (("trajectories", 1), ("seed", 0), ("goals", 1), ("frames", 2), ("shard", 1)):
+            if getattr(self, name) < least:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be at least {least}")
+        for name in ("dense_share", "trivial_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be between 0 and 1")
+        if self.target not in TARGETS:
+            raise unknown_name("target", self.target, TARGETS)
+        if self.timing not in TIMINGS:
+            raise unknown_name("timing", self.timing, TIMINGS)
+        if self.goals > 127:
+            raise InputError(f"goals is {self.goals}; it must be at most 127")
+
+    @property
+    def shards(self) -> int:
+        return -(-self.trajectories // self.shard)
+
+    def rows(self, index: int) -> int:
+        """Trajectories of a shard: all have as many, but the last may have fewer."""
+        return min(self.shard, self.trajectories - index * self.shard)

@@ -1,0 +1,154 @@
+"""One shard of the data: problems drawn and solved until it is full; it depends on settings and number."""
+
+import numpy as np
+from jaxtyping import Float, Float32
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError
+from robotdiffuse.generation.problems import TargetProblem, draw_problem
+from robotdiffuse.generation.settings import FAMILIES, SLOTS, GenerationSettings
+from robotdiffuse.paths.timing import time_parameterize
+from robotdiffuse.planners import rrt_connect_kernel as connect
+from robotdiffuse.planners.rrt_connect import random_state, search_space
+from robotdiffuse.planners.shared_tree import SharedTreeSearch
+from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.rop import pack_scene
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.transforms import quaternion_from_rotation
+from robotdiffuse.types import Path
+from robotdiffuse.verify import Verifier, VerifySettings
+
+TRIES = 50
+"""Problems drawn for each row, and GRACE more, before the settings are called hopeless."""
+GRACE = 1_000
+NUMBERS = 2**32
+"""Problem numbers of a shard; shards do not share any."""
+
+Arrays = dict[str, ndarray]
+Row = dict[str, ndarray | np.generic]
+Counts = dict[str, int]
+
+
+def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts]:
+    """Arrays and counts of a shard, as `learning.shards` keeps them.
+
+    Counts: `tried` problems; of those `solved` ones are in the shard, `thinned` ones are trivial and left
+    out, of `unsolved` ones the search found no path, and `refused` ones did not pass the judge. Raises
+    InputError if hardly any problem can be solved.
+    """
+    robot, rows = load_robot(settings.robot), settings.rows(index)
+    kept: list[Row] = []
+    counts = dict.fromkeys(("tried", "solved", "thinned", "unsolved", "refused"), 0)
+    while len(kept) < rows:
+        if counts["tried"] >= TRIES * rows + GRACE:
+            raise InputError(
+                f"only {len(kept)} of {counts['tried']} problems were solved for {robot.name}; a smaller "
+                f"safety_distance than {settings.search.safety_distance} m or other scenes may help"
+            )
+        number = index * NUMBERS + counts["tried"]
+        counts["tried"] += 1
+        row = solve(settings, robot, number)
+        if isinstance(row, str):
+            counts[row] += 1
+        else:
+            kept.append(row)
+            counts["solved"] += 1
+    return {name: np.stack([row[name] for row in kept]) for name in kept[0]}, counts
+
+
+def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
+    """The row of a problem by its number, or why there is none: thinned, unsolved or refused."""
+    rng = np.random.default_rng([settings.seed, number])
+    drawn = draw_problem(settings, robot, rng)
+    checker = CollisionChecker(robot, drawn.scene)
+    search = SharedTreeSearch(
+        checker, drawn.start, drawn.goals, settings.search, random_state(settings.seed, number)
+    )
+    search.run()
+    path = search.path()
+    if path is None:
+        return "unsolved"
+    goal = drawn.goals[search.best_goal]
+    line_free = _line_is_free(settings, checker, drawn.start, goal)
+    if line_free and rng.random() >= settings.trivial_share:
+        return "thinned"
+    goals = JointGoal(drawn.goals.astype(np.float64))
+    judge = Verifier(Problem(robot, drawn.scene, drawn.start.astype(np.float64), goals), VerifySettings())
+    motion = _frames(settings, robot, path, judge)
+    if motion is None:
+        return "refused"
+    times, q = motion
+    q[0], q[-1] = drawn.start, goal
+    if not judge.path(Path(robot.joint_names, q.astype(np.float64))).valid:
+        return "refused"
+    row = _row(settings, drawn, search, q)
+    row["clearance"] = checker.link_clearances(q).min()
+    row["line_free"] = np.bool_(line_free)
+    row["seed"] = np.uint64(number)
+    if settings.timing == "time":
+        row["times"] = times.astype(np.float32)
+    return row
+
+
+def _row(
+    settings: GenerationSettings, drawn: TargetProblem, search: SharedTreeSearch, q: Float32[ndarray, "n dof"]
+) -> Row:
+    k, dof = drawn.goals.shape
+    goals, goal_costs = np.full((settings.goals, dof), np.nan), np.full(settings.goals, np.nan)
+    goals[:k], goal_costs[:k] = drawn.goals, search.goal_costs
+    floor = FAMILIES[list(FAMILIES)[drawn.family]].floor
+    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor:]), SLOTS)
+    wxyz = quaternion_from_rotation(drawn.T_base_tip[:3, :3])
+    straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
+    return {
+        "trajectories": q,
+        "start": drawn.start,
+        "goals": goals.astype(np.float32),
+        "goal_costs": goal_costs.astype(np.float32),
+        "goal_index": np.int8(search.best_goal),
+        "target_pose": np.concatenate([wxyz, drawn.T_base_tip[:3, 3]]).astype(np.float32),
+        "obstacle_kinds": kinds,
+        "obstacle_params": params,
+        "family": np.int8(drawn.family),
+        "cost": np.float32(search.cost),
+        "safety_distance": np.float32(search.safety_distance),
+        "detour": np.float32(search.cost / max(straight, 1e-9)),
+    }
+
+
+def _line_is_free(
+    settings: GenerationSettings, checker: CollisionChecker, start: ndarray, goal: ndarray
+) -> bool:
+    space = search_space(checker, settings.search.resolution)
+    return bool(connect.motions_free(space, np.stack([start, goal]))[0])
+
+
+def _frames(
+    settings: GenerationSettings, robot: Robot, path: Float32[ndarray, "n dof"], judge: Verifier
+) -> tuple[ndarray, Float32[ndarray, "frames dof"]] | None:
+    """Times and joint values of the frames; None if the timed motion does not pass the judge."""
+    if settings.timing == "arc":
+        return np.zeros(0), resample(path, settings.frames).astype(np.float32)
+    waypoints = Path(robot.joint_names, path.astype(np.float64))
+    if not judge.path(waypoints).valid:
+        return None
+    timed = time_parameterize(
+        robot, waypoints, lambda motion: judge.trajectory(motion).valid, judge.collision_free
+    )
+    if not judge.trajectory(timed).valid:
+        return None
+    times = np.linspace(0.0, timed.duration, settings.frames)
+    rows = [np.interp(times, timed.times, timed.positions[:, j]) for j in range(robot.dof)]
+    return times, np.stack(rows, axis=1).astype(np.float32)
+
+
+def resample(path: Float[ndarray, "n dof"], frames: int) -> Float[ndarray, "frames dof"]:
+    """The path at `frames` places evenly spaced in joint-space length, both ends included."""
+    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    at = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
+    wanted = np.linspace(0.0, at[-1], frames)
+    rows = [np.interp(wanted, at, path[:, j]) for j in range(path.shape[1])]
+    return np.stack(rows, axis=1).astype(path.dtype)
