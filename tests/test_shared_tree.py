@@ -123,7 +123,7 @@ def consistent(tree) -> None:
 def test_the_tree_stays_a_tree() -> None:
     """With goals reached, rewired, grafted, and room made anew."""
     checker = CollisionChecker(PANDA, WALL)
-    goals = np.stack([RIGHT, RIGHT + [0.2, 0.2, 0, 0, 0, 0, 0], RIGHT + [0.1, -0.3, 0.3, 0, 0, 0, 0]])
+    goals = RIGHT + np.pad([[0.0, 0.0, 0.0], [0.2, 0.2, 0.0], [0.1, -0.3, 0.3]], ((0, 0), (0, 4)))
     settings = replace(TOUCHING, capacity=64, growth=400)
     search = SharedTreeSearch(checker, LEFT, goals, settings, random_state(2))
     for _ in range(5):
@@ -155,7 +155,8 @@ def test_samples_fill_the_hyperspheroid_evenly() -> None:
 
 
 def test_the_cheapest_goal_wins_and_every_goal_has_its_cost() -> None:
-    goals = np.stack([RIGHT, RIGHT + [0.2, 0.2, 0, 0, 0, 0, 0], LEFT + [0.1, 0.4, 0, 0, 0, 0, 0]])
+    goals = np.stack([RIGHT, RIGHT, LEFT])
+    goals[1:, :2] += [[0.2, 0.2], [0.1, 0.4]]
     checker = CollisionChecker(PANDA, WALL)
     assert checker.free(goals).all()
     search = SharedTreeSearch(checker, LEFT, goals, TOUCHING, random_state(0))
@@ -262,4 +263,4 @@ def test_no_way_ends_at_the_time_limit_or_earlier() -> None:
 )
 def test_bad_settings_are_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"shared_tree_rrt_star.{name} is {value}"):
-        SharedTreeSettings(**{name: value})
+        replace(SharedTreeSettings(), **{name: value})
