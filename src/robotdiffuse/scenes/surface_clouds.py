@@ -46,29 +46,33 @@ def surface_clouds(
     which none does is all zeros. `ordered`: sorted by x, then y, then z, and rounded to a millionth of the
     scene's largest coordinate, for encoders to which the order matters.
     """
-    n, device = len(kinds), params.device
-    clouds = torch.empty(n, count, 3, device=device)
-    used = torch.nonzero((kinds != NONE).any(0))[:, 0]
-    if not len(used) or not count:
+    n, k = kinds.shape
+    clouds = torch.empty(n, count, 3, device=params.device)
+    if not n or not k or not count:
         return clouds.zero_()
-    kinds, params = kinds[:, used], params[:, used]
-    part = max(1, (PART if device.type == "cpu" else PART_ELSEWHERE) // count)
+    # empty rows last, and scenes with as many shapes together: a part takes as long as its fullest scene
+    slots = (kinds == NONE).byte().argsort(stable=True, dim=1)
+    number, order = (kinds != NONE).sum(1).sort(stable=True)
+    shapes = _Shapes.of(kinds.gather(1, slots)[order], params[order[:, None], slots[order]])
+    eyes = None if camera is None else camera[order]
+    table, area = _faces(shapes, region, eyes)
+    part = max(1, (PART if params.device.type == "cpu" else PART_ELSEWHERE) // count)
+    most = number.tolist()
     for i in range(0, n, part):
         rows = slice(i, i + part)
-        eye = None if camera is None else camera[rows]
-        shapes = _Shapes.of(kinds[rows], params[rows])
-        if region is None and eye is None:
-            cloud = _draw(shapes, count, generator, None, None)[0]
+        used = slice(0, max(1, max(most[rows])))
+        faces = table[:, rows, used].reshape(len(table), -1), area[rows, used].flatten(1)
+        if region is None and eyes is None:
+            cloud = _draw(*faces, count, generator, False)[0]
         else:
-            draws = math.ceil(OVERSAMPLING * count)
-            cloud, shape = _draw(shapes, draws, generator, region, eye)
+            cloud, shape = _draw(*faces, math.ceil(OVERSAMPLING * count), generator, eyes is not None)
             counts = torch.ones_like(shape, dtype=torch.bool) if region is None else _within(region, cloud)
-            if eye is not None:
-                counts &= ~_hidden(shapes, cloud, shape, eye)
+            if eyes is not None:
+                counts &= ~_hidden(shapes.some(rows, used), cloud, shape, eyes[rows])
             cloud = _first(cloud, counts, count)
         if ordered:
             _sort(cloud)
-        torch.stack(cloud, -1, out=clouds[rows])
+        clouds[order[rows]] = torch.stack(cloud, -1)
     return clouds
 
 
@@ -92,6 +96,14 @@ class _Shapes:
         half = torch.where(box, params[..., 3:6] / 2, torch.where(sphere, params[..., 3], 0.0)[..., None])
         unit = params.new_tensor([1.0, 0.0, 0.0, 0.0])
         return _Shapes(sphere, params[..., :3], half, _rotation(torch.where(box, params[..., 6:], unit)))
+
+    def some(self, rows: slice, slots: slice) -> "_Shapes":
+        return _Shapes(
+            self.sphere[rows, slots],
+            self.center[rows, slots],
+            self.half[rows, slots],
+            self.rotation[rows, slots],
+        )
 
     def local(self, points: Points) -> Points:
         """Points in the frames of the shapes, in units of their half sizes; x, y, z are [b, 1] or, if there
@@ -165,25 +177,28 @@ def _may_be_seen(
 
 
 def _draw(
-    shapes: _Shapes, count: int, generator: Generator, region: VisibleRegion | None, eye: Tensor | None
+    table: Float32[Tensor, "13 bk3"],
+    area: Float32[Tensor, "b k3"],
+    count: int,
+    generator: Generator,
+    one_sided: bool,
 ) -> tuple[Points, Tensor]:
-    """Points, and the shape of each [b, count]."""
-    table, area = _faces(shapes, region, eye)
-    n, k = area.shape[:2]
-    ends = area.flatten(1).cumsum(1)
+    """Points on the faces of `_faces`, and the shape of each [b, count]."""
+    n, faces = area.shape
+    ends = area.cumsum(1)
     pick, u, v = torch.rand(3, n, count, generator=generator, device=area.device)
     pick *= ends[:, -1:]
     shape = torch.zeros(n, count, dtype=torch.int64, device=area.device)
-    for j in range(k - 1):
-        shape += pick >= ends[:, 3 * j + 2, None]
-    face = 3 * shape + torch.arange(0, 3 * k * n, 3 * k, device=area.device)[:, None]
+    for j in range(2, faces - 1, 3):
+        shape += pick >= ends[:, j, None]
+    face = 3 * shape + torch.arange(0, faces * n, faces, device=area.device)[:, None]
     flat = ends.view(-1)
     first, second = (flat[i:].index_select(0, face.view(-1)).view(n, count) for i in (0, 1))
     rows = face.add_(pick >= first).add_(pick >= second).view(-1)
-    of = [part.index_select(0, rows).view(n, count) for part in table.flatten(1)]
+    of = [part.index_select(0, rows).view(n, count) for part in table]
 
     cap = of[12]
-    if eye is None:  # the side of the box, and where on it, from one number
+    if not one_sided:  # the side of the box, and where on it, from one number
         height = u.mul_(2).sub_(1)
         side = torch.ones_like(u).copysign_(u)
         across = u.abs().mul_(2).sub_(1)
@@ -217,10 +232,7 @@ def _hidden(
     """Which points lie behind, or within, another shape than their own, as seen from the eye."""
     hidden = torch.zeros_like(shape, dtype=torch.bool)
     for j in range(shapes.sphere.shape[1]):
-        one = slice(j, j + 1)
-        other = _Shapes(
-            shapes.sphere[:, one], shapes.center[:, one], shapes.half[:, one], shapes.rotation[:, one]
-        )
+        other = shapes.some(slice(None), slice(j, j + 1))
         at = other.local(points)
         way = [e - p for e, p in zip(other.local([eye[:, s, None] for s in range(3)]), at, strict=True)]
         # sphere: the least distance of the segment from the centre
