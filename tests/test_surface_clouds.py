@@ -60,6 +60,17 @@ def test_points_lie_on_surfaces(seen):
             np.testing.assert_allclose(np.abs(depths(*scene)).min(0), 0, atol=1e-6)
 
 
+@pytest.mark.parametrize("number", [0.0, 1 - 2.0**-24])
+def test_extreme_random_numbers(number, monkeypatch):
+    """The largest number below 1, times the area, may be rounded to all of it: there is no face beyond."""
+    kinds, params, _ = some_scenes(200, 4)
+    kinds[:, 1], params[:, 1, 3] = SPHERE, torch.rand(200) + 0.1
+    monkeypatch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, number))
+    clouds = surface_clouds(kinds, params, 2, seeded())
+    for scene in zip(kinds.numpy(), params.numpy(), clouds.double().numpy(), strict=True):
+        np.testing.assert_allclose(np.abs(depths(*scene)).min(0), 0, atol=1e-6)
+
+
 def test_uniform_by_area():
     """Shares of shapes and of the six faces of a turned box; heights on a sphere."""
     kinds = torch.tensor([[0, BOX, SPHERE]], dtype=torch.int8)

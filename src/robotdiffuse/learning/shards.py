@@ -189,6 +189,8 @@ def remove_leftovers(folder: str | FilePath) -> None:
     """Remove what killed runs left half-written. Only while nobody writes to the folder."""
     for path in FilePath(folder).glob(".shard_*.zarr.*"):
         shutil.rmtree(path, ignore_errors=True)
+    for path in FilePath(folder).glob(f".{MANIFEST}.*"):
+        path.unlink(missing_ok=True)
 
 
 def _zarr() -> ModuleType:

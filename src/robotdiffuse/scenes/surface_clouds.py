@@ -18,7 +18,7 @@ from robotdiffuse.scenes.sampling import BOX, NONE, SPHERE, VisibleRegion
 
 PART = 1 << 15
 """Points that are done at once on the CPU: their arrays fit the second-level cache."""
-PART_ELSEWHERE = 1 << 23
+PART_ELSEWHERE = 1 << 22
 OVERSAMPLING = 1.5
 """Points drawn for each that is wanted, where some may be hidden or out of the region."""
 BITS = 21
@@ -183,11 +183,11 @@ def _draw(
     generator: Generator,
     one_sided: bool,
 ) -> tuple[Points, Tensor]:
-    """Points on the faces of `_faces`, and the shape of each [b, count]."""
+    """Points on the faces of `_faces`, and the shape of each [b, count]; one_sided: there is an eye."""
     n, faces = area.shape
     ends = area.cumsum(1)
     pick, u, v = torch.rand(3, n, count, generator=generator, device=area.device)
-    pick *= ends[:, -1:]
+    pick *= ends[:, -1:] * (1 - 1e-6)  # the product must not be rounded up to the end
     shape = torch.zeros(n, count, dtype=torch.int64, device=area.device)
     for j in range(2, faces - 1, 3):
         shape += pick >= ends[:, j, None]
