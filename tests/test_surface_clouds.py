@@ -62,8 +62,8 @@ def test_points_lie_on_surfaces(seen):
 
 @pytest.mark.parametrize("number", [0.0, 1 - 2.0**-24])
 def test_extreme_random_numbers(number, monkeypatch):
-    """The largest number below 1 times an area is rounded to the area if that is a power of two; no point may
-    be on a face beyond. Among these spheres there are some whose area is 1 in the code's unit."""
+    """No product of the greatest number below 1 and an area is rounded up to the area, beyond which there is
+    no face; among these are areas close to a power of two, from both sides."""
     kinds, params = torch.full((40, 1), SPHERE, dtype=torch.int8), torch.zeros(40, 1, 10)
     params[:, 0, 0] = 3.0
     params[:, 0, 3] = float(np.sqrt(2 / np.pi)) * (1 + torch.arange(-20, 20) * 2.0**-24)

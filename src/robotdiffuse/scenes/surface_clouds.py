@@ -187,7 +187,7 @@ def _draw(
     n, faces = area.shape
     ends = area.cumsum(1)
     pick, u, v = torch.rand(3, n, count, generator=generator, device=area.device)
-    pick *= ends[:, -1:] * (1 - 1e-6)  # the product must not be rounded up to the end
+    pick *= ends[:, -1:]  # less than the end: 1 - 2^-24, the greatest number drawn, rounds nothing up to it
     shape = torch.zeros(n, count, dtype=torch.int64, device=area.device)
     for j in range(2, faces - 1, 3):
         shape += pick >= ends[:, j, None]
