@@ -41,7 +41,7 @@ def depths(kinds: ndarray, params: ndarray, points: ndarray) -> ndarray:
 
 def is_seen(kinds: ndarray, params: ndarray, points: ndarray, eye: ndarray, margin: float) -> ndarray:
     """Whether nothing on the way to the eye is deeper than the margin inside a shape: by walking along it."""
-    steps = np.linspace(0, 1, 600)[1:, None, None]
+    steps = np.linspace(0, 1, 400)[1:, None, None]
     way = (points + steps * (eye - points)).reshape(-1, 3)
     deepest = depths(kinds, params, way).max(0).reshape(len(steps), -1)
     return deepest.max(0) < margin
@@ -115,7 +115,7 @@ def test_what_a_camera_sees():
     that it has among points drawn everywhere and filtered."""
     kinds, params, camera = some_scenes(12, 5, 5)
     seen = surface_clouds(kinds, params, 400, seeded(), camera=camera).double().numpy()
-    every = surface_clouds(kinds, params, 6000, seeded(1)).double().numpy()
+    every = surface_clouds(kinds, params, 4000, seeded(1)).double().numpy()
     compared = 0
     for i in range(len(kinds)):
         scene = kinds[i].numpy(), params[i].numpy()
