@@ -36,8 +36,9 @@ lint: .venv/dev.stamp
 bench: .venv/dev.stamp
 	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
 
-weights: .venv/core.stamp
-	$(BIN)/robotdiffuse data generate --out runs/panda/data --problems 240000
+weights: .venv/dev.stamp
+	$(BIN)/robotdiffuse data generate --out runs/panda/data --trajectories 92000 \
+		--dense-share 0.15 --trivial-share 0.1 --target pose --goals 1
 	$(BIN)/robotdiffuse train encoder --out runs/panda/encoder --minutes 6
 	$(BIN)/robotdiffuse train planner --out runs/panda/planner --minutes 44 \
 		--data runs/panda/data --encoder runs/panda/encoder

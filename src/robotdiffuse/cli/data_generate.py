@@ -25,6 +25,7 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
         help="share to keep of what the straight line solves (default: 1, the paper's)",
     )
     parser.add_argument("--target", metavar="KIND", help="position (default) or pose of the tip")
+    parser.add_argument("--goals", type=count, metavar="N", help="most goals of a target (default: 10)")
     parser.add_argument("--frames", type=count, metavar="N", help="frames of a motion (default: 254)")
     parser.add_argument(
         "--timing", metavar="KIND", help="frames even in arc length (arc, default) or in time"
@@ -51,6 +52,7 @@ SETTINGS = (
     "dense_share",
     "trivial_share",
     "target",
+    "goals",
     "frames",
     "timing",
     "shard",

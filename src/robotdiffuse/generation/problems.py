@@ -40,9 +40,9 @@ def draw_problem(settings: GenerationSettings, robot: Robot, rng: Generator) -> 
     """A random problem; the same state of `rng` gives the same one.
 
     Target `position`: the positions of the tip at start and goal are uniform in the family's region, as the
-    authors' are; configurations come from inverse kinematics. Target `pose`: the start, and the configuration
-    whose tip pose is the target, are uniform among the free ones with the tip in the region. Scenes that
-    leave no start or no goal are drawn anew. Raises InputError if the settings leave none at all.
+    authors' are; configurations come from inverse kinematics. Target `pose`: the start, and the first goal,
+    whose tip pose is the target, are uniform among the free configurations with the tip in the region. Scenes
+    that leave no start or no goal are drawn anew. Raises InputError if the settings leave none at all.
     """
     family = int(rng.random() < settings.dense_share)
     rules = list(FAMILIES.values())[family]
@@ -82,9 +82,10 @@ def _by_pose(
     if start is None or goal is None:
         return None
     T_base_tip = link_pose(robot, goal, robot.tip)
-    goals = _reaching(robot, T_base_tip, count, checker, rng, InverseKinematicsSettings())
-    if not len(goals):
-        goals = goal[None].astype(np.float32)
+    goals = goal[None].astype(np.float32)
+    if count > 1:
+        others = _reaching(robot, T_base_tip, count - 1, checker, rng, InverseKinematicsSettings())
+        goals = np.concatenate([goals, others])
     return start.astype(np.float32), goals, T_base_tip
 
 
