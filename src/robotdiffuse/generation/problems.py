@@ -1,6 +1,6 @@
 """Random problems as in the paper: a scene, a start, a target of the tip, goals by inverse kinematics."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -19,7 +19,9 @@ from robotdiffuse.scenes.scene import Scene
 
 SCENES = 100
 """Scenes given up, for want of a start or of a goal, before the settings are called impossible."""
-POSITION_ONLY = InverseKinematicsSettings(position_only=True)
+FULL_POSE = InverseKinematicsSettings(max_rounds=4, patience=2)
+"""A few rounds: a target inside an obstacle is better drawn anew than searched for long."""
+POSITION_ONLY = replace(FULL_POSE, position_only=True)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +86,7 @@ def _by_pose(
     T_base_tip = link_pose(robot, goal, robot.tip)
     goals = goal[None].astype(np.float32)
     if count > 1:
-        others = _reaching(robot, T_base_tip, count - 1, checker, rng, InverseKinematicsSettings())
+        others = _reaching(robot, T_base_tip, count - 1, checker, rng, FULL_POSE)
         goals = np.concatenate([goals, others])
     return start.astype(np.float32), goals, T_base_tip
 
