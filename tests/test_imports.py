@@ -41,6 +41,7 @@ EXTRAS = {
     "ray": {"generation"},
     "zarr": {"learning"},
     "viser": {"viewer"},
+    "matplotlib": {"evaluation"},
     "pinocchio": set(),
     "example_robot_data": set(),
 }

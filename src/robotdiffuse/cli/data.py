@@ -2,7 +2,7 @@
 
 import argparse
 
-from robotdiffuse.cli import data_generate
+from robotdiffuse.cli import data_generate, data_look
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -11,3 +11,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     data_generate.add_generate(actions)
+    data_look.add_info(actions)
+    data_look.add_check(actions)
+    data_look.add_view(actions)
+    data_look.add_export(actions)

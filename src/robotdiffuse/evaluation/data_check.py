@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data_rows import motion_of, problem_of, scene_of
+from robotdiffuse.evaluation.data_rows import path_of, pick_rows, problem_of, scene_of
 from robotdiffuse.learning.shards import (
     Manifest,
     Shard,
@@ -143,7 +143,11 @@ def check_data(
         sizes = dict(zip(indices, processes.map(task.size, indices), strict=True))
         found = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
         rows = {i: size for i, size in sizes.items() if isinstance(size, int)}
-        chosen = list(_chosen(rows, count, seed))
+        chosen = [
+            (index, picked[i : i + CHUNK])
+            for index, picked in pick_rows(rows, count, seed).items()
+            for i in range(0, len(picked), CHUNK)
+        ]
         total, done, least = sum(len(part) for _, part in chosen), 0, np.inf
         for part in processes.map(task.judge, chosen):
             found += part.findings
@@ -174,20 +178,6 @@ def _need_pybullet() -> None:
             "the second judge needs PyBullet, whose wheels stop at Python 3.11: pip install "
             "'robotdiffuse[sim]', or leave it out by --no-pybullet (pybullet=False)"
         ) from None
-
-
-def _chosen(sizes: dict[int, int], count: int | None, seed: int) -> Iterator[tuple[int, Int[ndarray, "n"]]]:
-    """Random rows without repetition, in parts of one shard each."""
-    total, first = sum(sizes.values()), 0
-    if count is None or count >= total:
-        picked = np.arange(total)
-    else:
-        picked = np.sort(np.random.default_rng(seed).choice(total, count, replace=False))
-    for index, size in sizes.items():
-        rows = picked[(picked >= first) & (picked < first + size)] - first
-        first += size
-        for i in range(0, len(rows), CHUNK):
-            yield index, rows[i : i + CHUNK]
 
 
 class _Processes:
@@ -261,7 +251,7 @@ class _Task:
                     oracle.set_scene(scene_of(self.manifest, shard, row))
                 except InputError:
                     continue  # found already
-                path = motion_of(self.robot, shard, row)
+                path = path_of(self.robot, shard, row)
                 contact = oracle.check_path(path, PYBULLET_STEP, PYBULLET_TOLERANCE)
                 if contact is not None:
                     depth, at = -1e3 * contact.distance, contact.at
@@ -271,7 +261,7 @@ class _Task:
 
 def _wrong(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
     """Kind and message of everything that is wrong with a motion but for PyBullet's opinion."""
-    robot, path = task.robot, motion_of(task.robot, shard, row)
+    robot, path = task.robot, path_of(task.robot, shard, row)
     yield from _ends(shard, row)
     yield from _limits(robot, path.positions)
     yield from _lengths(shard, row, path)

@@ -162,9 +162,9 @@ def _tiles(summary: DataSummary) -> str:
     tiles = (
         (f"{summary.trajectories:,}", made),
         (f"{summary.frames:,}", "frames"),
-        (megabytes(summary.bytes), f"in {summary.shards:,} shards"),
+        (size_in_words(summary.bytes), f"in {summary.shards:,} shards"),
         (f"{100 * summary.success:.1f} %", "of problems solved"),
-        (f"{100 * summary.kept:.1f} %", f"keep the whole {100 * summary.safety_distance:.3g} cm"),
+        (f"{100 * summary.kept:.1f} %", f"keep the whole {100 * summary.safety_distance:.3g}\u00a0cm"),
         (f"{100 * summary.trivial:.1f} %", "trivial: the line is free"),
         (f"{summary.length.quantiles[2]:.2f} rad", "median length"),
         (train[1], f"to {train[0]} on, " + ", ".join(f"{count} {name}" for name, count in held_out)),
@@ -180,7 +180,7 @@ def _footer(columns: DataColumns) -> str:
     return f"Made with {versions}. Robot {columns.manifest.robot_fingerprint}."
 
 
-def megabytes(size: int) -> str:
+def size_in_words(size: int) -> str:
     """A size on disk in words."""
     return f"{size / 1e9:.2f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
 

@@ -107,7 +107,7 @@ def outcomes(summary: DataSummary) -> str:
     values = [summary.counts.get(name, 0) for name in REASONS]
     axes.barh(REASONS, values, color=[OUTCOMES[name] for name in REASONS], height=0.62)
     for i, value in enumerate(values):
-        axes.text(value + 0.015 * tried, i, f"{value:,}  ({100 * value / tried:.1f} %)", va="center")
+        axes.text(value + 0.015 * tried, i, f"{value:,} ({100 * value / tried:.1f} %)", va="center")
     axes.set_xlim(0, 1.42 * max(1, *values))
     axes.invert_yaxis()
     axes.spines[["bottom"]].set_visible(False)

@@ -1,16 +1,20 @@
 """Rows of a data set as problems and motions again."""
 
+from collections.abc import Iterator
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
+from jaxtyping import Int
+from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.shards import Manifest, Shard
+from robotdiffuse.learning.shards import Manifest, Shard, read_shard, shard_indices
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.rop import RopSettings, floor_box, unpack_scene
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.types import Path
+from robotdiffuse.types import Path, Trajectory
 
 
 def family_names(manifest: Manifest) -> tuple[str, ...]:
@@ -51,6 +55,38 @@ def problem_of(manifest: Manifest, robot: Robot, shard: Shard, row: int) -> Prob
     return Problem(robot, scene_of(manifest, shard, row), start, JointGoal(goals))
 
 
-def motion_of(robot: Robot, shard: Shard, row: int) -> Path:
+def path_of(robot: Robot, shard: Shard, row: int) -> Path:
     """The frames of a row as a path."""
     return Path(robot.joint_names, np.asarray(shard["trajectories"][row], np.float64))
+
+
+def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
+    """The frames of a row as they move: timed, with rates by differences, where the data have times."""
+    path = path_of(robot, shard, row)
+    times = np.asarray(shard.arrays.get("times", ()), np.float64)
+    if not len(times) or not (np.diff(times[row]) > 0).all():
+        return path
+    velocities = np.gradient(path.positions, times[row], axis=0)
+    accelerations = np.gradient(velocities, times[row], axis=0)
+    return Trajectory(robot.joint_names, times[row], path.positions, velocities, accelerations)
+
+
+def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, Int[ndarray, "n"]]:
+    """Random rows without repetition, all where `count` is None, from shards of these sizes by number."""
+    total, first, picked = sum(sizes.values()), 0, {}
+    if count is None or count >= total:
+        rows = np.arange(total)
+    else:
+        rows = np.sort(np.random.default_rng(seed).choice(total, count, replace=False))
+    for index, size in sizes.items():
+        picked[index] = rows[(rows >= first) & (rows < first + size)] - first
+        first += size
+    return picked
+
+
+def random_rows(folder: str | FilePath, count: int, seed: int) -> Iterator[tuple[Shard, Int[ndarray, "n"]]]:
+    """The shards that random rows are from, with these rows. Raises InputError for a damaged shard."""
+    sizes = {index: len(read_shard(folder, index, ("family",))) for index in shard_indices(folder)}
+    for index, rows in pick_rows(sizes, count, seed).items():
+        if len(rows):
+            yield read_shard(folder, index), rows
