@@ -13,6 +13,7 @@ MODULES = sorted(SOURCE.rglob("*.py"))
 
 CHAIN = (
     "errors",
+    "files",
     "transforms",
     "types",
     "robots",

@@ -11,7 +11,8 @@ from numpy import ndarray
 
 from robotdiffuse.evaluation import data_plots
 from robotdiffuse.evaluation.data_report import DataColumns, DataSummary, read_columns, summarize
-from robotdiffuse.paths.export import check_output, write_atomically
+from robotdiffuse.files import write_atomically
+from robotdiffuse.paths.export import check_output
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
@@ -164,7 +165,7 @@ def _tiles(summary: DataSummary) -> str:
         (f"{summary.frames:,}", "frames"),
         (size_in_words(summary.bytes), f"in {summary.shards:,} shards"),
         (f"{100 * summary.success:.1f} %", "of problems solved"),
-        (f"{100 * summary.kept:.1f} %", f"keep the whole {100 * summary.safety_distance:.3g}\u00a0cm"),
+        (f"{100 * summary.kept:.1f} %", f"searches keep all {100 * summary.safety_distance:.3g}\u00a0cm"),
         (f"{100 * summary.trivial:.1f} %", "trivial: the line is free"),
         (f"{summary.length.quantiles[2]:.2f} rad", "median length"),
         (train[1], f"to {train[0]} on, " + ", ".join(f"{count} {name}" for name, count in held_out)),
@@ -177,7 +178,8 @@ def _tiles(summary: DataSummary) -> str:
 
 def _footer(columns: DataColumns) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in columns.manifest.versions.items())
-    return f"Made with {versions}. Robot {columns.manifest.robot_fingerprint}."
+    robot = columns.manifest.robot_fingerprint
+    return f"Made with {versions}; robot {robot}. The last bar of a histogram holds all that lies beyond."
 
 
 def size_in_words(size: int) -> str:

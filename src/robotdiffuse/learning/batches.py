@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float, Float32, Int8
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.checkpoint import fingerprint, write_atomically
+from robotdiffuse.files import write_atomically
+from robotdiffuse.learning.checkpoint import fingerprint
 from robotdiffuse.learning.encoders import PointAutoencoder
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.shards import SPLITS, Shard, check_shard, read_manifest, shard_indices, split_of
@@ -157,7 +158,7 @@ def _cached_codes(
     try:
         buffer = BytesIO()
         np.save(buffer, codes)
-        write_atomically(cache, buffer.getvalue())
+        write_atomically(cache, buffer.getvalue(), make_folder=True)
     except InputError:
         pass  # a read-only data folder: the codes are made again next time
     return codes

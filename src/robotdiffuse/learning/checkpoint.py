@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import os
 import struct
 from pathlib import Path as FilePath
 from typing import Any
@@ -13,6 +12,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.config import settings_from_json, settings_to_json
 from robotdiffuse.learning.encoders import ENCODERS, PointAutoencoder
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
@@ -23,25 +23,11 @@ BUNDLED = FilePath(__file__).parent / "weights"
 """Weights that come with the package, one folder per robot."""
 
 
-def write_atomically(file: FilePath, data: bytes) -> None:
-    """Write beside the file, then rename over it, so that an interruption leaves the old file.
-
-    Raises InputError if the folder cannot be written.
-    """
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        fresh = file.with_name(f".{file.name}.{os.getpid()}")
-        fresh.write_bytes(data)
-        os.replace(fresh, file)
-    except OSError as error:
-        raise InputError(f"cannot write {file}: {error.strerror or error}") from None
-
-
 def write_tensors(file: FilePath, tensors: dict[str, Tensor], notes: dict[str, Any]) -> str:
     """Write tensors and JSON notes into one safetensors file. Returns its SHA-256."""
     contiguous = {name: tensor.detach().contiguous() for name, tensor in tensors.items()}
     data = save(contiguous, metadata={"notes": json.dumps(notes)})
-    write_atomically(file, data)
+    write_atomically(file, data, make_folder=True)
     return hashlib.sha256(data).hexdigest()
 
 
@@ -74,7 +60,7 @@ def _pack(module: nn.Module) -> dict[str, Tensor]:
 def _save(module: nn.Module, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
     digest = write_tensors(folder / f"{stem}.safetensors", _pack(module), {})
     about = {"format": FORMAT, **about, "weights_sha256": digest}
-    write_atomically(folder / f"{stem}.json", (json.dumps(about, indent=1) + "\n").encode())
+    write_atomically(folder / f"{stem}.json", json.dumps(about, indent=1) + "\n", make_folder=True)
 
 
 def _load(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any]]:

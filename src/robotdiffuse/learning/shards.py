@@ -23,7 +23,7 @@ from jaxtyping import Float32, Int8
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.checkpoint import write_atomically
+from robotdiffuse.files import write_atomically
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 
@@ -141,7 +141,7 @@ class Shard:
 def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
     """Write manifest.json, whole or not at all; makes the folder. Raises InputError if it cannot."""
     data = {"format": FORMAT, "dof": manifest.dof} | asdict(manifest)
-    write_atomically(FilePath(folder) / MANIFEST, (json.dumps(data, indent=1) + "\n").encode())
+    write_atomically(FilePath(folder) / MANIFEST, json.dumps(data, indent=1) + "\n", make_folder=True)
 
 
 def read_manifest(folder: str | FilePath) -> Manifest:

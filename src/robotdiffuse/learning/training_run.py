@@ -20,7 +20,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.checkpoint import read_tensors, write_atomically, write_tensors
+from robotdiffuse.files import write_atomically
+from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
 from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, settings_to_json
 
 FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder")
@@ -224,7 +225,7 @@ class TrainingRun:
         writer: csv.DictWriter[str] = csv.DictWriter(text, COLUMNS)
         writer.writeheader()
         writer.writerows(self.rows)
-        write_atomically(self.out / "log.csv", text.getvalue().encode())
+        write_atomically(self.out / "log.csv", text.getvalue(), make_folder=True)
 
     def _restore(self, check: bool) -> None:
         tensors, notes = read_tensors(self._file)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.files import write_atomically
 from robotdiffuse.types import Path, PlanResult, Status, Trajectory
 
 ROWS = ("positions", "velocities", "accelerations")
@@ -43,17 +44,6 @@ def check_output(file: str | FilePath, endings: tuple[str, ...]) -> FilePath:
     if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
         raise InputError(f"{path} cannot be written: permission denied")
     return path
-
-
-def write_atomically(file: FilePath, content: str | bytes) -> None:
-    """Write a file so that it is never seen half written. Raises InputError when it cannot be written."""
-    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
-        temporary.replace(file)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{file} cannot be written: {error.strerror}") from None
 
 
 def save_trajectory(trajectory: Trajectory, file: str | FilePath) -> None:

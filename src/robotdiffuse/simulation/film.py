@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.export import write_atomically
+from robotdiffuse.files import write_atomically
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.camera import DepthCamera, Light, RawImage, render, take

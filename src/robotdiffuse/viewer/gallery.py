@@ -11,7 +11,8 @@ from tempfile import TemporaryDirectory
 
 from PIL import Image
 
-from robotdiffuse.paths.export import check_output, write_atomically
+from robotdiffuse.files import write_atomically
+from robotdiffuse.paths.export import check_output
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.types import Path, Trajectory

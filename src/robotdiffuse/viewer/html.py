@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.paths.export import check_output, write_atomically
+from robotdiffuse.files import write_atomically
+from robotdiffuse.paths.export import check_output
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape

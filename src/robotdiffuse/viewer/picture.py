@@ -10,7 +10,8 @@ from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.export import check_output, write_atomically
+from robotdiffuse.files import write_atomically
+from robotdiffuse.paths.export import check_output
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.types import Path, PlanResult, Trajectory
