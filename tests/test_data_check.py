@@ -96,7 +96,7 @@ WRONG = {
     "start": ("ends", lambda row: row | {"start": row["start"] + np.float32(1e-6)}),
     "goal": ("ends", lambda row: row | {"goals": row["goals"] + 1e-6}),
     "no such goal": ("ends", lambda row: row | {"goal_index": np.array(2)}),
-    "cost": ("cost", lambda row: row | {"cost": 1.05 * row["cost"], "detour": 1.05 * row["detour"]}),
+    "cost": ("cost", lambda row: row | {"cost": 1.1 * row["cost"], "detour": 1.1 * row["detour"]}),
     "detour": ("cost", lambda row: row | {"detour": 1.01 * row["detour"]}),
     "clearance": ("clearance", lambda row: row | {"clearance": row["clearance"] - 0.001}),
 }

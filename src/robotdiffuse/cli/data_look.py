@@ -151,12 +151,16 @@ def print_summary(summary: "DataSummary") -> None:
     spreads = Table("", "mean", "least", "5 %", "median", "95 %", "most")
     parts = ((summary.length, 1.0), (summary.detour, 1.0), (summary.clearance, 100.0))
     for name, (spread, scale) in zip(units, parts, strict=True):
-        spreads.add_row(name, *(f"{scale * value:.3f}" for value in (spread.mean, *spread.quantiles)))
+        spreads.add_row(name, *(_rounded(scale * value) for value in (spread.mean, *spread.quantiles)))
     console.print(spreads)
 
 
 def _median(spread: "Spread", scale: float = 1.0) -> str:
-    return f"{scale * spread.quantiles[2]:.3f}"
+    return _rounded(scale * spread.quantiles[2])
+
+
+def _rounded(value: float) -> str:
+    return f"{round(value, 3) + 0.0:.3f}"  # no negative zero
 
 
 def run_check(arguments: argparse.Namespace) -> int:
@@ -195,7 +199,7 @@ def print_check(check: "DataCheck") -> None:
     for kind, name in KINDS.items():
         left_out = kind == "pybullet" and not check.pybullet
         table.add_row(name, "not asked" if left_out else f"{check.counts[kind]:,}")
-    table.add_row("least clearance recorded", f"{1e3 * check.least_clearance:.2f} mm")
+    table.add_row("least clearance recorded", f"{_rounded(1e3 * check.least_clearance)} mm")
     console.print(table)
     if check.examples:
         examples = Table("first examples", "where", "what")

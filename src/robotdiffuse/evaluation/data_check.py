@@ -50,8 +50,8 @@ LIMIT_SLACK = 1e-6
 """Limits are held up to this, for frames are in single precision [rad]."""
 CLEARANCE_TOLERANCE = 1e-4
 """The recorded clearance may differ by this from the least one of the frames by covering spheres [m]."""
-COST_TOLERANCE = 0.02
-"""Frames may cut corners: they may be shorter than the recorded length by this share ..."""
+COST_TOLERANCE = 0.05
+"""Frames cut corners, timed ones more: they may be shorter than the recorded length by this share ..."""
 ROUNDING = 1e-4
 """... and longer by this; the detour must be as recorded up to this."""
 PYBULLET_STEP = 0.01

@@ -131,7 +131,10 @@ def clearances(columns: DataColumns, safety_distance: float) -> str:
     figure = _figure(4, 2.3)
     axes = figure.subplots()
     values = 100 * columns.all["clearance"]
-    _histogram(axes, columns, values, np.linspace(0, max(_end(values), 120 * safety_distance), BINS))
+    end = max(_end(values), 120 * safety_distance)
+    # the safety distance lies between two bars, for many motions keep exactly that
+    width = 100 * safety_distance / max(1, round(BINS * 100 * safety_distance / end)) or end / BINS
+    _histogram(axes, columns, values, np.arange(0, end + width, width))
     axes.axvline(100 * safety_distance, color=INK, linewidth=1, linestyle=(0, (3, 2)))
     place = axes.get_xaxis_transform()
     axes.text(100 * safety_distance + 0.15, 0.8, "safety\ndistance", transform=place, fontsize=7.5)
@@ -259,7 +262,7 @@ def tips(positions: dict[str, Float[ndarray, "n 3"]]) -> str:
             few = points[:: -(-len(points) // MOST_TIPS)] if len(points) else points
             size = 3.0 if len(few) > 800 else 6.0
             axes.scatter(
-                few[:, 0], few[:, across], size, color, alpha=0.45, linewidths=0, label=end, rasterized=True
+                few[:, 0], few[:, across], size, color, alpha=0.6, linewidths=0, label=end, rasterized=True
             )
         axes.set_xlim(-reach, reach)
         axes.set_ylim(*((-reach, reach) if across == 1 else (0, 1.25 * reach)))
