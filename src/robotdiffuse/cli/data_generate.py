@@ -37,7 +37,6 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--workers",
         type=count,
-        default=os.cpu_count() or 1,
         metavar="N",
         help="processes (default: all cores)",
     )
@@ -61,13 +60,17 @@ SETTINGS = (
 
 def run_generate(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
+    from datetime import timedelta
     from pathlib import Path
 
     from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+    from robotdiffuse.errors import InputError
     from robotdiffuse.generation import GenerationSettings, generate
 
+    if arguments.cluster is not None and arguments.workers is not None:
+        raise InputError("--workers is for this machine's processes; --cluster uses all cores that it has")
     given = {name: getattr(arguments, name) for name in SETTINGS if getattr(arguments, name) is not None}
     settings = GenerationSettings(**given)
     if arguments.safety_distance is not None:
@@ -79,20 +82,22 @@ def run_generate(arguments: argparse.Namespace) -> int:
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"),
         TimeElapsedColumn(),
-        TimeRemainingColumn(),
+        TextColumn("{task.fields[left]}"),
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("trajectories", rate="", total=settings.trajectories)
-        first: list[int] = []
+        task = bar.add_task("trajectories", rate="", left="", total=settings.trajectories)
+        before: list[int] = []
 
-        def show(done: int, _total: int) -> None:
-            if not first:
-                first.append(done)
+        def show(done: int, total: int) -> None:
+            if not before:
+                before.append(done)
                 bar.reset(task, completed=done)
-            elapsed = bar.tasks[0].elapsed or 0.0
-            rate = f"{(done - first[0]) / elapsed:.0f}/s" if done > first[0] and elapsed > 0 else ""
-            bar.update(task, completed=done, rate=rate)
+            elapsed, new = bar.tasks[0].elapsed, done - before[0]
+            if elapsed and new:
+                left = timedelta(seconds=round((total - done) * elapsed / new))
+                bar.update(task, completed=done, rate=f"{new / elapsed:.1f}/s", left=f"{left} left")
 
-        made = generate(settings, Path(arguments.out), arguments.workers, arguments.cluster, show)
+        workers = arguments.workers or os.cpu_count() or 1
+        made = generate(settings, Path(arguments.out), workers, arguments.cluster, show)
     print(f"{made:,} trajectories of {settings.frames} frames in {arguments.out}")
     return 0

@@ -1,16 +1,17 @@
 """From settings to a folder of shards: what is there is kept, what is missing is made, here or on Ray."""
 
+import fcntl
 import json
-import platform
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
-from robotdiffuse import __version__
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.generation.settings import FAMILIES, SLOTS, GenerationSettings
-from robotdiffuse.generation.workers import CLUSTERS, on_this_machine
+from robotdiffuse.generation.workers import CLUSTERS, on_this_machine, versions
 from robotdiffuse.learning.shards import (
     MANIFEST,
     Manifest,
@@ -38,37 +39,83 @@ def generate(
     Ray cluster that RAY_ADDRESS names, or by one started here. `progress` is called with the numbers of
     trajectories that are there and of all.
 
-    Raises InputError for a folder of other settings, of another version or robot, or one that cannot be
-    written.
+    Raises InputError for a folder of other settings, of another version or robot, one that cannot be
+    written, or one that another process is filling.
     """
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
     if cluster is not None and cluster not in CLUSTERS:
         raise unknown_name("cluster", cluster, CLUSTERS)
-    _claim(settings, out)
-    remove_leftovers(out)
+    wanted = manifest_of(settings)
+    with _alone_in(out):
+        try:
+            _tidy(out)
+            _claim(wanted, out)
+            return _fill(settings, out, workers, cluster, progress or _silent)
+        finally:
+            _tidy(out)
+
+
+def _silent(_done: int, _total: int) -> None:
+    """No progress is shown."""
+
+
+def _fill(
+    settings: GenerationSettings,
+    out: Path,
+    workers: int,
+    cluster: str | None,
+    progress: Callable[[int, int], None],
+) -> int:
     there = set(shard_indices(out))
     missing = [index for index in range(settings.shards) if index not in there]
     done = settings.trajectories - sum(settings.rows(index) for index in missing)
-    if progress:
-        progress(done, settings.trajectories)
-    if missing:
-        if cluster is None:
-            made = on_this_machine(settings, missing, workers)
-        else:
-            made = CLUSTERS[cluster](settings, missing)
+    progress(done, settings.trajectories)
+    if not missing:
+        return settings.trajectories
+    if cluster is None:
+        made = on_this_machine(settings, missing, workers)
+    else:
+        made = CLUSTERS[cluster](settings, missing)
+    # closed at once, so that nobody works on when this is interrupted
+    with closing(made):
         for index, (arrays, counts) in made:
             write_shard(out, index, arrays, counts)
             done += settings.rows(index)
-            if progress:
-                progress(done, settings.trajectories)
+            progress(done, settings.trajectories)
     return settings.trajectories
+
+
+@contextmanager
+def _alone_in(out: Path) -> Iterator[None]:
+    """Make the folder and lock it; the lock ends with this process, however that ends."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError as error:
+        raise InputError(f"cannot use the folder {out}: {error.strerror}") from None
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"another process is filling {out}; wait for it") from None
+        except OSError:
+            pass  # a file system without locks
+        yield
+    finally:
+        os.close(folder)
+
+
+def _tidy(out: Path) -> None:
+    """Remove what is half-written, by a killed process or for want of room on the disk."""
+    remove_leftovers(out)
+    for leftover in out.glob(f".{MANIFEST}.*"):
+        leftover.unlink(missing_ok=True)
 
 
 def manifest_of(settings: GenerationSettings) -> Manifest:
     """The manifest of the data that the settings make."""
     robot = load_robot(settings.robot)
-    packages = ("numpy", "numba", "zarr")
     return Manifest(
         robot=settings.robot,
         robot_fingerprint=robot_fingerprint(robot),
@@ -83,26 +130,25 @@ def manifest_of(settings: GenerationSettings) -> Manifest:
         trajectories=settings.trajectories,
         shard=settings.shard,
         settings=asdict(settings),
-        versions={"robotdiffuse": __version__, "python": platform.python_version()}
-        | {name: version(name) for name in packages},
+        versions=versions(),
     )
 
 
-def _claim(settings: GenerationSettings, out: Path) -> None:
+def _claim(wanted: Manifest, out: Path) -> None:
     """Write the manifest, or see to it that the one that is there is of the same data."""
-    wanted = manifest_of(settings)
     if not (out / MANIFEST).exists():
         if shard_indices(out):
             raise InputError(f"{out} holds shards but no {MANIFEST}; use another folder")
         write_manifest(out, wanted)
         return
     found = read_manifest(out)
-    found.check_robot(load_robot(settings.robot))
-    for name, value in wanted.settings.items():
-        if _plain(found.settings.get(name)) != _plain(value):
+    found.check_robot(load_robot(wanted.robot))
+    begun = _flat(found.settings)
+    for name, value in _flat(wanted.settings).items():
+        if begun.get(name) != value:
             raise InputError(
-                f"{out} was begun with {name} {found.settings.get(name)}, not {value}; use the same "
-                "settings, or another folder"
+                f"{out} was begun with {name} {begun.get(name)}, not {value}; use the same settings, or "
+                "another folder"
             )
     for name, value in wanted.versions.items():
         if found.versions.get(name) != value:
@@ -112,6 +158,9 @@ def _claim(settings: GenerationSettings, out: Path) -> None:
             )
 
 
-def _plain(value: object) -> object:
-    """As it comes back from JSON."""
-    return json.loads(json.dumps(value))
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """As they come back from JSON, those of the search as search.NAME."""
+    flat: dict[str, Any] = {}
+    for name, value in json.loads(json.dumps(settings)).items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return flat

@@ -3,21 +3,43 @@
 import logging
 import multiprocessing
 import os
+import platform
 import signal
+import socket
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
 
+from robotdiffuse import __version__
 from robotdiffuse.errors import InputError
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.shard_maker import Arrays, Counts, make_shard
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.fingerprint import robot_fingerprint
 
-Made = Iterator[tuple[int, tuple[Arrays, Counts]]]
+Made = Generator[tuple[int, tuple[Arrays, Counts]], None, None]
+PACKAGES = ("numpy", "numba", "zarr")
+CONNECT_SECONDS = 5.0
+"""Until a Ray cluster that does not answer is given up; Ray itself tries for minutes."""
+LOST_NODES = 20
+"""Times that a shard is begun again on another node of a Ray cluster."""
+GO_ON = "the finished shards are kept, the same command goes on"
+
+
+def versions() -> dict[str, str]:
+    """What the data may differ by, besides the settings and the robot."""
+    return {"robotdiffuse": __version__, "python": platform.python_version()} | {
+        name: version(name) for name in PACKAGES
+    }
 
 
 def on_this_machine(settings: GenerationSettings, indices: list[int], workers: int) -> Made:
-    """Shards made by `workers` processes; no more of them wait to be written than there are processes.
+    """Shards made by `workers` processes; at most one more than that is being made or waits to be written.
 
     Raises InputError if a process is killed from outside, as when memory runs out.
     """
@@ -30,15 +52,27 @@ def on_this_machine(settings: GenerationSettings, indices: list[int], workers: i
         while queue or running:
             while queue and len(running) < workers + 1:
                 index = queue.pop()
-                running[pool.submit(make_shard, settings, index)] = index
+                with _interrupts_held_back():
+                    running[pool.submit(make_shard, settings, index)] = index
             for job in wait(running, return_when=FIRST_COMPLETED).done:
                 yield running.pop(job), job.result()
     except BrokenProcessPool:
-        raise InputError(
-            "a worker process was killed; the finished shards are kept, the same command goes on"
-        ) from None
+        raise InputError(f"a worker process was killed, or could not be started; {GO_ON}") from None
     finally:
         _stop(pool)
+
+
+@contextmanager
+def _interrupts_held_back() -> Iterator[None]:
+    """Ctrl-C waits, and never reaches processes that are started now: they inherit the signal mask.
+
+    So it is the parent alone that handles it, even while workers are still importing.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _stop(pool: ProcessPoolExecutor) -> None:
@@ -50,8 +84,7 @@ def _stop(pool: ProcessPoolExecutor) -> None:
 
 
 def _prepare_worker() -> None:
-    """Ctrl-C is the parent's to handle; a worker ends with it, even where it is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """A worker ends with its parent, even where that is killed."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -66,38 +99,85 @@ def _end_with_parent() -> None:
 def on_ray(settings: GenerationSettings, indices: list[int]) -> Made:
     """Shards made as tasks of one core each by a Ray cluster; those of a lost node are made again elsewhere.
 
-    Raises InputError if Ray is not installed or its cluster cannot be reached.
+    The cluster is the one that RAY_ADDRESS names, or is started here with all cores. Its nodes need the same
+    versions of this package and of what it computes with; where the robot is a URDF, at the same place.
+    Raises InputError if Ray is not installed, its cluster cannot be reached, or its nodes do not fit.
     """
+    # read when ray is imported: messages on a lost node are pages long, but for the one on the task
+    os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray
-        from ray.exceptions import RayTaskError
+        from ray.exceptions import RayError, RayTaskError
     except ImportError:
         raise InputError('a Ray cluster needs ray: pip install "robotdiffuse[cluster]"') from None
     ours = not ray.is_initialized()
     if ours:
-        try:
-            ray.init(log_to_driver=False, logging_level=logging.ERROR)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            raise InputError(f"no Ray cluster: {' '.join(str(error).split())}") from None
-    # -1: as often as nodes are lost
-    task = ray.remote(num_cpus=1, max_retries=-1)(make_shard)
+        _check_reachable(os.environ.get("RAY_ADDRESS", ""))
+    if Path(settings.robot).exists():
+        # nodes have other working folders
+        settings = replace(settings, robot=str(Path(settings.robot).resolve()))
+    here = _bearings(settings)
     queue, running = list(reversed(indices)), {}
     try:
+        if ours:
+            ray.init(log_to_driver=False, logging_level=logging.CRITICAL)
+        task = ray.remote(num_cpus=1, max_retries=LOST_NODES)(_make_on_node)
         while queue or running:
-            most = 2 * int(ray.cluster_resources().get("CPU", 1))
+            most = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
             while queue and len(running) < most:
                 index = queue.pop()
-                running[task.remote(settings, index)] = index
+                running[task.remote(settings, index, here)] = index
             done, _ = ray.wait(list(running), num_returns=1)
             for reference in done:
                 yield running.pop(reference), ray.get(reference)
     except RayTaskError as error:
         if isinstance(error.cause, InputError):
             raise InputError(str(error.cause)) from None
+        if "failed to import" in str(error):
+            raise InputError(
+                f"a node of the Ray cluster cannot import robotdiffuse; install {__version__} on all"
+            ) from None
         raise
+    except RayError as error:
+        raise InputError(f"the Ray cluster failed: {_line(error)}; {GO_ON}") from None
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        if running:
+            raise
+        raise InputError(f"no Ray cluster: {_line(error)}") from None
     finally:
         if ours:
             ray.shutdown()
+
+
+def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, str]) -> tuple[Arrays, Counts]:
+    for name, found in _bearings(settings).items():
+        if found != wanted[name]:
+            raise InputError(
+                f"a node of the Ray cluster has {name} {found}, this machine {wanted[name]}; their data may "
+                "differ: install the same on all"
+            )
+    return make_shard(settings, index)
+
+
+def _bearings(settings: GenerationSettings) -> dict[str, str]:
+    """What two machines must have in common to make the same data."""
+    return versions() | {f"robot {settings.robot}": robot_fingerprint(load_robot(settings.robot))}
+
+
+def _check_reachable(address: str) -> None:
+    """Raises InputError if nobody listens where the address HOST:PORT or ray://HOST:PORT says."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    if not host or not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
+    except (OSError, OverflowError) as error:
+        raise InputError(f"no Ray cluster at {address}, where RAY_ADDRESS says: {error}") from None
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())
 
 
 CLUSTERS: dict[str, Callable[[GenerationSettings, list[int]], Made]] = {"ray": on_ray}
