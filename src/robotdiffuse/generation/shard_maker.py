@@ -41,7 +41,7 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
     """
     robot, rows = load_robot(settings.robot), settings.rows(index)
     kept: list[Row] = []
-    counts = dict.fromkeys(("tried", "solved", "thinned", "unsolved", "refused"), 0)
+    counts: Counts = dict.fromkeys(("tried", "solved", "thinned", "unsolved", "refused"), 0)
     while len(kept) < rows:
         if counts["tried"] >= TRIES * rows + GRACE:
             raise InputError(
@@ -85,7 +85,8 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     if not judge.path(Path(robot.joint_names, q.astype(np.float64))).valid:
         return "refused"
     row = _row(settings, drawn, search, q)
-    row["clearance"] = checker.link_clearances(q).min()
+    clearances = checker.link_clearances(q).min(axis=1)
+    row["clearance"], row["end_clearance"] = clearances.min(), clearances[[0, -1]]
     row["line_free"] = np.bool_(line_free)
     row["seed"] = np.uint64(number)
     if settings.timing == "time":
