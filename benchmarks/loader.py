@@ -69,6 +69,7 @@ def write_store(folder: str, robot: Robot, trajectories: int) -> None:
             "obstacle_kinds": np.stack([kinds for kinds, _ in packed]),
             "obstacle_params": np.stack([params for _, params in packed]),
             "family": dense,
+            "end_clearance": np.zeros((n, 2)),
             **{name: np.zeros(n) for name in ("cost", "clearance", "safety_distance", "line_free", "detour")},
             "seed": np.arange(n),
         }

@@ -43,6 +43,7 @@ def record(
         "family": np.array(family),
         "cost": length,
         "clearance": CollisionChecker(robot, scene).link_clearances(q).min(initial=1.0),
+        "end_clearance": CollisionChecker(robot, scene).link_clearances(q[[0, -1]]).min(axis=1, initial=1.0),
         "safety_distance": np.array(0.05 if family == 0 else 0.04),
         "line_free": np.array(line_free),
         "detour": length / np.linalg.norm(q[-1].astype(np.float64) - q[0]),

@@ -68,6 +68,7 @@ def random_arrays(robot: Robot, n: int, rng: Generator, frames: int = FRAMES) ->
         "family": np.zeros(n, np.int8),
         "cost": np.ones(n, np.float32),
         "clearance": np.full(n, 0.05, np.float32),
+        "end_clearance": np.full((n, 2), 0.05, np.float32),
         "safety_distance": np.full(n, 0.05, np.float32),
         "line_free": rng.random(n) < 0.3,
         "detour": np.ones(n, np.float32),

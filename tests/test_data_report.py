@@ -36,7 +36,7 @@ def test_figures(tmp_path, rows):
     assert summary.length.quantiles == pytest.approx(np.quantile(costs, QUANTILES))
     assert summary.detour.quantiles == pytest.approx(np.ones(5), abs=1e-5)
     assert summary.trivial == pytest.approx(7 / 11)
-    assert summary.safety_distance == pytest.approx(0.05) and summary.kept == pytest.approx(6 / 11)
+    assert summary.safety_distance == pytest.approx(0.05) and summary.kept == summary.kept_throughout == 1.0
     assert summary.goals_reached == 1
     assert {name: family.trajectories for name, family in summary.families.items()} == {
         "rop": 6,

@@ -130,7 +130,10 @@ def print_summary(summary: "DataSummary") -> None:
     table.add_row(
         "problems tried", f"{counts.get('tried', 0):,}: {100 * summary.success:.1f} % solved; {lost}"
     )
-    safety = f"{100 * summary.safety_distance:.3g} cm kept by {100 * summary.kept:.1f} %"
+    safety = (
+        f"{100 * summary.safety_distance:.3g} cm, or what start and goal have, kept by "
+        f"{100 * summary.kept:.1f} %; where both have it, by {100 * summary.kept_throughout:.1f} %"
+    )
     table.add_row("safety distance", f"{safety} of the searches")
     table.add_row("goals reached", f"{summary.goals_reached:.1f} per problem")
     console.print(table)

@@ -275,10 +275,16 @@ def _wrong(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
         yield "collision", f"{violation.message} at frame {violation.time:.2f}"
     elif violation is not None and violation.kind not in ("limits", "start"):
         yield "motion", violation.message
-    measured = float(CollisionChecker(robot, problem.scene).link_clearances(path.positions).min(initial=1.0))
+    checker = CollisionChecker(robot, problem.scene)
+    clearances = checker.link_clearances(path.positions).min(axis=1, initial=1.0)
+    measured = float(clearances.min())
     recorded = float(shard["clearance"][row])
     if abs(measured - recorded) > CLEARANCE_TOLERANCE:
         yield "clearance", f"clearance is {1e3 * recorded:.2f} mm; measured: {1e3 * measured:.2f} mm"
+    worst = int(np.abs(shard["end_clearance"][row] - clearances[[0, -1]]).argmax())
+    end, at_end = float(shard["end_clearance"][row, worst]), float(clearances[[0, -1]][worst])
+    if abs(end - at_end) > CLEARANCE_TOLERANCE:
+        yield "clearance", f"end_clearance is {1e3 * end:.2f} mm; measured: {1e3 * at_end:.2f} mm"
 
 
 def _ends(shard: Shard, row: int) -> Iterator[tuple[str, str]]:

@@ -165,7 +165,10 @@ def _tiles(summary: DataSummary) -> str:
         (f"{summary.frames:,}", "frames"),
         (size_in_words(summary.bytes), f"in {summary.shards:,} shards"),
         (f"{100 * summary.success:.1f} %", "of problems solved"),
-        (f"{100 * summary.kept:.1f} %", f"searches keep all {100 * summary.safety_distance:.3g}\u00a0cm"),
+        (
+            f"{100 * summary.kept:.1f} %",
+            f"come no closer than {100 * summary.safety_distance:.3g}\u00a0cm or than their ends",
+        ),
         (f"{100 * summary.trivial:.1f} %", "trivial: the line is free"),
         (f"{summary.length.quantiles[2]:.2f} rad", "median length"),
         (train[1], f"to {train[0]} on, " + ", ".join(f"{count} {name}" for name, count in held_out)),

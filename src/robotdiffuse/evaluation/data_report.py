@@ -24,13 +24,24 @@ SAMPLE = 20_000
 """Motions, spread evenly over the set, whose larger arrays are kept for the plots."""
 FRAMES_KEPT = 24
 """Frames of each of these, spread evenly."""
-SMALL = ("cost", "clearance", "safety_distance", "line_free", "detour", "family", "goal_index")
+SMALL = (
+    "cost",
+    "clearance",
+    "end_clearance",
+    "safety_distance",
+    "line_free",
+    "detour",
+    "family",
+    "goal_index",
+)
 """Arrays that are kept of all motions."""
 LARGE = ("start", "goals", "goal_costs", "target_pose", "obstacle_kinds", "obstacle_params", "trajectories")
 """Arrays that are kept of the sample."""
 REASONS = ("solved", "unsolved", "refused", "thinned")
 """What becomes of a problem that was tried."""
-KEPT_SLACK = 1e-6
+KEPT_SLACK = 0.002
+"""By this a motion may come closer than the safety distance and still count as keeping it: frames cut corners
+[m]."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +111,9 @@ class DataSummary:
     safety_distance: float
     """That the search set out with [m]."""
     kept: float
-    """Share of motions whose search kept the whole safety distance."""
+    """Share of motions that come no closer than the safety distance, or than the closer of start and goal."""
+    kept_throughout: float
+    """Share of motions that keep the safety distance all along, of those whose ends have it; nan if none have."""
     trivial: float
     """Share of motions that the straight line would have done."""
     goals_reached: float
@@ -167,7 +180,8 @@ def summarize(columns: DataColumns) -> DataSummary:
         for i, name in enumerate(family_names(manifest))
         if (rows["family"] == i).any()
     }
-    whole = safety_distance(columns)
+    whole, ends = safety_distance(columns), rows["end_clearance"].min(axis=1)
+    apart = rows["clearance"][ends >= whole]
     return DataSummary(
         robot=manifest.robot,
         timing=manifest.timing,
@@ -183,7 +197,8 @@ def summarize(columns: DataColumns) -> DataSummary:
         detour=_spread(rows["detour"]),
         clearance=_spread(rows["clearance"]),
         safety_distance=whole,
-        kept=float((rows["safety_distance"] >= whole - KEPT_SLACK).mean()),
+        kept=float((rows["clearance"] >= np.minimum(whole, ends) - KEPT_SLACK).mean()),
+        kept_throughout=float((apart >= whole - KEPT_SLACK).mean()) if len(apart) else float("nan"),
         trivial=float(rows["line_free"].mean()),
         goals_reached=float(np.isfinite(columns.sample["goal_costs"]).sum(axis=1).mean()),
     )

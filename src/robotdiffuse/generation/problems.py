@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from numpy.random import Generator
 
@@ -19,6 +19,8 @@ from robotdiffuse.scenes.scene import Scene
 
 SCENES = 100
 """Scenes given up, for want of a start or of a goal, before the settings are called impossible."""
+AT_LIMIT = 1e-3
+"""Joints closer than this to a limit count as clipped [rad]."""
 FULL_POSE = InverseKinematicsSettings(max_rounds=4, patience=2)
 """A few rounds: a target inside an obstacle is better drawn anew than searched for long."""
 POSITION_ONLY = replace(FULL_POSE, position_only=True)
@@ -105,8 +107,14 @@ def _reaching(
     rng: Generator,
     settings: InverseKinematicsSettings,
 ) -> Float32[ndarray, "k dof"]:
-    """Free configurations, rounded to what the data hold, so that the judge sees exactly these."""
-    q = inverse_kinematics(
-        robot, robot.tip, T_base_tip, count, rng=rng, accept=checker.free, settings=settings
-    )
+    """Free configurations, rounded to what the data hold, so that the judge sees exactly these.
+
+    Solutions with a joint at a limit, where the solver clips it, would be far too many, and are left out.
+    """
+
+    def accept(q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
+        inside = ((q > robot.lower + AT_LIMIT) & (q < robot.upper - AT_LIMIT)).all(axis=1)
+        return inside & checker.free(q)
+
+    q = inverse_kinematics(robot, robot.tip, T_base_tip, count, rng=rng, accept=accept, settings=settings)
     return q.astype(np.float32)

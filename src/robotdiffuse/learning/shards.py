@@ -48,6 +48,7 @@ ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
     "family": ("|i1", ()),
     "cost": ("<f4", ()),
     "clearance": ("<f4", ()),
+    "end_clearance": ("<f4", (2,)),
     "safety_distance": ("<f4", ()),
     "line_free": ("|b1", ()),
     "detour": ("<f4", ()),
@@ -59,7 +60,8 @@ Joint values [rad], times [s], lengths [m]. `trajectories` begin at `start` and 
 exactly. Rows of `goals` beyond those that a problem has are NaN, and so are their `goal_costs`; the cost of a
 goal that was not reached is inf. `target_pose` is wxyz_xyz of the tip in the base frame. Obstacles are as
 `pack_scene` packs them, without the floor. `cost` is the joint-space length of the path [rad], `clearance` a
-lower bound of its distance to obstacles [m], `safety_distance` the distance that the search kept [m],
+lower bound of its distance to obstacles [m], `end_clearance` that of start and reached goal alone,
+`safety_distance` the distance that the search kept but near ends that are closer themselves [m],
 `line_free` whether the straight line would have done, `detour` the cost in units of the straight line's,
 `seed` the number of the problem.
 """
