@@ -113,7 +113,7 @@ class DataSummary:
     kept: float
     """Share of motions that come no closer than the safety distance, or than the closer of start and goal."""
     kept_throughout: float
-    """Share of motions that keep the safety distance all along, of those whose ends have it; nan if none have."""
+    """Share that keeps the safety distance all along, of motions whose ends have it; nan if none have."""
     trivial: float
     """Share of motions that the straight line would have done."""
     goals_reached: float
