@@ -3,6 +3,8 @@
 import fcntl
 import json
 import os
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict
@@ -80,10 +82,27 @@ def _fill(
     # closed at once, so that nobody works on when this is interrupted
     with closing(made):
         for index, (arrays, counts) in made:
-            write_shard(out, index, arrays, counts)
+            with _interrupts_afterwards():
+                write_shard(out, index, arrays, counts)
             done += settings.rows(index)
             progress(done, settings.trajectories)
     return settings.trajectories
+
+
+@contextmanager
+def _interrupts_afterwards() -> Iterator[None]:
+    """Ctrl-C takes effect afterwards: zarr's threads would go on writing what was tidied up."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _frame: caught.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if caught:
+        signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager

@@ -52,7 +52,7 @@ def on_this_machine(settings: GenerationSettings, indices: list[int], workers: i
         while queue or running:
             while queue and len(running) < workers + 1:
                 index = queue.pop()
-                with _interrupts_held_back():
+                with _interrupts_not_passed_on():
                     running[pool.submit(make_shard, settings, index)] = index
             for job in wait(running, return_when=FIRST_COMPLETED).done:
                 yield running.pop(job), job.result()
@@ -63,8 +63,8 @@ def on_this_machine(settings: GenerationSettings, indices: list[int], workers: i
 
 
 @contextmanager
-def _interrupts_held_back() -> Iterator[None]:
-    """Ctrl-C waits, and never reaches processes that are started now: they inherit the signal mask.
+def _interrupts_not_passed_on() -> Iterator[None]:
+    """Ctrl-C never reaches processes that are started meanwhile: they inherit the signal mask.
 
     So it is the parent alone that handles it, even while workers are still importing.
     """

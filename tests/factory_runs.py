@@ -1,0 +1,78 @@
+"""Runs of the data factory for tests: in this process, or by the real command line."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from robotdiffuse.generation import GenerationSettings
+from robotdiffuse.generation.shard_maker import Arrays, Counts, make_shard
+
+COMMAND = (sys.executable, "-c", "import sys; from robotdiffuse.cli import main; sys.exit(main())")
+
+
+def in_this_process(
+    settings: GenerationSettings, indices: list[int], _workers: int
+) -> Iterator[tuple[int, tuple[Arrays, Counts]]]:
+    """Makes shards as `workers.on_this_machine` does, but without processes."""
+    for index in indices:
+        yield index, make_shard(settings, index)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """All files of a folder, hidden ones too, byte for byte."""
+    files = (file for file in sorted(folder.rglob("*")) if file.is_file())
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+def start(out: Path, trajectories: int, shard: int, frames: int, workers: int) -> subprocess.Popen[str]:
+    """The command, as the first of a process group of its own."""
+    sizes = {"trajectories": trajectories, "shard": shard, "frames": frames, "workers": workers}
+    options = [text for name, value in sizes.items() for text in (f"--{name}", str(value))]
+    return subprocess.Popen(
+        [*COMMAND, "data", "generate", "--out", str(out), *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def shards(out: Path) -> int:
+    return len(list(out.glob("shard_*.zarr")))
+
+
+def wait_for_shards(run: subprocess.Popen[str], out: Path, count: int, seconds: float = 60.0) -> None:
+    """Until the folder holds so many shards, or the command has ended."""
+    end = time.monotonic() + seconds
+    while shards(out) < count and run.poll() is None:
+        assert time.monotonic() < end, f"no {count} shards in {seconds} s"
+        time.sleep(0.005)
+
+
+def group_ends(group: int, seconds: float = 30.0) -> bool:
+    """Whether all processes of a group end within a time."""
+    end = time.monotonic() + seconds
+    while members(group):
+        if time.monotonic() > end:
+            os.killpg(group, signal.SIGKILL)
+            return False
+        time.sleep(0.05)
+    return True
+
+
+def members(group: int) -> list[int]:
+    """Processes of a group that run; those that have ended and only wait to be collected do not count."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            # the name, in parentheses, may hold anything
+            state, _, pgrp = stat.read_text().rpartition(")")[2].split()[:3]
+        except (OSError, ValueError):
+            continue
+        if int(pgrp) == group and state != "Z":
+            found.append(int(stat.parent.name))
+    return found
