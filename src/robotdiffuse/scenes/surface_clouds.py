@@ -71,7 +71,7 @@ def surface_clouds(
                 counts &= ~_hidden(shapes.some(rows, used), cloud, shape, eyes[rows])
             cloud = _first(cloud, counts, count)
         if ordered:
-            _sort(cloud)
+            sort_points(cloud)
         clouds[order[rows]] = torch.stack(cloud, -1)
     return clouds
 
@@ -264,8 +264,11 @@ def _first(points: Points, counts: Bool[Tensor, "b m"], count: int) -> Points:
     return [p.gather(1, source).mul_(total > 0) for p in points]
 
 
-def _sort(points: Points) -> None:
-    """Sort each scene's points in place: as integers that hold x, y, z one after the other."""
+def sort_points(points: Points) -> None:
+    """Sort each scene's points in place by x, then y, then z: as integers that hold one after the other.
+
+    Coordinates are rounded to a millionth of the scene's largest.
+    """
     middle = 1 << (BITS - 1)
     largest = torch.stack([p.abs().amax(1) for p in points]).amax(0)
     scale = ((middle - 1) / largest.clamp(min=TINY))[:, None]

@@ -4,22 +4,27 @@ The paper's encoder is a perceptron over 1,400 points in a fixed order. This one
 point and pools (Qi et al. 2017, PointNet), so that neither the order nor the number of points matters.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
 
+import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.random import Generator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.scenes.sampling import PANDA_REGION, VisibleRegion
+from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
+
+QUERIES = 96
+"""Points per cloud at which the distance field is reconstructed."""
+DISTANCE_CAP = 0.5
+"""Reconstructed distances are capped [m]."""
 
 
 @dataclass(frozen=True)
-class PointAutoencoderSettings:
-    code: int = 96
-    """Size of z (paper: 60, for two obstacles)."""
+class PointAutoencoderSettings(EncoderSettings):
     points: tuple[int, ...] = (64, 128, 256)
     """Layers of the perceptron on each point."""
     octaves: int = 4
@@ -28,24 +33,22 @@ class PointAutoencoderSettings:
     """Layer between the pooled features and z, and in the decoder."""
     decoded: int = 192
     """Points that the decoder reconstructs."""
-    region: VisibleRegion = PANDA_REGION
-    """Points outside do not count: the arm gets nowhere near them."""
+    distance_weight: float = 4.0
+    """In training: weight of the error of the reconstructed distance field beside the Chamfer distance, both
+    in metres."""
 
     def __post_init__(self) -> None:
-        if not self.points or min(self.points) < 1:
-            raise InputError(f"encoder.points is {self.points}; it must be the sizes of one layer or more")
+        super().__post_init__()
+        self.check_layers("points")
 
 
-class PointAutoencoder(nn.Module):
+class PointAutoencoder(Autoencoder):
     """z = MLP(max-pool and mean-pool of MLP(point)); decoded to points and to a distance field."""
 
-    center: Tensor
-    mean: Tensor
-    scale: Tensor
+    settings: PointAutoencoderSettings
 
     def __init__(self, settings: PointAutoencoderSettings) -> None:
-        super().__init__()
-        self.settings = settings
+        super().__init__(settings)
         sizes = (3 + 6 * settings.octaves, *settings.points)
         self.points = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
         self.empty = nn.Parameter(torch.zeros(2 * sizes[-1]))
@@ -64,21 +67,6 @@ class PointAutoencoder(nn.Module):
             nn.GELU("tanh"), nn.Linear(192, 192), nn.GELU("tanh"), nn.Linear(192, 192), nn.GELU("tanh"),
             nn.Linear(192, 1),
         )  # fmt: skip
-        self.register_buffer("center", torch.tensor(settings.region.center), persistent=False)
-        self.register_buffer("mean", torch.zeros(code))
-        self.register_buffer("scale", torch.ones(code))
-
-    def near(self, cloud: Float[Tensor, "batch points 3"]) -> Tensor:
-        """Which points count, [batch points] of bool: those in the region."""
-        region = self.settings.region
-        return ((cloud - self.center).square().sum(-1) < region.reach**2) & (cloud[..., 2] > region.floor)
-
-    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
-        """z of each cloud; standardised once `standardize` was called. A cloud may hold no point at all.
-
-        Points outside the region do not count, so that clouds of different size may share a batch.
-        """
-        return (self.encode(cloud) - self.mean) / self.scale
 
     def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
         """z before standardisation."""
@@ -86,7 +74,7 @@ class PointAutoencoder(nn.Module):
         if cloud.shape[1] == 0:
             return self.head(empty).float()
         near = self.near(cloud)[..., None]
-        with torch.autocast(cloud.device.type, enabled=False):  # bf16 would round coordinates to 4 mm
+        with fp32(cloud):
             x = functional.relu(self.points[0](self._waves(cloud)))
         for layer in list(self.points)[1:]:
             x = functional.relu(layer(x))
@@ -112,10 +100,46 @@ class PointAutoencoder(nn.Module):
             self.query(self.query_code(code)[:, None] + self.query_point(self._waves(at))).float().squeeze(-1)
         )
 
-    def standardize(self, codes: Float[Tensor, "batch code"]) -> None:
-        """Scale z so that these codes have mean 0 and variance 1 in every place."""
-        self.mean.copy_(codes.mean(0))
-        self.scale.copy_(codes.std(0).clamp(min=1e-4))
+    def loss(
+        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
+    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        """Chamfer distance plus the weighted error of the distance field.
+
+        Errors: `chamfer`, both ways added; `distance`, mean error of the distance field;
+        `distance_of_constant`, that of a constant, all [m].
+        """
+        near = self.near(cloud)
+        at = self._spots(cloud, rng)
+        index, _ = nearest(at, cloud, near)
+        truth = (at - pick(cloud, index)).norm(dim=-1).clamp(max=DISTANCE_CAP)
+        truth = torch.where(near.any(1)[:, None], truth, DISTANCE_CAP)
+        code = self.encode(cloud)
+        guess = self.distance(code, at)
+        apart = chamfer(self.decode(code), cloud, near)
+        field = functional.smooth_l1_loss(guess, truth, beta=0.01)
+        errors = {
+            "chamfer": apart.item(),
+            "distance": (guess - truth).abs().mean().item(),
+            "distance_of_constant": (truth - truth.median()).abs().mean().item(),
+        }
+        return apart + self.settings.distance_weight * field, errors
+
+    def _spots(
+        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
+    ) -> Float[Tensor, "batch queries 3"]:
+        """Places to ask for the distance: half of them close to the surfaces, the others anywhere."""
+        batch, points, _ = cloud.shape
+        low, high = np.array([-1.0, -1.0, 0.0]), np.array([1.0, 1.0, 1.3])
+        spots = torch.from_numpy(rng.uniform(low, high, (batch, QUERIES, 3)).astype(np.float32))
+        chosen = torch.from_numpy(rng.integers(0, points, QUERIES // 2))
+        spread = torch.from_numpy(0.1 * rng.standard_normal((batch, QUERIES // 2, 3), dtype=np.float32))
+        spots, close = spots.to(cloud.device), cloud[:, chosen] + spread.to(cloud.device)
+        away = ~self.near(close)[..., None]
+        return torch.cat([torch.where(away, spots[:, : QUERIES // 2], close), spots[:, QUERIES // 2 :]], 1)
+
+    def penalised(self) -> Iterable[Tensor]:
+        """All parameters."""
+        return self.parameters()
 
 
 def nearest(

@@ -1,0 +1,128 @@
+"""What every encoder of the scene has in common."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Bool, Float
+from numpy.random import Generator
+from torch import Tensor, nn
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.scenes.sampling import PANDA_REGION, VisibleRegion
+
+
+@dataclass(frozen=True)
+class EncoderSettings:
+    """What training and planning need to know of any encoder."""
+
+    code: int = 96
+    """Size of z (paper: 60, for two obstacles)."""
+    cloud: int = 512
+    """Points of the clouds that it is given."""
+    region: VisibleRegion = PANDA_REGION
+    """Points outside do not count: the arm gets nowhere near them. A large reach: whole surfaces."""
+
+    def __post_init__(self) -> None:
+        for name in ("code", "cloud"):
+            if getattr(self, name) < 1:
+                raise InputError(f"encoder.{name} is {getattr(self, name)}; it must be 1 or more")
+
+    def check_layers(self, name: str, most_empty: int = 0) -> None:
+        """Raises InputError unless the field is the sizes of more than `most_empty` layers."""
+        sizes = getattr(self, name)
+        if len(sizes) <= most_empty or min(sizes, default=1) < 1:
+            raise InputError(
+                f"encoder.{name} is {sizes}; it must be the sizes of {most_empty + 1} layers or more"
+            )
+
+
+class Encoder(nn.Module, ABC):
+    """Point cloud to z. The order of the points never matters to `forward`, and a cloud may hold none."""
+
+    trained: ClassVar[Literal["alone", "jointly"]]
+    """Alone, with a loss of its own, and frozen then; or jointly with the planner, by the planner's loss."""
+    any_size: ClassVar[bool] = True
+    """Clouds of any size serve it well; otherwise they should be of about `settings.cloud` points."""
+    settings: EncoderSettings
+    center: Tensor
+
+    def __init__(self, settings: EncoderSettings) -> None:
+        super().__init__()
+        self.settings = settings
+        self.register_buffer("center", torch.tensor(settings.region.center), persistent=False)
+
+    @abstractmethod
+    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z of each cloud [m], float32.
+
+        Points outside the region do not count, so that clouds of different size may share a batch.
+        """
+
+    def near(self, cloud: Float[Tensor, "batch points 3"]) -> Bool[Tensor, "batch points"]:
+        """Which points count: those in the region, and no zeros, which `surface_clouds` fills up with."""
+        region = self.settings.region
+        inside = (cloud - self.center).square().sum(-1) < region.reach**2
+        return inside & (cloud[..., 2] > region.floor) & (cloud != 0).any(-1)
+
+
+class Autoencoder(Encoder):
+    """An encoder that is trained alone, to reconstruct what it encodes."""
+
+    trained = "alone"
+    mean: Tensor
+    scale: Tensor
+
+    def __init__(self, settings: EncoderSettings) -> None:
+        super().__init__(settings)
+        self.register_buffer("mean", torch.zeros(settings.code))
+        self.register_buffer("scale", torch.ones(settings.code))
+
+    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z of each cloud; standardised once `standardize` was called. A cloud may hold no point at all.
+
+        Points outside the region do not count, so that clouds of different size may share a batch.
+        """
+        return (self.encode(cloud) - self.mean) / self.scale
+
+    @abstractmethod
+    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z before standardisation."""
+
+    def standardize(self, codes: Float[Tensor, "batch code"]) -> None:
+        """Scale z so that these codes have mean 0 and variance 1 in every place."""
+        self.mean.copy_(codes.mean(0))
+        self.scale.copy_(codes.std(0).clamp(min=1e-4))
+
+    @abstractmethod
+    def loss(
+        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
+    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        """Loss of the reconstruction, and its errors by name, in metres."""
+
+    @abstractmethod
+    def penalised(self) -> Iterable[Tensor]:
+        """The weights theta of the paper's regulariser, lambda * sum theta^2."""
+
+
+def fp32(tensor: Tensor) -> torch.autocast:
+    """No bf16 within: it would round coordinates to 4 mm."""
+    return torch.autocast(tensor.device.type, enabled=False)
+
+
+def pool_max(
+    features: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
+) -> Float[Tensor, "batch channels"]:
+    """Greatest feature over the points that count; zeros where none does."""
+    low = torch.finfo(features.dtype).min
+    best = features.masked_fill(~near[..., None], low).amax(1)
+    return best.masked_fill(~near.any(1, keepdim=True), 0.0)
+
+
+def pool_mean(
+    features: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
+) -> Float[Tensor, "batch channels"]:
+    """Mean feature over the points that count; zeros where none does."""
+    return (features.float() * near[..., None]).sum(1) / near.sum(1, keepdim=True).clamp(min=1)

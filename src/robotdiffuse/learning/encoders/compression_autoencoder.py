@@ -1,0 +1,100 @@
+"""The paper's compression auto-encoder (section Condition embedding); its encoder is PointEnet.
+
+A perceptron on 1,400 points in a fixed order, 4200 -> 786 -> 512 -> 256 -> 60, and its mirror image. The
+paper leaves open what the order is and the activation. The order is by x, then y, then z; the activation is
+PReLU, as in MPNet (Qureshi et al. 2019), whose encoder this resembles down to the form of its loss.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from numpy.random import Generator
+from torch import Tensor, nn
+
+from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
+from robotdiffuse.scenes.surface_clouds import sort_points
+
+
+@dataclass(frozen=True)
+class CompressionAutoencoderSettings(EncoderSettings):
+    """The paper's sizes."""
+
+    code: int = 60
+    """Size of z."""
+    cloud: int = 1400
+    """Points of a cloud: the input is three times as long."""
+    hidden: tuple[int, ...] = (786, 512, 256)
+    """Layers of the encoder between the cloud and z; the decoder has the same, from the last to the first."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_layers("hidden")
+
+
+class CompressionAutoencoder(Autoencoder):
+    """z = MLP(all points, one after the other)."""
+
+    settings: CompressionAutoencoderSettings
+
+    def __init__(self, settings: CompressionAutoencoderSettings) -> None:
+        super().__init__(settings)
+        sizes = (3 * settings.cloud, *settings.hidden, settings.code)
+        self.encoder, self.decoder = _perceptron(sizes), _perceptron(sizes[::-1])
+
+    def arrange(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch cloud 3"]:
+        """As many points as the network takes, sorted by x, then y, then z.
+
+        Of more points, every so-manieth in that order is kept; fewer are repeated. No point: zeros. Clouds of
+        that size by `surface_clouds(..., ordered=True)` stay as they are, up to rounding.
+        """
+        batch, points, _ = cloud.shape
+        wanted = self.settings.cloud
+        if points == 0:
+            return cloud.new_zeros(batch, wanted, 3)
+        near = self.near(cloud)
+        coordinates = list((cloud * near[..., None]).unbind(-1))
+        sort_points(coordinates)
+        ordered = torch.stack(coordinates, -1)
+        # those that do not count are zeros now; behind the others with them, which keep their order
+        filled = (ordered != 0).any(-1)
+        ordered = ordered.gather(1, (~filled).byte().argsort(stable=True, dim=1)[..., None].expand(-1, -1, 3))
+        at = (torch.arange(wanted, device=cloud.device) * 2 + 1) * filled.sum(1, keepdim=True)
+        index = at.div(2 * wanted, rounding_mode="floor")
+        return ordered.gather(1, index[..., None].expand(-1, -1, 3))
+
+    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        with fp32(cloud):
+            return self.encoder(self.arrange(cloud.float()).flatten(1))
+
+    def decode(self, code: Float[Tensor, "batch code"]) -> Float[Tensor, "batch cloud 3"]:
+        """Reconstructed points [m], in order, from z before standardisation."""
+        with fp32(code):
+            return self.decoder(code.float()).view(len(code), -1, 3)
+
+    def loss(
+        self, cloud: Float[Tensor, "batch points 3"], rng: Generator
+    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        """The first term of l_AE: the mean over points of the squared distance to the reconstruction [m^2].
+
+        The equation's K, which it does not define, is the number of points; its i-hat is the text's x-hat.
+        `reconstruction` is the root of the loss [m].
+        """
+        code = self.encode(cloud)
+        error = (self.decode(code) - self.arrange(cloud)).square().sum(-1).mean()
+        return error, {"reconstruction": error.item() ** 0.5}
+
+    def penalised(self) -> Iterable[Tensor]:
+        """The encoder's weights.
+
+        The equation has (theta^2_ij)^2, which read by the letter is a sum of fourth powers. MPNet's equation
+        has the same place as theta^e_ij, the encoder's weights, squared: taken to be what is meant.
+        """
+        return (layer.weight for layer in self.encoder if isinstance(layer, nn.Linear))
+
+
+def _perceptron(sizes: tuple[int, ...]) -> nn.Sequential:
+    parts = [part for a, b in pairwise(sizes) for part in (nn.Linear(a, b), nn.PReLU())]
+    return nn.Sequential(*parts[:-1])

@@ -1,0 +1,119 @@
+"""DGCNN (Wang et al. 2019, "Dynamic Graph CNN for Learning on Point Clouds"), trained with the planner.
+
+Each layer joins every point with its nearest neighbours, in the space of that layer's own input, and takes
+the maximum over the edges of h(x_i, x_j - x_i). The original's h is a linear layer, batch norm and leaky
+ReLU. Here the norm is over the channels of a point (see pointnet.py for why) and comes after the maximum.
+Without a norm on the edges, the maximum commutes with the rest: with h = W [x_i, x_j - x_i] = (A - B) x_i +
+B x_j, it is over B x_j alone, and the layer costs two matrix products per point instead of one per edge.
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max, pool_mean
+
+SLOPE = 0.2
+"""Of the leaky ReLU below zero, as in the original."""
+FAR = 1e9
+"""Squared distance to points that do not count."""
+
+
+@dataclass(frozen=True)
+class DGCNNSettings(EncoderSettings):
+    """Sizes small enough for training on a CPU; the paper's are in brackets."""
+
+    cloud: int = 128
+    """Points of the clouds that it is given (1024)."""
+    neighbours: int = 8
+    """Nearest points that each is joined with (20)."""
+    edges: tuple[int, ...] = (32, 32, 64)
+    """Layers of edge convolution (64, 64, 128, 256)."""
+    embedding: int = 192
+    """Features of a point, from all those layers together, that are pooled (1024)."""
+    head: tuple[int, ...] = (192,)
+    """Layers between the pooled features and z (512, 256)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.check_layers("edges")
+        for name in ("neighbours", "embedding"):
+            if getattr(self, name) < 1:
+                raise InputError(f"encoder.{name} is {getattr(self, name)}; it must be 1 or more")
+
+
+def neighbours(
+    x: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"], count: int
+) -> Int64[Tensor, "batch points neighbours"]:
+    """Index of the `count` nearest points that count, itself included; itself again where there are fewer."""
+    with torch.no_grad(), fp32(x):
+        x = x.detach().float()
+        squared = x.square().sum(-1)
+        # |a - b|^2 without |a|^2, which is the same for all neighbours of a
+        apart = torch.baddbmm(squared[:, None], x, x.mT, alpha=-2.0)
+        apart = apart.masked_fill(~near[:, None], FAR)
+        found = apart.topk(min(count, x.shape[1]), dim=-1, largest=False, sorted=False)
+        itself = torch.arange(x.shape[1], device=x.device)[:, None]
+        return torch.where(found.values < FAR, found.indices, itself)
+
+
+class EdgeConvolution(nn.Module):
+    """max over neighbours j of h(x_i, x_j - x_i)."""
+
+    def __init__(self, channels: int, out: int, count: int) -> None:
+        super().__init__()
+        self.count = count
+        self.own = nn.Linear(channels, out)
+        self.other = nn.Linear(channels, out, bias=False)
+        self.norm = nn.LayerNorm(out)
+
+    def forward(
+        self, x: Float[Tensor, "batch points channels"], near: Bool[Tensor, "batch points"]
+    ) -> Float[Tensor, "batch points out"]:
+        index = neighbours(x, near, self.count)
+        other = self.other(x)
+        offset = other.shape[1] * torch.arange(len(other), device=x.device)[:, None, None]
+        joined = other.flatten(0, 1)[(index + offset)]
+        return functional.leaky_relu(self.norm(self.own(x) + joined.amax(2)), SLOPE)
+
+
+class DGCNN(Encoder):
+    """z = MLP(max-pool and mean-pool of MLP(outputs of all edge convolutions))."""
+
+    trained = "jointly"
+    any_size = False  # how far neighbours are is how dense the cloud is
+
+    def __init__(self, settings: DGCNNSettings) -> None:
+        super().__init__(settings)
+        self.edges = nn.ModuleList(
+            EdgeConvolution(a, b, settings.neighbours) for a, b in pairwise((3, *settings.edges))
+        )
+        self.embed = nn.Sequential(
+            nn.Linear(sum(settings.edges), settings.embedding),
+            nn.LayerNorm(settings.embedding),
+            nn.LeakyReLU(SLOPE),
+        )
+        sizes = (2 * settings.embedding, *settings.head)
+        self.empty = nn.Parameter(torch.zeros(sizes[0]))
+        head = [(nn.Linear(a, b), nn.LayerNorm(b), nn.LeakyReLU(SLOPE)) for a, b in pairwise(sizes)]
+        self.head = nn.Sequential(
+            *(part for parts in head for part in parts), nn.Linear(sizes[-1], settings.code)
+        )
+
+    def forward(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        if cloud.shape[1] == 0:
+            return self.head(self.empty.expand(len(cloud), -1)).float()
+        near = self.near(cloud)
+        found: list[Tensor] = []
+        with fp32(cloud):
+            found.append(self.edges[0](cloud, near))
+        for layer in list(self.edges)[1:]:
+            found.append(layer(found[-1], near))
+        x = self.embed(torch.cat(found, -1))
+        pooled = torch.cat([pool_max(x, near).float(), pool_mean(x, near)], -1)
+        return self.head(torch.where(near.any(1, keepdim=True), pooled, self.empty)).float()
