@@ -1,4 +1,8 @@
-"""The forward process: x_t = sqrt(alpha_bar_t) x_0 + sqrt(1 - alpha_bar_t) n, with n a Gaussian trajectory.
+"""The forward process: x_t = signal_t x_0 + noise_t n, with n a Gaussian trajectory.
+
+A schedule gives signal and noise of the levels t = 0 .. T. For `cosine` and `linear` they are
+sqrt(alpha_bar_t) and sqrt(1 - alpha_bar_t), so that unit variance stays; `flow` is the straight line from the
+data to the noise.
 
 The noise may be white over the frames (the paper's identity covariance) or have the covariance of the
 training trajectories over the frames. A trajectory is smooth, so white noise hides its low frequencies only
@@ -6,13 +10,14 @@ at the very end of the schedule, and noisy trajectories look like none that a ro
 covariance every frequency is hidden at the same rate, and clearances of noisy trajectories mean something.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, unknown_name
 
 
 @dataclass(frozen=True)
@@ -22,25 +27,76 @@ class ScheduleSettings:
     offset: float = 0.008
     """s of the cosine schedule (Nichol and Dhariwal 2021, eq. 17): the first levels are not too small."""
     floor: float = 1e-4
-    """Least alpha_bar: the last level is pure noise but for this share of the variance."""
+    """Least alpha_bar of the cosine schedule: the last level is noise but for this share of the variance."""
+    kind: str = "cosine"
+    """Name in SCHEDULES."""
 
     def __post_init__(self) -> None:
+        if self.kind not in SCHEDULES:
+            raise unknown_name("schedule.kind", self.kind, SCHEDULES)
         if self.steps < 2:
             raise InputError(f"schedule.steps is {self.steps}; it must be at least 2")
+        if self.kind == "linear" and self.steps <= LINEAR_STEPS * LINEAR_BETAS[1]:
+            raise InputError(
+                f"schedule.steps is {self.steps}; the linear schedule needs more than "
+                f"{LINEAR_STEPS * LINEAR_BETAS[1]:.0f}, or its last step would leave no signal"
+            )
+        if not self.offset >= 0:
+            raise InputError(f"schedule.offset is {self.offset}; it must be 0 or more")
+        if not 0 < self.floor < 1:
+            raise InputError(f"schedule.floor is {self.floor}; it must be between 0 and 1")
+
+
+Levels = tuple[Float[ndarray, "levels"], Float[ndarray, "levels"]]
+"""Signal and noise of the levels 0 .. T."""
+
+LINEAR_BETAS = (1e-4, 0.02)
+"""Variance that the first and last of LINEAR_STEPS steps add (Ho et al. 2020)."""
+LINEAR_STEPS = 1000
+
+
+def cosine(settings: ScheduleSettings) -> Levels:
+    """Nichol and Dhariwal 2021, eq. 17."""
+    t = np.arange(settings.steps + 1) / settings.steps
+    curve = np.cos((t + settings.offset) / (1 + settings.offset) * np.pi / 2) ** 2
+    alpha_bar = np.maximum(curve / curve[0], settings.floor)
+    return np.sqrt(alpha_bar), np.sqrt(1 - alpha_bar)
+
+
+def linear(settings: ScheduleSettings) -> Levels:
+    """Betas that grow evenly (Ho et al. 2020), scaled by 1000 / T so that any T ends at as little signal."""
+    betas = np.linspace(*LINEAR_BETAS, settings.steps) * (LINEAR_STEPS / settings.steps)
+    alpha_bar = np.concatenate([[1.0], np.cumprod(1 - betas)])
+    return np.sqrt(alpha_bar), np.sqrt(1 - alpha_bar)
+
+
+def flow(settings: ScheduleSettings) -> Levels:
+    """x_t = (1 - t/T) x_0 + t/T n: rectified flow, flow matching (Lipman et al. 2023; Liu et al. 2023)."""
+    t = np.arange(settings.steps + 1) / settings.steps
+    return 1 - t, t
+
+
+SCHEDULES: dict[str, Callable[[ScheduleSettings], Levels]] = {
+    "cosine": cosine,
+    "linear": linear,
+    "flow": flow,
+}
+"""Name in ScheduleSettings.kind: function."""
 
 
 class NoiseSchedule:
-    """alpha_bar_t of the levels t = 0 .. T; level 0 is the clean trajectory."""
+    """Signal and noise of the levels t = 0 .. T; level 0 is the clean trajectory."""
 
     def __init__(self, settings: ScheduleSettings) -> None:
         self.settings = settings
-        t = np.arange(settings.steps + 1) / settings.steps
-        curve = np.cos((t + settings.offset) / (1 + settings.offset) * np.pi / 2) ** 2
-        alpha_bar = np.maximum(curve / curve[0], settings.floor)
-        self.signal: Float[ndarray, "levels"] = np.sqrt(alpha_bar)
-        """sqrt(alpha_bar_t)"""
-        self.noise: Float[ndarray, "levels"] = np.sqrt(1 - alpha_bar)
-        """sqrt(1 - alpha_bar_t)"""
+        signal, noise = SCHEDULES[settings.kind](settings)
+        self.signal: Float[ndarray, "levels"] = signal
+        """Factor of the clean trajectory in x_t."""
+        self.noise: Float[ndarray, "levels"] = noise
+        """Factor of the unit noise in x_t."""
+        with np.errstate(divide="ignore"):
+            self.half_log_snr: Float[ndarray, "levels"] = np.log(signal) - np.log(noise)
+            """lambda_t = log(signal / noise); inf at level 0, and -inf where a flow ends."""
 
     @property
     def steps(self) -> int:
@@ -53,7 +109,8 @@ class NoiseSchedule:
         (Karras et al. 2022, table 1, for unit data variance); the limit is that of min-SNR weighting
         (Hang et al. 2023).
         """
-        return np.minimum(1 / np.maximum(self.noise[t] ** 2, 1 / limit), limit)
+        power = self.signal[t] ** 2 + self.noise[t] ** 2
+        return power / np.maximum(self.noise[t] ** 2, power / limit)
 
     def sampling_levels(self, steps: int) -> Int[ndarray, "steps_and_1"]:
         """The levels that a sampler of so many steps visits: from T to 0, evenly."""

@@ -1,36 +1,44 @@
 """DDIM (Song et al. 2021): deterministic, or with a share of the noise drawn afresh at every step."""
 
-from collections.abc import Callable
 from itertools import pairwise
 
 from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.learning.diffusion import NoiseSchedule
+from robotdiffuse.learning.samplers.sampler import DrawNoise, Predict, check_eta
 
 
 def ddim(
-    predict: Callable[[ndarray, int], ndarray],
-    schedule: NoiseSchedule,
-    draw_noise: Callable[[], ndarray],
-    steps: int,
-    eta: float = 0.0,
+    predict: Predict, schedule: NoiseSchedule, draw_noise: DrawNoise, steps: int, eta: float = 0.0
 ) -> Float[ndarray, "count ..."]:
-    """Samples, [count, ...] like the noise.
-
-    predict: (x_t, t) to the clean x_0.
-    draw_noise: standard noise of the shape of the samples.
-    eta: share of DDPM's fresh noise per step; 0 is deterministic, 1 is ancestral sampling.
-    """
+    """See `Sampler`."""
+    check_eta(eta)
     levels = schedule.sampling_levels(steps).tolist()
-    signal, noise = schedule.signal.tolist(), schedule.noise.tolist()
     x = draw_noise()
     for level, lower in pairwise(levels[:-1]):
-        clean = predict(x, level)
-        seen = (x - signal[level] * clean) / noise[level]
-        step = max(1.0 - (signal[level] / signal[lower]) ** 2, 0.0) ** 0.5
-        fresh = eta * noise[lower] / noise[level] * step
-        x = signal[lower] * clean + (noise[lower] ** 2 - fresh**2) ** 0.5 * seen
-        if fresh > 0:
-            x = x + fresh * draw_noise()
+        x = ddim_step(x, predict(x, level), schedule, level, lower, draw_noise, eta)
     return predict(x, levels[-2])
+
+
+def ddim_step(
+    x: Float[ndarray, "count ..."],
+    clean: Float[ndarray, "count ..."],
+    schedule: NoiseSchedule,
+    level: int,
+    lower: int,
+    draw_noise: DrawNoise,
+    eta: float,
+) -> Float[ndarray, "count ..."]:
+    """x at the level `lower` from x at `level` and its clean prediction (Song et al. 2021, eq. 12).
+
+    The noise seen in x is kept, but for the share that is drawn afresh: eq. 16 there, written so that it
+    also holds for schedules that do not keep the variance (flows).
+    """
+    signal, noise = float(schedule.signal[level]), float(schedule.noise[level])
+    signal_low, noise_low = float(schedule.signal[lower]), float(schedule.noise[lower])
+    seen = (x - signal * clean) / noise
+    added = max(noise**2 - (signal / signal_low * noise_low) ** 2, 0.0) ** 0.5
+    fresh = eta * noise_low / noise * added
+    x = signal_low * clean + (noise_low**2 - fresh**2) ** 0.5 * seen
+    return x + fresh * draw_noise() if fresh > 0 else x
