@@ -1,0 +1,83 @@
+"""An encoder-decoder transformer: the condition is encoded, the frames attend to it (paper: Table 2)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from robotdiffuse.learning.denoisers.base import Denoiser, check_attention, check_patch
+from robotdiffuse.learning.denoisers.layers import (
+    Block,
+    CrossBlock,
+    LevelEmbedding,
+    Linear,
+    positions,
+    start_at_zero,
+    two_layers,
+)
+
+
+@dataclass(frozen=True)
+class EncoderDecoderSettings:
+    width: int = 144
+    """Size of a token."""
+    encoder_layers: int = 2
+    layers: int = 4
+    """Of the decoder."""
+    heads: int = 4
+    """Attention heads; a divisor of width."""
+    hidden: int = 432
+    """Size of the hidden layer of each feed-forward network."""
+    patch: int = 4
+    """Frames per token of the decoder; a divisor of the number of frames."""
+
+    def __post_init__(self) -> None:
+        check_attention("encoder_decoder", self.width, self.heads)
+
+
+class EncoderDecoder(Denoiser):
+    """After Vaswani et al. 2017, with norms first: the tokens z, start, goal and t go through the encoder,
+    the frames through the decoder. Frames see each other both ways, for they are not drawn in turn."""
+
+    positions: Tensor
+
+    def __init__(
+        self, settings: EncoderDecoderSettings, frames: int, dof: int, features: int, condition: int
+    ) -> None:
+        super().__init__(settings, frames, dof, features, condition)
+        check_patch("encoder_decoder", settings.patch, frames)
+        width, heads, hidden = settings.width, settings.heads, settings.hidden
+        self.sizes = (condition - 2 * dof, dof, dof)
+        self.condition = nn.ModuleList(two_layers(size, width, width) for size in self.sizes)
+        self.level = LevelEmbedding(width)
+        self.encoder = nn.ModuleList(
+            Block(width, heads, hidden, settings.encoder_layers) for _ in range(settings.encoder_layers)
+        )
+        self.norm_encoded = nn.LayerNorm(width)
+        self.embed = Linear(settings.patch * features, width)
+        self.decoder = nn.ModuleList(
+            CrossBlock(width, heads, hidden, settings.layers) for _ in range(settings.layers)
+        )
+        self.norm = nn.LayerNorm(width)
+        self.out = Linear(width, settings.patch * dof)
+        start_at_zero(self.out)
+        self.register_buffer("positions", positions(frames // settings.patch, width), persistent=False)
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch frames features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+    ) -> Float[Tensor, "batch frames dof"]:
+        """The clean trajectory. `level` is t / T in [0, 1]."""
+        batch = features.shape[0]
+        parts = zip(self.condition, condition.split(self.sizes, -1), strict=True)
+        memory = torch.stack([*(embed(part) for embed, part in parts), self.level(level)], 1).float()
+        for block in self.encoder:
+            memory = block(memory)
+        memory = self.norm_encoded(memory)
+        x = self.embed(features.reshape(batch, len(self.positions), -1)) + self.positions
+        for block in self.decoder:
+            x = block(x, memory)
+        return self.out(self.norm(x)).float().reshape(batch, self.frames, self.dof)

@@ -1,0 +1,140 @@
+"""A temporal U-Net: convolutions over the frames at several resolutions (paper: Table 2)."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.denoisers.base import Denoiser
+from robotdiffuse.learning.denoisers.layers import (
+    LevelEmbedding,
+    Linear,
+    start_at_zero,
+    start_small,
+    two_layers,
+)
+
+
+@dataclass(frozen=True)
+class UNetSettings:
+    width: int = 48
+    """Channels at the full resolution; even."""
+    multiples: tuple[int, ...] = (1, 2, 4)
+    """Channels at each resolution, in units of `width`; each has half the frames of the one before."""
+    kernel: int = 5
+    """Frames that a convolution sees; odd."""
+    condition_width: int = 128
+    """Size of the vector that carries the condition and the noise level; even."""
+
+    def __post_init__(self) -> None:
+        if self.kernel < 1 or self.kernel % 2 == 0:
+            raise InputError(f"unet.kernel is {self.kernel}; it must be odd")
+        if not self.multiples or min(self.multiples) < 1:
+            raise InputError(f"unet.multiples is {self.multiples}; it must be a list of positive numbers")
+        for name, width in (("width", self.width), ("condition_width", self.condition_width)):
+            if width < 2 or width % 2:
+                raise InputError(f"unet.{name} is {width}; it must be even and positive")
+
+
+class Convolution(Linear):
+    """Convolution over the frames, zeros beyond the ends.
+
+    A matrix product on frames laid side by side: at these sizes faster in bf16 on a CPU than the library's
+    convolution (48 frames of 64 channels, batch 16: 0.12 against 0.29 ms; fp32: 0.38 against 0.21).
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int) -> None:
+        super().__init__(kernel * inputs, outputs)
+        self.kernel = kernel
+
+    def forward(self, input: Float[Tensor, "batch frames inputs"]) -> Float[Tensor, "batch frames outputs"]:
+        frames, reach = input.shape[1], self.kernel // 2
+        padded = functional.pad(input.to(self.weight.dtype), (0, 0, reach, reach))
+        return super().forward(torch.cat([padded[:, i : i + frames] for i in range(self.kernel)], -1))
+
+
+class ResidualBlock(nn.Module):
+    """Two convolutions; between them the condition scales and shifts channels (FiLM, Perez et al. 2018)."""
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, condition: int, blocks: int) -> None:
+        """`blocks`: number of residual blocks that follow each other."""
+        super().__init__()
+        self.norm_first, self.norm_second = nn.LayerNorm(inputs), nn.LayerNorm(outputs)
+        self.first = Convolution(inputs, outputs, kernel)
+        self.second = Convolution(outputs, outputs, kernel)
+        self.film = Linear(condition, 2 * outputs)
+        self.skip = Linear(inputs, outputs) if inputs != outputs else nn.Identity()
+        start_small(self.second, blocks)
+
+    def forward(
+        self, x: Float[Tensor, "batch frames inputs"], condition: Float[Tensor, "batch condition"]
+    ) -> Float[Tensor, "batch frames outputs"]:
+        scale, shift = self.film(condition)[:, None].float().chunk(2, -1)
+        inner = self.norm_second(self.first(functional.silu(self.norm_first(x))).float())
+        inner = functional.silu(inner * (1 + scale) + shift)
+        return self.skip(x).float() + self.second(inner)
+
+
+class UNet(Denoiser):
+    """After Janner et al. 2022 and Carvalho et al. 2023 (MPD), with layer norms over the channels.
+
+    Two residual blocks per resolution on the way down, two on the way up, which also see the frames of the
+    same resolution on the way down. Lengths that cannot be halved often enough are extended by repeating the
+    last frame, and the result is cut.
+    """
+
+    def __init__(self, settings: UNetSettings, frames: int, dof: int, features: int, condition: int) -> None:
+        super().__init__(settings, frames, dof, features, condition)
+        widths = [settings.width * multiple for multiple in settings.multiples]
+        halvings, token = len(widths) - 1, settings.condition_width
+        self.padding = -frames % 2**halvings
+
+        def blocks(inputs: int, outputs: int) -> nn.ModuleList:
+            count = 2 * (2 * halvings + 1)
+            first = ResidualBlock(inputs, outputs, settings.kernel, token, count)
+            return nn.ModuleList([first, ResidualBlock(outputs, outputs, settings.kernel, token, count)])
+
+        self.condition = two_layers(condition, 2 * token, token)
+        self.level = LevelEmbedding(token)
+        self.embed = Linear(features, widths[0])
+        self.down = nn.ModuleList(blocks(width, width) for width in widths[:-1])
+        self.halving = nn.ModuleList(Linear(2 * widths[i], widths[i + 1]) for i in range(halvings))
+        self.middle = blocks(widths[-1], widths[-1])
+        self.doubling = nn.ModuleList(Linear(widths[i + 1], 2 * widths[i]) for i in range(halvings))
+        self.up = nn.ModuleList(blocks(2 * width, width) for width in widths[:-1])
+        self.norm = nn.LayerNorm(widths[0])
+        self.out = Linear(widths[0], dof)
+        start_at_zero(self.out)
+
+    def forward(
+        self,
+        features: Float[Tensor, "batch frames features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+    ) -> Float[Tensor, "batch frames dof"]:
+        """The clean trajectory. `level` is t / T in [0, 1]."""
+        token = functional.silu(self.condition(condition) + self.level(level))
+        if self.padding:
+            features = torch.cat([features, features[:, -1:].expand(-1, self.padding, -1)], 1)
+        x = self.embed(features).float()
+        seen: list[Tensor] = []
+        for blocks, halve in zip(self.down, self.halving, strict=True):
+            x = _through(blocks, x, token)
+            seen.append(x)
+            x = halve(x.reshape(len(x), x.shape[1] // 2, -1)).float()
+        x = _through(self.middle, x, token)
+        for blocks, double, before in zip(
+            reversed(self.up), reversed(self.doubling), reversed(seen), strict=True
+        ):
+            x = double(x).float().reshape(before.shape)
+            x = _through(blocks, torch.cat([x, before], -1), token)
+        return self.out(self.norm(x[:, : self.frames])).float()
+
+
+def _through(blocks: nn.Module, x: Tensor, token: Tensor) -> Tensor:
+    for block in blocks.children():
+        x = block(x, token)
+    return x
