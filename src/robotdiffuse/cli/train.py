@@ -17,9 +17,10 @@ def add(commands: argparse._SubParsersAction) -> None:
 
     encoder = kinds.add_parser(
         "encoder",
-        help="the auto-encoder of point clouds",
-        description="Train the auto-encoder of point clouds on random scenes; it is frozen afterwards.",
+        help="an auto-encoder of point clouds",
+        description="Train an auto-encoder of point clouds on random scenes; it is frozen afterwards.",
     )
+    encoder.add_argument("--encoder", dest="name", metavar="NAME", help="which one (point_autoencoder)")
     _add_shared(encoder)
     encoder.set_defaults(run=run_encoder)
 
@@ -29,7 +30,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         description="Train the network that predicts motions, on planned trajectories.",
     )
     planner.add_argument("--data", required=True, metavar="FOLDER", help="folder with shards of trajectories")
-    planner.add_argument("--encoder", required=True, metavar="FOLDER", help="folder with a trained encoder")
+    planner.add_argument(
+        "--encoder",
+        required=True,
+        metavar="FOLDER",
+        help="folder with a trained encoder, or the name of one to train along: pointnet, dgcnn",
+    )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the data's robot")
     _add_shared(planner)
     planner.set_defaults(run=run_planner)
@@ -57,9 +63,9 @@ def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, o
 
 def run_encoder(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.config import EncoderTraining
-    from robotdiffuse.learning.training import train_encoder
+    from robotdiffuse.learning.encoder_training import train_encoder
 
-    settings = EncoderTraining(**_given(arguments, SHARED))  # type: ignore[arg-type]
+    settings = EncoderTraining(**_given(arguments, ("name", *SHARED)))  # type: ignore[arg-type]
     _report(train_encoder(settings, arguments.out), arguments.out)
     return 0
 

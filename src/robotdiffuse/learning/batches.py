@@ -10,18 +10,17 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int8
 from numpy import ndarray
+from torch import Tensor
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.checkpoint import fingerprint
-from robotdiffuse.learning.encoders import PointAutoencoder
+from robotdiffuse.learning.encoders import Encoder
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.shards import SPLITS, Shard, check_shard, read_manifest, shard_indices, split_of
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.sampling import BOX, SPHERE, sample_surfaces_batch
-
-CODE_POINTS = 512
-"""Points of the cloud that each scene of the data is encoded from."""
+from robotdiffuse.scenes.sampling import BOX, SPHERE
+from robotdiffuse.scenes.surface_clouds import surface_clouds
 
 
 def random_scenes(
@@ -60,8 +59,8 @@ class TrajectoryData:
     params: Float32[ndarray, "n k 10"]
     trivial: Bool[ndarray, "n"]
     """The straight line from start to goal is free too."""
-    codes: Float[ndarray, "n code"]
-    """z of each scene, float16."""
+    codes: Float[ndarray, "n code"] | None
+    """z of each scene, float16; None where the encoder is trained along."""
     digest: str
     """SHA-256 of the shards, the first 16 digits."""
     validation: int
@@ -81,20 +80,20 @@ class TrajectoryData:
             self.kinds[rows],
             self.params[rows],
             self.trivial[rows],
-            self.codes[rows],
+            None if self.codes is None else self.codes[rows],
             self.digest,
             validation,
         )
 
 
 def load_data(
-    folder: str, robot: Robot, encoder: PointAutoencoder, frames: int, report: Callable[[str], None]
+    folder: str, robot: Robot, encoder: Encoder | None, frames: int, report: Callable[[str], None]
 ) -> TrajectoryData:
     """The rows for training and validation of a data set, at `frames` frames, with the codes of their scenes.
 
     Codes are kept beside the shards, in files named by shard and encoder; where the folder cannot be written
-    they are made each time. `report` is told what is being done. Raises InputError, naming the file, if there
-    is no data set, a shard is damaged, or the robot is another.
+    they are made each time. Without an encoder there are none. `report` is told what is being done. Raises
+    InputError, naming the file, if there is no data set, a shard is damaged, or the robot is another.
     """
     manifest, indices = read_manifest(folder), shard_indices(folder)
     manifest.check_robot(robot)
@@ -102,12 +101,14 @@ def load_data(
         raise InputError(f"data folder {folder} holds no shard; make some with: robotdiffuse data generate")
     parts: dict[str, list[tuple[ndarray, ...]]] = {"train": [], "validation": []}
     digest, rows = hashlib.sha256(), 0
-    encoder_print = fingerprint(encoder)
+    encoder_print = "" if encoder is None else fingerprint(encoder)
     for i, index in enumerate(indices):
         shard = check_shard(folder, index, manifest)
         digest.update(shard.fingerprint.encode())
         split = split_of(shard["obstacle_kinds"], shard["obstacle_params"])
-        codes = _cached_codes(FilePath(folder), shard, encoder, f"{shard.fingerprint}-{encoder_print}")
+        codes = np.zeros((len(shard), 0), np.float16)
+        if encoder is not None:
+            codes = _cached_codes(FilePath(folder), shard, encoder, f"{shard.fingerprint}-{encoder_print}")
         for name, found in parts.items():
             of = split == SPLITS.index(name)
             q = resample_evenly(shard["trajectories"][of], frames)
@@ -118,7 +119,15 @@ def load_data(
     ordered = parts["train"] + parts["validation"]
     q, kinds, params, trivial, codes = (np.concatenate(arrays) for arrays in zip(*ordered, strict=True))
     validation = sum(len(part[0]) for part in parts["validation"])
-    return TrajectoryData(q, kinds, params, trivial, codes, digest.hexdigest()[:16], validation)
+    return TrajectoryData(
+        q,
+        kinds,
+        params,
+        trivial,
+        None if encoder is None else codes,
+        digest.hexdigest()[:16],
+        validation,
+    )
 
 
 def resample_evenly(q: Float32[ndarray, "n stored dof"], frames: int) -> Float32[ndarray, "n {frames} dof"]:
@@ -142,9 +151,7 @@ def resample_evenly(q: Float32[ndarray, "n stored dof"], frames: int) -> Float32
     return even
 
 
-def _cached_codes(
-    folder: FilePath, shard: Shard, encoder: PointAutoencoder, key: str
-) -> Float[ndarray, "n code"]:
+def _cached_codes(folder: FilePath, shard: Shard, encoder: Encoder, key: str) -> Float[ndarray, "n code"]:
     cache = folder / "codes" / f"{key}.npy"
     if cache.is_file():
         try:
@@ -165,7 +172,7 @@ def _cached_codes(
 
 
 def encode_scenes(
-    encoder: PointAutoencoder,
+    encoder: Encoder,
     kinds: Int8[ndarray, "n k"],
     params: Float32[ndarray, "n k 10"],
     rng: np.random.Generator,
@@ -174,10 +181,24 @@ def encode_scenes(
     codes = [np.zeros((0, encoder.settings.code), np.float16)]
     for i in range(0, len(kinds), 256):
         part = slice(i, i + 256)
-        clouds = sample_surfaces_batch(kinds[part], params[part], CODE_POINTS, rng, encoder.settings.region)
+        clouds = scene_clouds(encoder, kinds[part], params[part], rng)
         with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
-            codes.append(encoder(torch.from_numpy(clouds)).numpy().astype(np.float16))
+            codes.append(encoder(clouds).numpy().astype(np.float16))
     return np.concatenate(codes)
+
+
+def scene_clouds(
+    encoder: Encoder,
+    kinds: Int8[ndarray, "n k"],
+    params: Float32[ndarray, "n k 10"],
+    rng: np.random.Generator,
+    points: int | None = None,
+) -> Float32[Tensor, "n points 3"]:
+    """A random cloud of each packed scene as the encoder wants them, or of so many points [m]."""
+    settings = encoder.settings
+    generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+    scenes = torch.from_numpy(kinds), torch.from_numpy(params)
+    return surface_clouds(*scenes, points or settings.cloud, generator, region=settings.region)
 
 
 def fast_bf16() -> bool:
@@ -193,6 +214,9 @@ class Batch:
     level: Float[ndarray, "n"]
     """t / T"""
     condition: Float[ndarray, "n condition"]
+    """With zeros for z where there are clouds."""
+    clouds: Float32[Tensor, "n points 3"] | None
+    """Of the scenes [m], where the encoder is trained along."""
     clean: Float[ndarray, "n frames dof"]
     """Scaled residuals."""
     weight: Float[ndarray, "n"]
@@ -234,6 +258,11 @@ class Batches:
         """These rows at these noise levels."""
         data, model, schedule = self.data, self.model, self.model.schedule
         kinds, params = data.kinds[rows], data.params[rows]
+        if data.codes is None:
+            codes = np.zeros((len(rows), model.config.encoder_settings.code), np.float32)
+            clouds = scene_clouds(model.encoder, kinds, params, rng)
+        else:
+            codes, clouds = data.codes[rows].astype(np.float32), None
         q = data.q[rows]
         back = rng.random(len(rows)) < 0.5
         q[back] = q[back, ::-1]
@@ -246,7 +275,8 @@ class Batches:
         return Batch(
             features=model.features(noisy, line, lambda at: self.clearances(kinds, params, at)),
             level=(levels / schedule.steps).astype(np.float32),
-            condition=model.condition(data.codes[rows].astype(np.float32), q[:, 0], q[:, -1]),
+            condition=model.condition(codes, q[:, 0], q[:, -1]),
+            clouds=clouds,
             clean=clean,
             weight=schedule.weight(levels, self.weight_limit).astype(np.float32),
             line=line,

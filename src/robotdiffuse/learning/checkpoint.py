@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.config import settings_from_json, settings_to_json
-from robotdiffuse.learning.encoders import ENCODERS, PointAutoencoder
+from robotdiffuse.learning.encoders import ENCODERS, Encoder, encoder_name, make_encoder
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.robots.robot import Robot
 
@@ -91,24 +91,26 @@ def _fill(module: nn.Module, tensors: dict[str, Tensor], file: FilePath) -> None
         raise InputError(f"{file} does not fit its description: {reason}") from None
 
 
-def save_encoder(encoder: PointAutoencoder, folder: str | FilePath, training: dict[str, Any]) -> None:
+def save_encoder(encoder: Encoder, folder: str | FilePath, training: dict[str, Any]) -> None:
     """Write encoder.safetensors and encoder.json. `training`: how it was trained, for the reader."""
     about = {
-        "encoder": "point_autoencoder",
+        "encoder": encoder_name(encoder),
         "settings": settings_to_json(encoder.settings),
         "training": training,
     }
     _save(encoder, FilePath(folder), "encoder", about)
 
 
-def load_encoder(folder: str | FilePath) -> PointAutoencoder:
+def load_encoder(folder: str | FilePath) -> Encoder:
     """The trained encoder of a folder, frozen. Raises InputError if it is missing or damaged."""
     tensors, about = _load(FilePath(folder), "encoder")
     where = str(FilePath(folder) / "encoder.json")
     if about.get("encoder") not in ENCODERS:
         raise unknown_name(f"encoder in {where}:", about.get("encoder"), ENCODERS)
-    kind, settings = ENCODERS[about["encoder"]]
-    encoder = kind(settings_from_json(settings, about.get("settings"), f"{where}: settings"))
+    settings = ENCODERS[about["encoder"]][1]
+    encoder = make_encoder(
+        about["encoder"], settings_from_json(settings, about.get("settings"), f"{where}: settings")
+    )
     _fill(encoder, tensors, FilePath(folder) / "encoder.safetensors")
     return encoder.requires_grad_(False).eval()
 

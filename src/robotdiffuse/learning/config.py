@@ -2,15 +2,24 @@
 
 import dataclasses
 import typing
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
-from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
+from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings
 
 Settings = TypeVar("Settings")
+
+
+def of_kind(name: str, table: Mapping[str, tuple[Any, Any]]) -> dict[str, Any]:
+    """Metadata of a field whose settings are of the kind that another field, `name`, says by a table's name.
+
+    The table has pairs of a network and its settings, as ENCODERS and DENOISERS.
+    """
+    return {"name": name, "table": table}
 
 
 def settings_to_json(settings: object) -> dict[str, Any]:
@@ -21,8 +30,8 @@ def settings_to_json(settings: object) -> dict[str, Any]:
 def settings_from_json(kind: type[Settings], values: object, where: str) -> Settings:
     """The settings dataclass of this kind.
 
-    Fields may be numbers, text, tuples of them, or settings again. Raises InputError for a field that is
-    unknown, missing or of the wrong type; `where` names the origin in the message.
+    Fields may be numbers, text, tuples of them, or settings again, see `of_kind` too. Raises InputError for a
+    field that is unknown, missing or of the wrong type; `where` names the origin in the message.
     """
     if not isinstance(values, dict):
         raise InputError(f"{where} is {values!r}; it must be a table of settings")
@@ -37,6 +46,12 @@ def settings_from_json(kind: type[Settings], values: object, where: str) -> Sett
         if name not in values:
             if entry.default is dataclasses.MISSING and entry.default_factory is dataclasses.MISSING:
                 raise InputError(f"{where}.{name} is missing")
+        elif entry.metadata and values[name] is not None:
+            chosen = values.get(entry.metadata["name"], fields[entry.metadata["name"]].default)
+            if not isinstance(chosen, str) or chosen not in entry.metadata["table"]:
+                raise unknown_name(f"{where}.{entry.metadata['name']}", chosen, entry.metadata["table"])
+            settings = entry.metadata["table"][chosen][1]
+            found[name] = settings_from_json(settings, values[name], f"{where}.{name}")
         elif dataclasses.is_dataclass(hint):
             found[name] = settings_from_json(typing.cast(type, hint), values[name], f"{where}.{name}")
         else:
@@ -58,6 +73,17 @@ def _value(hint: Any, value: object, where: str) -> Any:
     return value
 
 
+def check_kind(field: str, name: str, settings: object, table: Mapping[str, tuple[Any, Any]]) -> None:
+    """Raises InputError unless the name is in the table and the settings, if any, are of its kind."""
+    if name not in table:
+        raise unknown_name(field, name, table)
+    if settings is not None and type(settings) is not table[name][1]:
+        raise InputError(
+            f"{field} is {name}, but its settings are {type(settings).__name__}; "
+            f"they must be {table[name][1].__name__}"
+        )
+
+
 def _length(samples: int | None, minutes: float | None) -> None:
     if (samples is None) == (minutes is None):
         raise InputError(f"samples is {samples} and minutes is {minutes}; give exactly one of them")
@@ -67,8 +93,10 @@ def _length(samples: int | None, minutes: float | None) -> None:
 
 @dataclass(frozen=True)
 class EncoderTraining:
-    """Training of the point cloud auto-encoder alone; it is frozen afterwards (paper, eq. l_AE)."""
+    """Training of an auto-encoder of point clouds alone; it is frozen afterwards (paper, eq. l_AE)."""
 
+    name: str = "point_autoencoder"
+    """Which one; an encoder that is trained alone."""
     minutes: float | None = 5.0
     """Length of the run in wall time [min]; the learning rate reaches 0 at its end. None: by `samples`."""
     samples: int | None = None
@@ -82,28 +110,36 @@ class EncoderTraining:
     max_obstacles: int = 12
     """Most obstacles in a training scene."""
     points: int = 256
-    """Most points of a training cloud; each step takes between an eighth and all of them."""
-    distance_weight: float = 4.0
-    """Weight of the error of the reconstructed distance field beside the Chamfer distance, both in metres."""
+    """Most points of a training cloud; each step takes between an eighth and all of them. An encoder for
+    clouds of one size gets that size."""
     regularization: float = 1e-7
-    """The paper's lambda: weight of the sum of squared weights."""
+    """The paper's lambda: weight of the sum of squared weights, in the unit of the reconstruction's loss."""
     threads: int = 1
     """Threads of PyTorch: one thread beside other work is several times faster than two."""
     checkpoint_seconds: float = 60.0
-    encoder: PointAutoencoderSettings = field(default_factory=PointAutoencoderSettings)
+    encoder: EncoderSettings | None = field(default=None, metadata=of_kind("name", ENCODERS))
+    """None: the defaults of that encoder."""
 
     def __post_init__(self) -> None:
         _length(self.samples, self.minutes)
+        alone = [name for name, (network, _) in ENCODERS.items() if network.trained == "alone"]
+        if self.name in ENCODERS and self.name not in alone:
+            raise InputError(
+                f"name is {self.name}, an encoder that is trained jointly with the planner, not alone; "
+                f"alone: {', '.join(alone)}"
+            )
+        check_kind("name", self.name, self.encoder, ENCODERS)
 
 
 @dataclass(frozen=True)
 class PlannerTraining:
-    """Training of the motion predictor on planned trajectories, with a frozen encoder."""
+    """Training of the motion predictor on planned trajectories."""
 
     data: str
     """Folder with shards (.npz) of `robotdiffuse data generate`."""
     encoder: str
-    """Folder with a trained encoder."""
+    """Folder with a trained encoder, which stays as it is; or the name of an encoder, pointnet or dgcnn, say,
+    that starts untrained and is trained along, by the planner's loss, on clouds drawn anew each time."""
     robot: str = "panda"
     """Bundled name, or path to a URDF: the robot that the data are for."""
     minutes: float | None = 70.0
@@ -134,10 +170,28 @@ class PlannerTraining:
     threads: int = 1
     """Threads of PyTorch: one thread beside other work is several times faster than two."""
     checkpoint_seconds: float = 120.0
-    denoiser: TransformerSettings = field(default_factory=TransformerSettings)
+    encoder_settings: EncoderSettings | None = field(default=None, metadata=of_kind("encoder", ENCODERS))
+    """Of an encoder that is trained along; None: its defaults."""
+    denoiser: str = "transformer"
+    """Which denoiser."""
+    denoiser_settings: DenoiserSettings | None = field(default=None, metadata=of_kind("denoiser", DENOISERS))
+    """None: the defaults of that denoiser."""
+    condition_drop: float = 0.0
+    """Share of the samples whose condition [z, start, goal] is hidden from the denoiser, for classifier-free
+    guidance (paper: "randomly masked", no share given; Ho and Salimans 2022: 0.1 or 0.2). 0: no guidance."""
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
 
     def __post_init__(self) -> None:
         _length(self.samples, self.minutes)
         if not 0.0 <= self.trivial_share <= 1.0:
             raise InputError(f"trivial_share is {self.trivial_share}; it must be between 0 and 1")
+        if not 0.0 <= self.condition_drop < 1.0:
+            raise InputError(f"condition_drop is {self.condition_drop}; it must be at least 0 and below 1")
+        check_kind("denoiser", self.denoiser, self.denoiser_settings, DENOISERS)
+        if self.encoder_settings is not None:
+            check_kind("encoder", self.encoder, self.encoder_settings, ENCODERS)
+
+    @property
+    def jointly(self) -> bool:
+        """Whether the encoder is trained along."""
+        return self.encoder in ENCODERS

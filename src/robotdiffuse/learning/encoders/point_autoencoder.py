@@ -149,7 +149,7 @@ def nearest(
 
     The reverse [batch m] is the index of the nearest point of `a` to each of `b`.
     """
-    with torch.no_grad():
+    with torch.no_grad(), fp32(a):
         b = torch.where(allowed[..., None], b, 100.0).float()
         # |a - b|^2 without its constant |a|^2, which is added for the reverse only.
         squared = torch.baddbmm(b.square().sum(-1)[:, None], a.float(), b.mT, alpha=-2.0)

@@ -1,0 +1,118 @@
+"""Training of an auto-encoder of point clouds alone, and what can be read from the codes of any encoder."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int8
+from numpy import ndarray
+from torch import Tensor
+
+from robotdiffuse.learning.batches import fast_bf16, random_scenes, scene_clouds
+from robotdiffuse.learning.checkpoint import save_encoder
+from robotdiffuse.learning.config import EncoderTraining, settings_to_json
+from robotdiffuse.learning.encoders import Autoencoder, Encoder, make_encoder
+from robotdiffuse.learning.training_run import TrainingRun
+from robotdiffuse.learning.versions import versions
+from robotdiffuse.scenes.sampling import BOX, NONE
+from robotdiffuse.transforms import rotation_from_quaternion
+
+READ, CHECKED = 2048, 512
+"""Scenes that a linear read-out is fitted to, and further ones that it is judged by."""
+SPOTS = np.stack(
+    np.meshgrid([-0.6, -0.2, 0.2, 0.6], [-0.6, -0.2, 0.2, 0.6], [0.2, 0.5, 0.8], indexing="ij"), -1
+).reshape(-1, 3)
+"""Places around the arm [m] whose distance to the obstacles is read out."""
+NEAR = 0.3
+"""Distances are capped to plus and minus this [m]."""
+RIDGE = 1e-3
+"""Of the variance of a code's numbers, so that none is needed too much."""
+
+
+def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
+    """Train an auto-encoder; write encoder.safetensors and encoder.json into the folder `out`.
+
+    The same call continues a run that was interrupted. Returns errors on fresh clouds, all in metres: those
+    of the reconstruction, see the encoder's `loss`, and those of `linear_readout`. Raises InputError if the
+    folder holds a different run, and KeyboardInterrupt, after a checkpoint, on Ctrl-C.
+    """
+    torch.manual_seed(settings.seed)
+    module = make_encoder(settings.name, settings.encoder)
+    assert isinstance(module, Autoencoder)  # by EncoderTraining
+    run = TrainingRun(
+        module, out, settings, average=0.999, weight_decay=0.0, gradient_norm=1.0, bad_steps=10, identity={}
+    )
+    most = settings.points if module.any_size else module.settings.cloud
+
+    def loss(rng: np.random.Generator) -> Float[Tensor, ""]:
+        points = int(rng.integers(max(1, most // 8), most + 1)) if module.any_size else most
+        scenes = random_scenes(settings.batch, settings.max_obstacles, rng)
+        error, _ = _reconstruction(module, *scenes, points, rng)
+        theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()
+        return error + settings.regularization * theta
+
+    def judge(count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        rng = np.random.default_rng(seed)
+        with torch.no_grad():
+            return _reconstruction(module, *random_scenes(count, settings.max_obstacles, rng), most, rng)
+
+    run.loop(loss, lambda: judge(128, 123)[0].item(), "encoder")
+    with run.averaged(), torch.no_grad():
+        rng = np.random.default_rng(settings.seed + 1)
+        scenes = random_scenes(READ, settings.max_obstacles, rng)
+        clouds = scene_clouds(module, *scenes, rng).split(256)
+        module.standardize(torch.cat([module.encode(part) for part in clouds]))
+        report = judge(512, settings.seed + 2)[1] | linear_readout(module, settings.max_obstacles, rng)
+        about = {"settings": settings_to_json(settings), "samples": run.at.samples, **report, **versions()}
+        save_encoder(module, out, about)
+    return report
+
+
+def _reconstruction(
+    module: Autoencoder,
+    kinds: Int8[ndarray, "n k"],
+    params: Float32[ndarray, "n k 10"],
+    points: int,
+    rng: np.random.Generator,
+) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    cloud = scene_clouds(module, kinds, params, rng, points)
+    with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+        return module.loss(cloud, rng)
+
+
+def linear_readout(encoder: Encoder, max_obstacles: int, rng: np.random.Generator) -> dict[str, float]:
+    """What of a scene stands in z in plain sight: a yardstick that is the same for all encoders.
+
+    A linear map from z to the signed distances of fixed places around the arm to the obstacles, fitted to
+    random scenes and judged by others. `readout`: its mean error [m]; `readout_of_constant`: that of the mean
+    distances, with no z at all.
+    """
+    kinds, params = random_scenes(READ + CHECKED, max_obstacles, rng)
+    with torch.no_grad():
+        clouds = scene_clouds(encoder, kinds, params, rng).split(256)
+        z = torch.cat([encoder(part) for part in clouds]).numpy().astype(np.float64)
+    wanted = scene_distances(kinds, params, SPOTS).clip(-NEAR, NEAR).astype(np.float64)
+    z -= z[:READ].mean(0)
+    mean = wanted[:READ].mean(0)
+    gram = z[:READ].T @ z[:READ]
+    ridge = max(RIDGE * np.trace(gram) / len(gram), np.finfo(np.float64).tiny)
+    weights = np.linalg.solve(gram + ridge * np.eye(len(gram)), z[:READ].T @ (wanted[:READ] - mean))
+    error = wanted[READ:] - mean
+    return {
+        "readout": float(np.abs(error - z[READ:] @ weights).mean()),
+        "readout_of_constant": float(np.abs(error).mean()),
+    }
+
+
+def scene_distances(
+    kinds: Int8[ndarray, "n k"], params: Float32[ndarray, "n k 10"], at: Float[ndarray, "places 3"]
+) -> Float[ndarray, "n places"]:
+    """Signed distance [m] of places to the nearest of each packed scene's shapes; infinite if it has none."""
+    nearest = np.full((len(kinds), len(at)), np.inf)
+    for kind, p in zip(kinds.T, params.transpose(1, 0, 2).astype(np.float64), strict=True):
+        box, some = kind == BOX, kind != NONE
+        away = at - p[:, None, :3]
+        distance = np.linalg.norm(away, axis=-1) - p[:, 3, None]
+        local = np.abs(away[box] @ rotation_from_quaternion(p[box, 6:])) - p[box, None, 3:6] / 2
+        outside = np.linalg.norm(local.clip(min=0), axis=-1)
+        distance[box] = outside + local.max(-1).clip(max=0)
+        nearest[some] = np.minimum(nearest[some], distance[some])
+    return nearest
