@@ -4,7 +4,7 @@
 
 Prints the report that is kept in benchmarks/results/faults.txt. The command line is started anew after each
 kill -9; moments are uniform, half of them in the first six seconds of a start, when processes start and the
-manifest is written, half in the half second that follows on the first new shard.
+manifest is written, half in the three seconds that follow on the first new shard.
 """
 
 import argparse
@@ -26,7 +26,8 @@ def start(out: Path, arguments: argparse.Namespace) -> subprocess.Popen[bytes]:
     options = ("--trajectories", arguments.trajectories, "--shard", arguments.shard)
     options += ("--workers", arguments.workers, "--dense-share", 0.3, "--out", out)
     command = [*COMMAND, "data", "generate", *map(str, options)]
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
+    quiet = subprocess.DEVNULL
+    return subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
 
 
 def shards(out: Path) -> int:
@@ -78,7 +79,7 @@ def main() -> None:
             run, begun = start(disturbed, arguments), time.monotonic()
             if kill % 2:
                 wait_for_shard(run, disturbed)
-                time.sleep(rng.uniform(0, 0.5))
+                time.sleep(rng.uniform(0, 3))
             else:
                 time.sleep(rng.uniform(0, 6))
             moment = time.monotonic() - begun
