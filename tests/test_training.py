@@ -16,7 +16,7 @@ from robotdiffuse.learning import training
 from robotdiffuse.learning.batches import load_data, random_scenes, resample_evenly
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, save_encoder
 from robotdiffuse.learning.config import EncoderTraining, PlannerTraining
-from robotdiffuse.learning.denoisers import TransformerSettings
+from robotdiffuse.learning.denoisers import TransformerSettings, UNetSettings
 from robotdiffuse.learning.encoder_training import train_encoder
 from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
 from robotdiffuse.learning.shards import shard_path, split_of, write_manifest, write_shard
@@ -286,3 +286,24 @@ def test_length_is_given_once():
 
 def test_moving_links(arm):
     assert moving_links(arm) == ("l1", "l2", "l3")
+
+
+def test_trains_without_some_conditions(data, tmp_path):
+    """The stand-in for a dropped condition is trained, and a guidance scale has an effect afterwards."""
+    small = UNetSettings(width=8, multiples=(1, 2), kernel=3, condition_width=16)
+    settings = planner_settings(data, condition_drop=0.5, denoiser="unet", denoiser_settings=small)
+    assert np.isfinite(train_planner(settings, str(tmp_path / "out"))["validation"])
+    model = load_model(tmp_path / "out")
+    assert model.null_condition is not None and model.null_condition.abs().min() > 0
+    ends = np.full(model.dof, -0.5), np.full(model.dof, 0.5)
+
+    def far(q):
+        return np.full((*q.shape[:-1], len(model.config.links)), 0.4, np.float32)
+
+    plain, pushed = (
+        model.sample(
+            model.encode(np.zeros((0, 3))), *ends, 2, np.random.default_rng(0), far, guidance_scale=w
+        )
+        for w in (1.0, 3.0)
+    )
+    assert not np.array_equal(plain, pushed)
