@@ -6,21 +6,23 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.transformer import Linear, TransformerSettings
+from robotdiffuse.learning.config import check_kind, of_kind
+from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
+from robotdiffuse.learning.denoisers.layers import Linear
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
-from robotdiffuse.learning.encoders import ENCODERS, PointAutoencoder, PointAutoencoderSettings
+from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings, PointAutoencoderSettings, make_encoder
 from robotdiffuse.learning.normalizer import JointNormalizer
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.robots.robot import Robot
 
 MAX_POINTS = 2048
-"""Larger clouds are thinned to this many points by chance before they are encoded."""
+"""Larger clouds are thinned to this many points by chance before they are encoded; to as many as an encoder
+is for, if it is not for clouds of any size."""
 
 ClearanceFn = Callable[[ndarray], ndarray]
 """Joint values [count, frames, dof] (float32) to clearances of the links, [count, frames, links] [m]."""
@@ -47,11 +49,21 @@ class MotionModelConfig:
     """Clearances are clipped to this range before the denoiser sees them [m]."""
     clearance_high: float = 0.4
     encoder: str = "point_autoencoder"
-    encoder_settings: PointAutoencoderSettings = field(default_factory=PointAutoencoderSettings)
+    encoder_settings: EncoderSettings = field(
+        default_factory=PointAutoencoderSettings, metadata=of_kind("encoder", ENCODERS)
+    )
     denoiser: str = "transformer"
-    denoiser_settings: TransformerSettings = field(default_factory=TransformerSettings)
+    denoiser_settings: DenoiserSettings = field(
+        default_factory=TransformerSettings, metadata=of_kind("denoiser", DENOISERS)
+    )
+    null_condition: bool = False
+    """Whether the model has a learned stand-in for a dropped condition, for classifier-free guidance."""
     sampler: str = "ddim"
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+
+    def __post_init__(self) -> None:
+        check_kind("encoder", self.encoder, self.encoder_settings, ENCODERS)
+        check_kind("denoiser", self.denoiser, self.denoiser_settings, DENOISERS)
 
     def check_robot(self, robot: Robot, where: str) -> None:
         """Raises InputError unless the model was trained for this robot. `where` names the model."""
@@ -76,6 +88,7 @@ class MotionModel(nn.Module):
 
     residual_scale: Tensor
     noise_factor: Tensor
+    null_condition: nn.Parameter | None
 
     def __init__(self, config: MotionModelConfig) -> None:
         super().__init__()
@@ -83,12 +96,14 @@ class MotionModel(nn.Module):
         self.dof = len(config.joint_names)
         self.normalizer = JointNormalizer(np.array(config.lower), np.array(config.upper))
         self.schedule = NoiseSchedule(config.schedule)
-        self.encoder: PointAutoencoder = ENCODERS[config.encoder][0](config.encoder_settings)
+        self.encoder = make_encoder(config.encoder, config.encoder_settings)
         condition = config.encoder_settings.code + 2 * self.dof
         features = 2 * self.dof + len(config.links)
         self.denoiser = DENOISERS[config.denoiser][0](
             config.denoiser_settings, config.frames, self.dof, features, condition
         )
+        null = nn.Parameter(torch.zeros(condition)) if config.null_condition else None
+        self.register_parameter("null_condition", null)
         self.register_buffer("residual_scale", torch.ones(self.dof))
         self.register_buffer("noise_factor", torch.eye(config.frames))
         self._line = np.linspace(0.0, 1.0, config.frames, dtype=np.float32)[:, None]
@@ -120,9 +135,10 @@ class MotionModel(nn.Module):
         """z of a point cloud of the obstacles' surfaces (base frame, [m]); no point at all is a scene too."""
         points = np.asarray(points, np.float32).reshape(-1, 3)
         points = points[self.config.encoder_settings.region.holds(points)]
-        if len(points) > MAX_POINTS:
+        most = MAX_POINTS if self.encoder.any_size else self.config.encoder_settings.cloud
+        if len(points) > most:
             rng = np.random.default_rng(0) if rng is None else rng
-            points = points[rng.choice(len(points), MAX_POINTS, replace=False)]
+            points = points[rng.choice(len(points), most, replace=False)]
         with torch.inference_mode(), one_thread():
             return self.encoder(torch.from_numpy(points)[None])[0].numpy()
 
@@ -176,6 +192,42 @@ class MotionModel(nn.Module):
         ends = [self.normalizer.to_unit(np.asarray(q, np.float32)) for q in (start, goal)]
         return np.concatenate([code, *ends], axis=-1)
 
+    def denoise(
+        self,
+        features: Float[Tensor, "batch frames features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        dropped: Bool[Tensor, "batch"] | None = None,
+    ) -> Float[Tensor, "batch frames dof"]:
+        """What the denoiser predicts.
+
+        dropped: samples whose condition is hidden from it (Ho and Salimans 2022; paper: C is randomly
+            masked). What the features say of ends and clearances stays. Needs `config.null_condition`.
+        """
+        if dropped is not None:
+            if self.null_condition is None:
+                raise InputError("null_condition of the model is False; it cannot do without its condition")
+            condition = torch.where(dropped[:, None], self.null_condition, condition)
+        return self.denoiser(features, level, condition)
+
+    def denoise_guided(
+        self,
+        features: Float[Tensor, "batch frames features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        scale: float,
+    ) -> Float[Tensor, "batch frames dof"]:
+        """Classifier-free guidance: u + scale (c - u), of the predictions c with the condition and u without.
+
+        1 is the prediction itself, at no cost; other scales take a batch of twice the size.
+        """
+        if scale == 1.0:
+            return self.denoise(features, level, condition)
+        dropped = torch.arange(2 * len(level), device=level.device) >= len(level)
+        twice = torch.cat([features] * 2), torch.cat([level] * 2), torch.cat([condition] * 2)
+        with_it, without = self.denoise(*twice, dropped).chunk(2)
+        return without + scale * (with_it - without)
+
     def sample(
         self,
         code: Float[ndarray, "code"],
@@ -187,6 +239,7 @@ class MotionModel(nn.Module):
         steps: int = 6,
         guide: GuideFn | None = None,
         eta: float = 0.0,
+        guidance_scale: float = 1.0,
     ) -> Float[ndarray, "count frames dof"]:
         """Trajectories from start to goal [rad] (float64, the ends exact), of a model from `load_model`.
 
@@ -196,7 +249,14 @@ class MotionModel(nn.Module):
         guide: improves the predicted clean trajectories in the second half of the steps, the last included
             (paper, section Motion Guided Generation); it need not keep the ends.
         eta: share of fresh noise per step, see `ddim`.
+        guidance_scale: of classifier-free guidance, see `denoise_guided`; only 1 for a model that was trained
+            without dropping its condition.
         """
+        if guidance_scale != 1.0 and not self.config.null_condition:
+            raise InputError(
+                f"guidance_scale is {guidance_scale}; it must be 1, for this model was trained with "
+                "condition_drop 0 and knows no motions without a condition"
+            )
         line = self.line(start, goal)[None]
         condition = torch.from_numpy(self.condition(code, start, goal)).expand(count, -1)
         levels = self.config.schedule.steps
@@ -204,7 +264,8 @@ class MotionModel(nn.Module):
 
         def predict(x: ndarray, level: int) -> ndarray:
             inputs = torch.from_numpy(self.features(x, line, clearances))
-            clean = self.denoiser(inputs, torch.full((count,), level / levels), condition).numpy()
+            at = torch.full((count,), level / levels)
+            clean = self.denoise_guided(inputs, at, condition, guidance_scale).numpy()
             if guide is not None and level in guided:
                 clean = self.residual(guide(self.joints(hold_ends(clean), line), level / levels), line)
             return hold_ends(clean)
