@@ -38,7 +38,7 @@ bench: .venv/dev.stamp
 
 weights: .venv/dev.stamp
 	$(BIN)/robotdiffuse data generate --out runs/panda/data --trajectories 92000 \
-		--dense-share 0.15 --trivial-share 0.1 --target pose --goals 1
+		--mix rop=0.85,rop_dense=0.15 --trivial-share 0.1 --target pose --goals 1
 	$(BIN)/robotdiffuse train encoder --out runs/panda/encoder --minutes 6
 	$(BIN)/robotdiffuse train planner --out runs/panda/planner --minutes 44 \
 		--data runs/panda/data --encoder runs/panda/encoder

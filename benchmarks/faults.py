@@ -24,7 +24,7 @@ COMMAND = (sys.executable, "-c", "import sys; from robotdiffuse.cli import main;
 def start(out: Path, arguments: argparse.Namespace) -> subprocess.Popen[bytes]:
     """The command, as the first of a process group of its own."""
     options = ("--trajectories", arguments.trajectories, "--shard", arguments.shard)
-    options += ("--workers", arguments.workers, "--dense-share", 0.3, "--out", out)
+    options += ("--workers", arguments.workers, "--mix", "rop=0.7,rop_dense=0.3", "--out", out)
     command = [*COMMAND, "data", "generate", *map(str, options)]
     quiet = subprocess.DEVNULL
     return subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
@@ -95,7 +95,7 @@ def main() -> None:
         same = contents(disturbed) == contents(undisturbed)
         files = len(contents(undisturbed))
         size = sum(map(len, contents(undisturbed).values()))
-    columns = ["kill -9", "after [s]", "shards there", "half-written", "workers ended after [s]"]
+    columns = ["kill -9", "after, s", "shards there", "half-written", "workers ended after, s"]
     print_table("Killed, and started again", columns, rows)
     print(f"\nExit status of the last run: {finished}; of the undisturbed one: {alone}.")
     print(

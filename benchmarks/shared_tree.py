@@ -65,7 +65,7 @@ def one_goal(count: int) -> list[Problem]:
 
 def many_goals(count: int) -> list[Problem]:
     """Problems of the data factory, half of them dense, where the line to the nearest goal is not free."""
-    settings = GenerationSettings(dense_share=0.5)
+    settings = GenerationSettings(mix={"rop": 1.0, "rop_dense": 1.0})
     found: list[Problem] = []
     index = 0
     while len(found) < count:

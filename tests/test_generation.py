@@ -19,7 +19,6 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.generation import FAMILIES, GenerationSettings, factory, generate, problems
 from robotdiffuse.generation.problems import draw_problem
-from robotdiffuse.generation.settings import SLOTS
 from robotdiffuse.generation.shard_maker import NUMBERS, make_shard, resample
 from robotdiffuse.learning.shards import check_shard, read_manifest, read_shard
 from robotdiffuse.problem import JointGoal, Problem
@@ -31,7 +30,8 @@ from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quat
 from robotdiffuse.types import Path as Motion
 from robotdiffuse.verify import verify
 
-SETTINGS = GenerationSettings(trajectories=12, shard=4, frames=32, seed=3, dense_share=0.5, goals=4)
+MIX = {"rop": 0.5, "rop_dense": 0.5}
+SETTINGS = GenerationSettings(trajectories=12, shard=4, frames=32, seed=3, mix=MIX, goals=4)
 PANDA = load_robot("panda")
 
 
@@ -80,7 +80,7 @@ def test_a_finished_folder_is_left_as_it_is(folder: Path) -> None:
 
 def test_shards_are_whole_and_what_the_manifest_says(folder: Path) -> None:
     manifest = read_manifest(folder)
-    assert (manifest.trajectories, manifest.shard, manifest.slots) == (12, 4, SLOTS)
+    assert (manifest.trajectories, manifest.shard, manifest.slots) == (12, 4, 12)
     assert tuple(manifest.families) == tuple(FAMILIES)
     assert set(manifest.versions) == {"robotdiffuse", "python", "numpy", "numba", "zarr"}
     for index in range(SETTINGS.shards):
@@ -98,8 +98,8 @@ def checked_problem(row: dict[str, Any]) -> tuple[Problem, CollisionChecker]:
     rng = np.random.default_rng([SETTINGS.seed, int(row["seed"])])
     drawn = draw_problem(SETTINGS, PANDA, rng)
     assert row["family"] == drawn.family
-    floor = list(FAMILIES.values())[drawn.family].floor
-    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor:]), SLOTS)
+    floor = list(SETTINGS.families.values())[drawn.family].floor
+    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor:]), SETTINGS.slots)
     np.testing.assert_array_equal(row["obstacle_kinds"], kinds)
     np.testing.assert_array_equal(row["obstacle_params"], params)
     np.testing.assert_array_equal(row["start"], drawn.start)
@@ -171,7 +171,7 @@ def test_target_pose_holds_for_all_goals() -> None:
 
 
 def test_thinning_leaves_out_what_the_line_solves_and_nothing_else() -> None:
-    whole = replace(SETTINGS, trajectories=8, shard=8, dense_share=1.0)
+    whole = replace(SETTINGS, trajectories=8, shard=8, mix={"rop_dense": 1.0})
     arrays, counts = make_shard(whole, 0)
     assert counts["thinned"] == 0
     hard = ~arrays["line_free"]
@@ -210,7 +210,6 @@ def test_frames_are_even_in_length() -> None:
         ("goals", 0),
         ("goals", 128),
         ("frames", 1),
-        ("dense_share", 1.5),
         ("trivial_share", -0.1),
         ("trivial_share", float("nan")),
     ],
@@ -229,10 +228,10 @@ def test_unknown_kinds_are_refused_with_those_known(name: str, known: str) -> No
 def test_scenes_out_of_reach_are_refused() -> None:
     far = replace(FAMILIES["rop"], tip_x=(5.0, 5.1))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(problems.FAMILIES, "rop", far)
+        patch.setitem(FAMILIES, "rop", far)
         patch.setattr(problems, "SCENES", 2)
         with pytest.raises(InputError, match="no free start and goal in 2 scenes of rop for panda"):
-            make_shard(replace(SETTINGS, dense_share=0.0), 0)
+            make_shard(replace(SETTINGS, mix={"rop": 1.0}), 0)
 
 
 def change_manifest(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
@@ -303,3 +302,21 @@ def test_workers_and_clusters_that_are_none_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"cluster.*slurm.*ray"):
         generate(SETTINGS, tmp_path / "data", cluster="slurm")
     assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
+    ("mix", "message"),
+    [
+        ({}, "mix is empty"),
+        ({"rop": 0.0}, "share of rop is 0"),
+        ({"rop": float("nan")}, "share of rop is nan"),
+        ({"kitchen": 1.0}, r"kitchen.*rop, rop_dense"),
+    ],
+)
+def test_bad_mixes_are_refused(mix: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        replace(SETTINGS, mix=mix)
+
+
+def test_the_papers_mix_needs_two_slots() -> None:
+    assert GenerationSettings().slots == 2 and SETTINGS.slots == 12

@@ -58,3 +58,11 @@ def share(text: str) -> float:
     if value > 1:
         raise argparse.ArgumentTypeError(f"{text!r} is not between 0 and 1")
     return value
+
+
+def shares(text: str) -> dict[str, float]:
+    """NAME=SHARE,NAME=SHARE,... with shares of at least 0."""
+    pairs = [part.strip().partition("=") for part in text.split(",")]
+    if len({name for name, _, _ in pairs}) < len(pairs):
+        raise argparse.ArgumentTypeError(f"{text!r} names a family twice")
+    return {name: not_negative(number) for name, _, number in pairs}

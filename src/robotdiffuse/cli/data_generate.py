@@ -3,7 +3,7 @@
 import argparse
 import os
 
-from robotdiffuse.cli.arguments import count, natural, not_negative, share
+from robotdiffuse.cli.arguments import count, natural, not_negative, share, shares
 
 
 def add_generate(actions: argparse._SubParsersAction) -> None:
@@ -17,7 +17,9 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
     parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF (default: panda)")
     parser.add_argument("--trajectories", type=count, metavar="N", help="motions to make (default: 140000)")
     parser.add_argument("--seed", type=natural, metavar="N", help="random seed (default: 0)")
-    parser.add_argument("--dense-share", type=share, metavar="P", help="share of rop_dense (default: 0)")
+    parser.add_argument(
+        "--mix", type=shares, metavar="NAME=P,...", help="shares of rop and rop_dense (default: rop=1)"
+    )
     parser.add_argument(
         "--trivial-share",
         type=share,
@@ -48,7 +50,7 @@ SETTINGS = (
     "robot",
     "trajectories",
     "seed",
-    "dense_share",
+    "mix",
     "trivial_share",
     "target",
     "goals",

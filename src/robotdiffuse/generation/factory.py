@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.generation.settings import FAMILIES, SLOTS, GenerationSettings
+from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.workers import CLUSTERS, on_this_machine, versions
 from robotdiffuse.learning.shards import (
     MANIFEST,
@@ -144,8 +144,8 @@ def manifest_of(settings: GenerationSettings) -> Manifest:
         upper=tuple(robot.upper.tolist()),
         frames=settings.frames,
         timing=settings.timing,
-        families={name: asdict(family) for name, family in FAMILIES.items()},
-        slots=SLOTS,
+        families={name: asdict(family) for name, family in settings.families.items()},
+        slots=settings.slots,
         goals=settings.goals,
         trajectories=settings.trajectories,
         shard=settings.shard,

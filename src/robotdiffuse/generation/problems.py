@@ -9,7 +9,7 @@ from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.generation.settings import FAMILIES, GenerationSettings
+from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -31,7 +31,7 @@ class TargetProblem:
     """A problem whose goals all bring the tip to one target."""
 
     family: int
-    """In the order of FAMILIES."""
+    """In the order of the mix."""
     scene: Scene
     """The floor first, if the family has one."""
     start: Float32[ndarray, "dof"]
@@ -48,8 +48,9 @@ def draw_problem(settings: GenerationSettings, robot: Robot, rng: Generator) -> 
     whose tip pose is the target, are uniform among the free configurations with the tip in the region. Scenes
     that leave no start or no goal are drawn anew. Raises InputError if the settings leave none at all.
     """
-    family = int(rng.random() < settings.dense_share)
-    rules = list(FAMILIES.values())[family]
+    shares = np.array(list(settings.mix.values()))
+    family = int(rng.choice(len(shares), p=shares / shares.sum()))
+    name, rules = list(settings.families.items())[family]
     keep_out = base_spheres(robot)
     for _ in range(SCENES):
         scene = sample_scene(rules, rng, keep_out)
@@ -59,7 +60,7 @@ def draw_problem(settings: GenerationSettings, robot: Robot, rng: Generator) -> 
         if found is not None:
             return TargetProblem(family, scene, *found)
     raise InputError(
-        f"no free start and goal in {SCENES} scenes of {list(FAMILIES)[family]} for {robot.name}: its tip "
+        f"no free start and goal in {SCENES} scenes of {name} for {robot.name}: its tip "
         f"{robot.tip} cannot be where these scenes want it"
     )
 

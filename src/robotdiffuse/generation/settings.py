@@ -7,11 +7,9 @@ from robotdiffuse.planners.shared_tree import SharedTreeSettings
 from robotdiffuse.scenes.rop import ROP, ROP_DENSE, RopSettings
 
 FAMILIES: dict[str, RopSettings] = {"rop": ROP, "rop_dense": ROP_DENSE}
-"""Families of scenes by name; rows of the data hold the number in this order."""
+"""Families of scenes by name."""
 TARGETS = ("position", "pose")
 TIMINGS = ("arc", "time")
-SLOTS = max(family.obstacles[1] for family in FAMILIES.values())
-"""Most obstacles of a scene."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +21,9 @@ class GenerationSettings:
     trajectories: int = 140_000
     """Solved and verified motions to make, each in a scene of its own (the paper: 0.14 million)."""
     seed: int = 0
-    dense_share: float = 0.0
-    """Share of problems from `rop_dense`; the others are from `rop`, the paper's."""
+    mix: dict[str, float] = field(default_factory=lambda: {"rop": 1.0})
+    """Shares of problems by family of scenes, in any unit; the default is the paper's. Rows of the data hold
+    the number of their family in this order."""
     trivial_share: float = 1.0
     """Share that is kept of the problems that the straight line solves; 1 is the paper's distribution."""
     target: str = "position"
@@ -48,15 +47,31 @@ class GenerationSettings:
         for name, least in (("trajectories", 1), ("seed", 0), ("goals", 1), ("frames", 2), ("shard", 1)):
             if getattr(self, name) < least:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be at least {least}")
-        for name in ("dense_share", "trivial_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"{name} is {getattr(self, name)}; it must be between 0 and 1")
+        for name, share in self.mix.items():
+            if name not in FAMILIES:
+                raise unknown_name("family of scenes in mix", name, FAMILIES)
+            if not 0 < share < float("inf"):
+                raise InputError(f"mix: the share of {name} is {share}; it must be positive")
+        if not self.mix:
+            raise InputError(f"mix is empty; it must name a family: {', '.join(FAMILIES)}")
+        if not 0 <= self.trivial_share <= 1:
+            raise InputError(f"trivial_share is {self.trivial_share}; it must be between 0 and 1")
         if self.target not in TARGETS:
             raise unknown_name("target", self.target, TARGETS)
         if self.timing not in TIMINGS:
             raise unknown_name("timing", self.timing, TIMINGS)
         if self.goals > 127:
             raise InputError(f"goals is {self.goals}; it must be at most 127")
+
+    @property
+    def families(self) -> dict[str, RopSettings]:
+        """Those of the mix, in its order."""
+        return {name: FAMILIES[name] for name in self.mix}
+
+    @property
+    def slots(self) -> int:
+        """Most obstacles of a scene, the floor left out."""
+        return max(family.obstacles[1] for family in self.families.values())
 
     @property
     def shards(self) -> int:

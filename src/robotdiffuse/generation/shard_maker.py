@@ -7,7 +7,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.generation.problems import TargetProblem, draw_problem
-from robotdiffuse.generation.settings import FAMILIES, SLOTS, GenerationSettings
+from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.planners import rrt_connect_kernel as connect
 from robotdiffuse.planners.rrt_connect import random_state, search_space
@@ -100,8 +100,8 @@ def _row(
     k, dof = drawn.goals.shape
     goals, goal_costs = np.full((settings.goals, dof), np.nan), np.full(settings.goals, np.nan)
     goals[:k], goal_costs[:k] = drawn.goals, search.goal_costs
-    floor = FAMILIES[list(FAMILIES)[drawn.family]].floor
-    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor:]), SLOTS)
+    floor = list(settings.families.values())[drawn.family].floor
+    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor:]), settings.slots)
     wxyz = quaternion_from_rotation(drawn.T_base_tip[:3, :3])
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
     return {
