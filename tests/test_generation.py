@@ -245,6 +245,8 @@ def test_other_settings_are_refused_by_name(folder: Path) -> None:
     for changed, message in (
         (replace(SETTINGS, seed=4), "seed 3, not 4"),
         (replace(SETTINGS, trajectories=13), "trajectories 12, not 13"),
+        (replace(SETTINGS, mix={"rop": 1.0}), r'mix .*"rop_dense".*, not {"rop": 1.0}'),
+        (replace(SETTINGS, mix=dict(reversed(SETTINGS.mix.items()))), r"mix .*, not "),
         (replace(SETTINGS, search=search), r"search\.safety_distance 0\.05, not 0\.02"),
     ):
         before = contents(folder)

@@ -163,8 +163,8 @@ def _claim(wanted: Manifest, out: Path) -> None:
         return
     found = read_manifest(out)
     found.check_robot(load_robot(wanted.robot))
-    begun = _flat(found.settings)
-    for name, value in _flat(wanted.settings).items():
+    begun = _by_name(found.settings)
+    for name, value in _by_name(wanted.settings).items():
         if begun.get(name) != value:
             raise InputError(
                 f"{out} was begun with {name} {begun.get(name)}, not {value}; use the same settings, or "
@@ -178,9 +178,9 @@ def _claim(wanted: Manifest, out: Path) -> None:
             )
 
 
-def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """As they come back from JSON, those of the search as search.NAME."""
-    flat: dict[str, Any] = {}
-    for name, value in json.loads(json.dumps(settings)).items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
-    return flat
+def _by_name(settings: dict[str, Any]) -> dict[str, str]:
+    """As JSON, in which the order of a mix counts; those of the search as search.NAME."""
+    search = settings.get("search")
+    inner = search if isinstance(search, dict) else {}
+    named = settings | {f"search.{name}": value for name, value in inner.items()}
+    return {name: json.dumps(value) for name, value in named.items() if name != "search"}
