@@ -19,6 +19,10 @@ def dpm_solver(
     the middle of the step in lambda = log(signal / noise). The first and the last step are of first order:
     the first has no earlier prediction, and the last, of infinite length in lambda, takes the prediction as
     it is. With eta 1 this is their SDE-DPM-Solver++(2M).
+
+    Levels are spaced evenly in t as for the others. Spaced evenly in lambda, samples of the Panda's model end
+    nearer to where 200 steps take them from 8 steps on (0.065 against 0.080 with 10) but farther off up to 6
+    (0.128 against 0.119), and no more of them were free of collision than chance explains.
     """
     check_eta(eta)
     levels = schedule.sampling_levels(steps).tolist()
