@@ -134,7 +134,7 @@ def on_ray(settings: GenerationSettings, indices: list[int]) -> Made:
     except RayTaskError as error:
         if isinstance(error.cause, InputError):
             raise InputError(str(error.cause)) from None
-        if "failed to import" in str(error):
+        if "No module named 'robotdiffuse'" in str(error):
             raise InputError(
                 f"a node of the Ray cluster cannot import robotdiffuse; install {__version__} on all"
             ) from None
