@@ -82,6 +82,10 @@ def sample_target(
     return transform(point - fingers * rotation[:, 2], rotation)
 
 
+LEAST = {"objects": 0, "boards": 2, "columns": 1, "crates": 1, "spots": 0, "lowest": 0}
+"""What these ranges may start from; the others, but for angles, must be positive."""
+
+
 @dataclass(frozen=True)
 class FurnitureSettings:
     """What all families share. Every range is drawn from uniformly; equal ends fix the value."""
@@ -126,22 +130,19 @@ class FurnitureSettings:
         raise NotImplementedError
 
 
-LEAST = {"objects": 0, "boards": 2, "columns": 1, "crates": 1, "spots": 0}
-"""Of the ranges that count."""
-
-
 @dataclass(frozen=True)
 class ShelfSettings(FurnitureSettings):
     """A bookcase that faces the arm: boards between uprights, open in front. Regions are its compartments and
-    the space on its top board; the hand points into it. Lengths in [m]."""
+    the space on its top board; the hand points into it. Of the loose things, at most one stands at a side of
+    a compartment; one that would leave too little room there is left out. Lengths in [m]."""
 
     reach: float = 0.85
     """A hand that points ahead reaches farther than one that points down."""
     distance: Range = (0.45, 0.7)
     """From the base to the middle of the front."""
     boards: tuple[int, int] = (2, 4)
-    lowest: Range = (0.02, 0.35)
-    """Height of the upper side of the lowest board."""
+    lowest: Range = (0.0, 0.33)
+    """Height of the lower side of the lowest board."""
     row_height: Range = (0.26, 0.42)
     """Free height between two boards, drawn for each row."""
     columns: tuple[int, int] = (1, 3)
@@ -324,13 +325,13 @@ def _shelf(s: ShelfSettings, rng: Generator) -> Drawn:
     frame = _Frame(s, s.distance, rng)
     depth, t = rng.uniform(*s.depth), rng.uniform(*s.thickness)
     rows = rng.uniform(*s.row_height, _count(s.boards, rng) - 1)
-    tops = rng.uniform(*s.lowest) + np.concatenate([[0.0], np.cumsum(rows + t)])
+    tops = rng.uniform(*s.lowest) + t + np.concatenate([[0.0], np.cumsum(rows + t)])
     columns = rng.uniform(*s.column_width, _count(s.columns, rng))
     sides = np.concatenate([[0.0], np.cumsum(columns + t)])
     sides -= (sides[-1] + t) / 2
     left, right, height = sides[0], sides[-1] + t, tops[-1]
     shapes: list[Box | Sphere] = [
-        frame.box((0.0, left, max(z - t, 0.0)), (depth, right, z), "board") for z in tops
+        frame.box((0.0, left + t, z - t), (depth, right - t, z), "board") for z in tops
     ]
     shapes += [frame.box((0.0, y, 0.0), (depth, y + t, height), "upright") for y in sides]
     if rng.random() < s.back_share:
@@ -345,6 +346,8 @@ def _shelf(s: ShelfSettings, rng: Generator) -> Drawn:
     for i in rng.permutation(len(rooms))[:things]:
         low, high, z, ceiling = rooms[i]
         thing = _Thing(s, rng, ceiling - z - GAP)
+        if 3 * thing.half > high - low:
+            continue
         x = rng.uniform(min(thing.half, depth / 2), max(depth - thing.half, depth / 2))
         y = low + thing.half if rng.random() < 0.5 else high - thing.half
         shapes.append(thing.placed(frame, x, y, z))
