@@ -37,6 +37,7 @@ class CompressionAutoencoderSettings(EncoderSettings):
 class CompressionAutoencoder(Autoencoder):
     """z = MLP(all points, one after the other)."""
 
+    any_size = False
     settings: CompressionAutoencoderSettings
 
     def __init__(self, settings: CompressionAutoencoderSettings) -> None:
@@ -82,8 +83,9 @@ class CompressionAutoencoder(Autoencoder):
         The equation's K, which it does not define, is the number of points; its i-hat is the text's x-hat.
         `reconstruction` is the root of the loss [m].
         """
-        code = self.encode(cloud)
-        error = (self.decode(code) - self.arrange(cloud)).square().sum(-1).mean()
+        with fp32(cloud):
+            points = self.arrange(cloud.float())
+            error = (self.decode(self.encoder(points.flatten(1))) - points).square().sum(-1).mean()
         return error, {"reconstruction": error.item() ** 0.5}
 
     def penalised(self) -> Iterable[Tensor]:
