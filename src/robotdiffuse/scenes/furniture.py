@@ -206,7 +206,7 @@ class TableSettings(FurnitureSettings):
     """Share of the tables on four legs; the others are solid."""
     leg_width: Range = (0.04, 0.07)
     wall_share: float = 0.5
-    """Share of the tables with a wall across the middle part."""
+    """Share of the tables with a wall that runs away from the arm, in the middle part."""
     pillar_share: float = 0.3
     """Share of the tables with a pillar."""
     divider_height: Range = (0.25, 0.6)
@@ -295,6 +295,7 @@ class _Thing:
     def __init__(self, settings: FurnitureSettings, rng: Generator, tallest: float = np.inf) -> None:
         x, y = rng.uniform(*settings.object_width, 2)
         self.ball = rng.random() < settings.ball_share
+        x = min(x, tallest) if self.ball else x
         self.size = (x, x, x) if self.ball else (x, y, min(rng.uniform(*settings.object_height), tallest))
         self.turn = float(rng.uniform(-np.pi, np.pi))
         self.half = x / 2 if self.ball else float(np.hypot(x, y)) / 2
