@@ -192,9 +192,9 @@ def test_samples_hold_start_and_goal(guided):
 
 def test_denoiser_sees_the_clearances():
     model = small_model()
-    line = model.line(np.zeros((2, 3)), np.ones((2, 3)))
+    between = model.between(np.zeros((2, 3)), np.ones((2, 3)))
     x = np.zeros((2, 16, 3), np.float32)
-    features = model.features(x, line, lambda q: np.stack([q[..., 0] * 0 + d for d in (-5, 0.15, 9)], -1))
+    features = model.features(x, between, lambda q: np.stack([q[..., 0] * 0 + d for d in (-5, 0.15, 9)], -1))
     assert features.shape == (2, 16, 9)
     np.testing.assert_allclose(features[0, 0, 6:], [-1, 0, 1], atol=1e-6)
 
@@ -203,10 +203,10 @@ def test_residual_and_joints_are_inverse():
     model = small_model()
     q = np.random.default_rng(0).uniform(-2, 2, (4, 16, 3)).astype(np.float32)
     model.fit_statistics(q, smooth_noise=True)
-    line = model.line(q[:, 0], q[:, -1])
-    residual = model.residual(q, line)
-    np.testing.assert_allclose(model.joints(residual, line), q, atol=1e-5)
-    assert np.sqrt((residual[:, 1:-1] ** 2).mean((0, 1))) == pytest.approx([1, 1, 1], abs=1e-4)
+    between = model.between(q[:, 0], q[:, -1])
+    rows = model.to_rows(q, between)
+    np.testing.assert_allclose(model.joints(rows, between), q, atol=1e-5)
+    assert np.sqrt((rows[:, 1:-1] ** 2).mean((0, 1))) == pytest.approx([1, 1, 1], abs=1e-4)
 
 
 def test_checkpoint_round_trip(tmp_path):

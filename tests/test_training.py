@@ -17,8 +17,10 @@ from robotdiffuse.learning.batches import load_data, random_scenes, resample_eve
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, save_encoder
 from robotdiffuse.learning.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.denoisers import TransformerSettings, UNetSettings
+from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.encoder_training import train_encoder
 from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
+from robotdiffuse.learning.losses import LossSettings
 from robotdiffuse.learning.shards import shard_path, split_of, write_manifest, write_shard
 from robotdiffuse.learning.training import moving_links, train_planner
 from robotdiffuse.learning.training_run import TrainingRun
@@ -137,9 +139,43 @@ def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
     assert train(tmp_path / "parts") == whole, "a finished run is left as it is"
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"target": "absolute", "smooth_noise": False},
+        {"parametrization": "b_spline", "rows": 8},
+        {"parametrization": "b_spline", "rows": 8, "target": "absolute"},
+        {"objective": "noise"},
+        {"objective": "velocity", "schedule": ScheduleSettings(kind="flow"), "sampler": "euler"},
+        {"sees_clearances": False, "sampler": "dpm_solver"},
+        {"losses": LossSettings(point=0.1, collision=0.1, frames=4)},
+    ],
+    ids=lambda changes: "-".join(map(str, changes)),
+)
+def test_every_choice_trains_and_plans(changes, tmp_path, data, arm):
+    """Loss falls, start and goal are exact, samples are within limits."""
+    out = tmp_path / "out"
+    train_planner(planner_settings(data, samples=16 * 120, **changes), str(out))
+    losses = [float(row["loss"]) for row in read_log(out)]
+    assert losses[-1] < losses[0]
+    model = load_model(out, arm)
+    start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
+    z = model.encode(np.zeros((0, 3)))
+
+    def clearances(q):
+        return np.full((*q.shape[:2], 3), 0.3, np.float32)
+
+    q = model.sample(z, start, goal, 3, np.random.default_rng(0), clearances, steps=8)
+    assert q.shape == (3, FRAMES, 3) and np.isfinite(q).all()
+    assert (q[:, 0] == start).all() and (q[:, -1] == goal).all()
+    assert (q >= arm.lower).all() and (q <= arm.upper).all()
+
+
 def test_planner_learns_which_side(tmp_path, data, arm):
     out = tmp_path / "out"
-    report = train_planner(planner_settings(data, samples=16 * 500, point_weight=0.01), str(out))
+    report = train_planner(
+        planner_settings(data, samples=16 * 500, losses=LossSettings(point=0.01)), str(out)
+    )
     rows = read_log(out)
     assert float(rows[-1]["loss"]) < 0.3 * float(rows[0]["loss"])
     assert report["samples"] == 8000

@@ -210,17 +210,25 @@ def fast_bf16() -> bool:
 class Batch:
     """Noisy trajectories and their clean ones; float32."""
 
-    features: Float[ndarray, "n frames features"]
+    features: Float[ndarray, "n rows features"]
     level: Float[ndarray, "n"]
     """t / T"""
     condition: Float[ndarray, "n condition"]
     """With zeros for z where there are clouds."""
     clouds: Float32[Tensor, "n points 3"] | None
     """Of the scenes [m], where the encoder is trained along."""
-    clean: Float[ndarray, "n frames dof"]
-    """Scaled residuals."""
+    clean: Float[ndarray, "n rows dof"]
+    noisy: Float[ndarray, "n rows dof"]
+    target: Float[ndarray, "n rows dof"]
+    """What the network is to output, by the model's objective."""
     weight: Float[ndarray, "n"]
-    line: Float[ndarray, "n frames dof"]
+    """Of the squared error of the output, by level."""
+    base: Float[ndarray, "n rows dof"]
+    """What rows are relative to, see `Between`."""
+    signal: Float[ndarray, "n 1 1"]
+    noise_level: Float[ndarray, "n 1 1"]
+    kinds: Int8[ndarray, "n k"]
+    params: Float32[ndarray, "n k 10"]
 
 
 class Batches:
@@ -234,7 +242,7 @@ class Batches:
         trivial_share: float,
         weight_limit: float,
     ) -> None:
-        """clearances: (kinds [n, k], params [n, k, 10], q [n, frames, dof]) to [n, frames, links] [m]."""
+        """clearances: (kinds [n, k], params [n, k, 10], q [n, rows, dof]) to [n, rows, links] [m]."""
         self.data, self.model, self.clearances = data, model, clearances
         self.weight_limit = weight_limit
         self.trivial, self.hard = np.flatnonzero(data.trivial), np.flatnonzero(~data.trivial)
@@ -266,18 +274,28 @@ class Batches:
         q = data.q[rows]
         back = rng.random(len(rows)) < 0.5
         q[back] = q[back, ::-1]
-        line = model.line(q[:, 0], q[:, -1])
-        clean = model.residual(q, line)
-        signal, noise = (
+        between = model.between(q[:, 0], q[:, -1])
+        clean = model.to_rows(q, between)
+        signal, noise_level = (
             a[levels].astype(np.float32)[:, None, None] for a in (schedule.signal, schedule.noise)
         )
-        noisy = signal * clean + noise * model.draw_noise(len(rows), rng)
+        noise = model.draw_noise(len(rows), rng)
+        noisy = signal * clean + noise_level * noise
+        target = model.objective.target(clean, noise, signal, noise_level)
+        weight = model.objective.weight(schedule, levels, self.weight_limit)
+        held = model.hold(noisy.copy(), between)
         return Batch(
-            features=model.features(noisy, line, lambda at: self.clearances(kinds, params, at)),
+            features=model.features(held, between, lambda at: self.clearances(kinds, params, at)),
             level=(levels / schedule.steps).astype(np.float32),
             condition=model.condition(codes, q[:, 0], q[:, -1]),
             clouds=clouds,
             clean=clean,
-            weight=schedule.weight(levels, self.weight_limit).astype(np.float32),
-            line=line,
+            noisy=noisy,
+            target=target,
+            weight=weight.astype(np.float32),
+            base=between.base,
+            signal=signal,
+            noise_level=noise_level,
+            kinds=kinds,
+            params=params,
         )

@@ -10,6 +10,7 @@ from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings
+from robotdiffuse.learning.losses import LossSettings
 
 Settings = TypeVar("Settings")
 
@@ -136,7 +137,7 @@ class PlannerTraining:
     """Training of the motion predictor on planned trajectories."""
 
     data: str
-    """Folder with shards (.npz) of `robotdiffuse data generate`."""
+    """Folder of a data set of `robotdiffuse data generate`."""
     encoder: str
     """Folder with a trained encoder, which stays as it is; or the name of an encoder, pointnet or dgcnn, say,
     that starts untrained and is trained along, by the planner's loss, on clouds drawn anew each time."""
@@ -159,8 +160,8 @@ class PlannerTraining:
     """Decay of the moving average of the weights; the average is what is kept."""
     weight_limit: float = 5.0
     """Most that a noise level weighs in the loss, see NoiseSchedule.weight."""
-    point_weight: float = 0.0
-    """The paper's lambda_point: weight of the squared distance of the link origins, in units of 0.1 m."""
+    losses: LossSettings = field(default_factory=LossSettings)
+    """The paper's losses of joints, points and collision."""
     trivial_share: float = 0.1
     """Share of the batch whose straight line is free. They teach to leave the line alone."""
     smooth_noise: bool = True
@@ -180,6 +181,20 @@ class PlannerTraining:
     """Share of the samples whose condition [z, start, goal] is hidden from the denoiser, for classifier-free
     guidance (paper: "randomly masked", no share given; Ho and Salimans 2022: 0.1 or 0.2). 0: no guidance."""
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+    sampler: str = "ddim"
+    """That planning will use: ddpm (the paper's), ddim, dpm_solver or euler."""
+    frames: int = 48
+    """Frames of a trajectory (paper: 254)."""
+    parametrization: str = "frames"
+    """What is diffused: frames (the paper's) or b_spline control points."""
+    rows: int | None = None
+    """As many; None: as there are frames."""
+    target: str = "residual"
+    """What rows are relative to: residual, to the straight line; absolute (the paper's)."""
+    objective: str = "clean"
+    """What the network predicts: clean (the paper's), noise or velocity."""
+    sees_clearances: bool = True
+    """Whether the denoiser is told the links' clearances along the noisy trajectory (beyond the paper)."""
 
     def __post_init__(self) -> None:
         _length(self.samples, self.minutes)

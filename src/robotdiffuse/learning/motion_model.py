@@ -10,13 +10,16 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.learning.config import check_kind, of_kind
 from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
 from robotdiffuse.learning.denoisers.layers import Linear
-from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
+from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings, PointAutoencoderSettings, make_encoder
 from robotdiffuse.learning.normalizer import JointNormalizer
+from robotdiffuse.learning.objectives import objective_for
+from robotdiffuse.learning.parametrization import parametrization
+from robotdiffuse.learning.representation import Between, TrajectoryRows
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.robots.robot import Robot
 
@@ -25,7 +28,7 @@ MAX_POINTS = 2048
 is for, if it is not for clouds of any size."""
 
 ClearanceFn = Callable[[ndarray], ndarray]
-"""Joint values [count, frames, dof] (float32) to clearances of the links, [count, frames, links] [m]."""
+"""Joint values [count, rows, dof] (float32) to clearances of the links, [count, rows, links] [m]."""
 GuideFn = Callable[[ndarray, float], ndarray]
 """Predicted joint values [count, frames, dof] (float32), noise level in (0, 1]; to improved joint values."""
 
@@ -44,7 +47,7 @@ class MotionModelConfig:
     links: tuple[str, ...]
     """The links whose clearances the denoiser sees, in order."""
     frames: int = 48
-    """Rows of a trajectory, evenly spaced along it (joint-space length)."""
+    """Frames of a trajectory, evenly spaced along it (joint-space length)."""
     clearance_low: float = -0.1
     """Clearances are clipped to this range before the denoiser sees them [m]."""
     clearance_high: float = 0.4
@@ -60,9 +63,21 @@ class MotionModelConfig:
     """Whether the model has a learned stand-in for a dropped condition, for classifier-free guidance."""
     sampler: str = "ddim"
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+    parametrization: str = "frames"
+    """What the rows are that are diffused: frames, or b_spline control points."""
+    rows: int | None = None
+    """As many; None: as there are frames."""
+    target: str = "residual"
+    """What rows are relative to: the straight line from start to goal (residual), or nothing (absolute)."""
+    objective: str = "clean"
+    """What the network predicts: clean, noise or velocity."""
+    sees_clearances: bool = True
+    """Whether the denoiser is told the clearances of the links along the noisy trajectory."""
 
     def __post_init__(self) -> None:
         check_kind("encoder", self.encoder, self.encoder_settings, ENCODERS)
+        if self.sampler not in SAMPLERS:
+            raise unknown_name("sampler", self.sampler, SAMPLERS)
         check_kind("denoiser", self.denoiser, self.denoiser_settings, DENOISERS)
 
     def check_robot(self, robot: Robot, where: str) -> None:
@@ -78,35 +93,26 @@ class MotionModelConfig:
             )
 
 
-class MotionModel(nn.Module):
-    """The diffusion model over trajectories.
+class MotionModel(TrajectoryRows):
+    """The diffusion model over trajectories, which are rows of numbers as in `TrajectoryRows`."""
 
-    A trajectory is its residual to the straight line from start to goal in normalised joint space, divided by
-    the standard deviation of the training residuals. Its first and last frame are zero: start and goal. The
-    paper's noise interpolation, which writes start and goal over the ends at each step, thus is a zero there.
-    """
-
-    residual_scale: Tensor
-    noise_factor: Tensor
     null_condition: nn.Parameter | None
 
     def __init__(self, config: MotionModelConfig) -> None:
-        super().__init__()
+        rows = parametrization(config.parametrization, config.frames, config.rows or config.frames)
+        normalizer = JointNormalizer(np.array(config.lower), np.array(config.upper))
+        super().__init__(normalizer, rows, config.target, config.frames)
         self.config = config
-        self.dof = len(config.joint_names)
-        self.normalizer = JointNormalizer(np.array(config.lower), np.array(config.upper))
         self.schedule = NoiseSchedule(config.schedule)
+        self.objective = objective_for(config.objective, self.schedule)
         self.encoder = make_encoder(config.encoder, config.encoder_settings)
         condition = config.encoder_settings.code + 2 * self.dof
-        features = 2 * self.dof + len(config.links)
+        features = 2 * self.dof + (len(config.links) if config.sees_clearances else 0)
         self.denoiser = DENOISERS[config.denoiser][0](
-            config.denoiser_settings, config.frames, self.dof, features, condition
+            config.denoiser_settings, self.rows, self.dof, features, condition
         )
         null = nn.Parameter(torch.zeros(condition)) if config.null_condition else None
         self.register_parameter("null_condition", null)
-        self.register_buffer("residual_scale", torch.ones(self.dof))
-        self.register_buffer("noise_factor", torch.eye(config.frames))
-        self._line = np.linspace(0.0, 1.0, config.frames, dtype=np.float32)[:, None]
 
     def for_inference(self) -> "MotionModel":
         """Freeze, and keep the denoiser's matrices in bf16 where the CPU multiplies it fast. Returns self."""
@@ -116,18 +122,6 @@ class MotionModel(nn.Module):
                 if isinstance(module, Linear):
                     module.to(torch.bfloat16)
         return self
-
-    def fit_statistics(self, q: Float[ndarray, "n frames dof"], smooth_noise: bool) -> None:
-        """Set the scale of the residuals, and the covariance of the noise, from trajectories [rad]."""
-        self.residual_scale.fill_(1.0)
-        residuals = self.residual(q, self.line(q[:, 0], q[:, -1]))
-        scale = np.maximum(np.sqrt((residuals[:, 1:-1] ** 2).mean((0, 1))), 1e-4)
-        self.residual_scale.copy_(torch.from_numpy(scale))
-        self.noise_factor.copy_(torch.from_numpy(noise_factor(residuals / scale, smooth_noise)))
-
-    @property
-    def _scale(self) -> ndarray:
-        return self.residual_scale.numpy()
 
     def encode(
         self, points: Float[ndarray, "n 3"], rng: np.random.Generator | None = None
@@ -142,45 +136,17 @@ class MotionModel(nn.Module):
         with torch.inference_mode(), one_thread():
             return self.encoder(torch.from_numpy(points)[None])[0].numpy()
 
-    def line(
-        self, start: Float[ndarray, "*batch dof"], goal: Float[ndarray, "*batch dof"]
-    ) -> Float[ndarray, "*batch frames dof"]:
-        """The straight line from start to goal, normalised joint values."""
-        a = self.normalizer.to_unit(np.asarray(start, np.float32))[..., None, :]
-        b = self.normalizer.to_unit(np.asarray(goal, np.float32))[..., None, :]
-        return a + (b - a) * self._line
-
-    def residual(
-        self, q: Float[ndarray, "*batch frames dof"], line: Float[ndarray, "*#batch frames dof"]
-    ) -> Float[ndarray, "*batch frames dof"]:
-        """Scaled residual of joint values [rad]."""
-        x = (self.normalizer.to_unit(q.astype(np.float32, copy=False)) - line) / self._scale
-        return hold_ends(x)
-
-    def joints(
-        self, x: Float[ndarray, "*batch frames dof"], line: Float[ndarray, "*#batch frames dof"]
-    ) -> Float[ndarray, "*batch frames dof"]:
-        """Joint values [rad] of a scaled residual."""
-        return self.normalizer.from_unit(line + x * self._scale)
-
     def features(
-        self,
-        x: Float[ndarray, "batch frames dof"],
-        line: Float[ndarray, "*batch1 frames dof"],
-        clearances: ClearanceFn,
-    ) -> Float[ndarray, "batch frames features"]:
-        """The denoiser's input for noisy residuals: residual, normalised joint values, link clearances."""
+        self, x: Float[ndarray, "batch rows dof"], between: Between, clearances: ClearanceFn
+    ) -> Float[ndarray, "batch rows features"]:
+        """The denoiser's input for noisy rows: the rows, normalised joint values, clearances of the links."""
+        unit = self.at_sites(x, between)
+        if not self.config.sees_clearances:
+            return np.concatenate([x, unit], axis=-1)
         low, high = self.config.clearance_low, self.config.clearance_high
-        unit = line + x * self._scale
         near = np.clip(clearances(self.normalizer.from_unit(unit)), low, high)
         near = (near - (low + high) / 2) * (2 / (high - low))
         return np.concatenate([x, unit, near.astype(np.float32, copy=False)], axis=-1)
-
-    def draw_noise(self, count: int, rng: np.random.Generator) -> Float[ndarray, "count frames dof"]:
-        """Standard noise of the forward process; zero at both ends."""
-        return self.noise_factor.numpy() @ rng.standard_normal(
-            (count, self.config.frames, self.dof), dtype=np.float32
-        )
 
     def condition(
         self,
@@ -194,11 +160,11 @@ class MotionModel(nn.Module):
 
     def denoise(
         self,
-        features: Float[Tensor, "batch frames features"],
+        features: Float[Tensor, "batch rows features"],
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
         dropped: Bool[Tensor, "batch"] | None = None,
-    ) -> Float[Tensor, "batch frames dof"]:
+    ) -> Float[Tensor, "batch rows dof"]:
         """What the denoiser predicts.
 
         dropped: samples whose condition is hidden from it (Ho and Salimans 2022; paper: C is randomly
@@ -212,11 +178,11 @@ class MotionModel(nn.Module):
 
     def denoise_guided(
         self,
-        features: Float[Tensor, "batch frames features"],
+        features: Float[Tensor, "batch rows features"],
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
         scale: float,
-    ) -> Float[Tensor, "batch frames dof"]:
+    ) -> Float[Tensor, "batch rows dof"]:
         """Classifier-free guidance: u + scale (c - u), of the predictions c with the condition and u without.
 
         1 is the prediction itself, at no cost; other scales take a batch of twice the size.
@@ -257,23 +223,25 @@ class MotionModel(nn.Module):
                 f"guidance_scale is {guidance_scale}; it must be 1, for this model was trained with "
                 "condition_drop 0 and knows no motions without a condition"
             )
-        line = self.line(start, goal)[None]
+        between = self.between(start[None], goal[None])
         condition = torch.from_numpy(self.condition(code, start, goal)).expand(count, -1)
         levels = self.config.schedule.steps
+        signal, noise = (a.astype(np.float32) for a in (self.schedule.signal, self.schedule.noise))
         guided: Int[ndarray, "n"] = self.schedule.sampling_levels(steps)[steps // 2 : -1]
 
         def predict(x: ndarray, level: int) -> ndarray:
-            inputs = torch.from_numpy(self.features(x, line, clearances))
+            inputs = torch.from_numpy(self.features(self.hold(x.copy(), between), between, clearances))
             at = torch.full((count,), level / levels)
-            clean = self.denoise_guided(inputs, at, condition, guidance_scale).numpy()
+            output = self.denoise_guided(inputs, at, condition, guidance_scale).numpy()
+            clean = self.hold(self.objective.clean(x, output, signal[level], noise[level]), between)
             if guide is not None and level in guided:
-                clean = self.residual(guide(self.joints(hold_ends(clean), line), level / levels), line)
-            return hold_ends(clean)
+                clean = self.to_rows(guide(self.joints(clean, between), level / levels), between)
+            return clean
 
         with torch.inference_mode(), one_thread():
             sampler = SAMPLERS[self.config.sampler]
             x = sampler(predict, self.schedule, lambda: self.draw_noise(count, rng), steps, eta)
-        q = self.joints(x, line).astype(np.float64)
+        q = self.joints(x, between).astype(np.float64)
         np.clip(q, self.config.lower, self.config.upper, out=q)
         q[:, 0], q[:, -1] = start, goal
         return q
@@ -289,10 +257,3 @@ def one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-def hold_ends(x: Float[ndarray, "*batch frames dof"]) -> Float[ndarray, "*batch frames dof"]:
-    """Set the first and last frame of residuals to zero (noise interpolation), in place."""
-    x[..., 0, :] = 0.0
-    x[..., -1, :] = 0.0
-    return x

@@ -27,9 +27,21 @@ class Parametrization:
     sites: Float[ndarray, "rows rows"]
     """`sites @ rows`: the trajectory at one place for each row, where the network is told of clearances."""
 
+    themselves: bool = False
+    """Rows are the frames: nothing is multiplied."""
+
     @property
     def rows(self) -> int:
         return len(self.fit)
+
+    def to_rows(self, frames: Float[ndarray, "*batch frames dof"]) -> Float[ndarray, "*batch rows dof"]:
+        return frames if self.themselves else self.fit @ frames
+
+    def to_frames(self, rows: Float[ndarray, "*batch rows dof"]) -> Float[ndarray, "*batch frames dof"]:
+        return rows if self.themselves else self.evaluate @ rows
+
+    def at_sites(self, rows: Float[ndarray, "*batch rows dof"]) -> Float[ndarray, "*batch rows dof"]:
+        return rows if self.themselves else self.sites @ rows
 
 
 def frames_themselves(frames: int, rows: int) -> Parametrization:
@@ -37,7 +49,7 @@ def frames_themselves(frames: int, rows: int) -> Parametrization:
     if rows != frames:
         raise InputError(f"rows is {rows}; for the parametrization frames it must be {frames}, the frames")
     identity = np.eye(frames, dtype=np.float32)
-    return Parametrization(identity, identity, identity)
+    return Parametrization(identity, identity, identity, themselves=True)
 
 
 def b_spline(frames: int, rows: int) -> Parametrization:
@@ -58,7 +70,8 @@ def b_spline(frames: int, rows: int) -> Parametrization:
     fit[0, 0] = fit[-1, -1] = 1.0
     left = np.eye(frames) - evaluate[:, [0, -1]] @ fit[[0, -1]]
     fit[1:-1] = np.linalg.pinv(evaluate[:, 1:-1]) @ left
-    return Parametrization(*(m.astype(np.float32) for m in (fit, evaluate, _basis(knots, greville))))
+    sites = _basis(knots, greville)
+    return Parametrization(fit.astype(np.float32), evaluate.astype(np.float32), sites.astype(np.float32))
 
 
 def _basis(knots: Float[ndarray, "m"], at: Float[ndarray, "n"]) -> Float[ndarray, "n rows"]:

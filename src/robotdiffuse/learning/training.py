@@ -14,6 +14,7 @@ from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_mod
 from robotdiffuse.learning.config import PlannerTraining, settings_to_json
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import Encoder, encoder_name, make_encoder
+from robotdiffuse.learning.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.training_run import TrainingRun
 from robotdiffuse.learning.versions import versions
@@ -27,10 +28,6 @@ HELD_OUT = 2000
 """Most trajectories of the split for validation that are looked at."""
 FLOOR = Scene([Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")])
 """Part of every scene of the data, as in ROP."""
-POINT_UNIT = 0.1
-"""[m] in L_point, so that it is of the size of the joint loss."""
-POINT_FRAMES = 6
-"""L_point looks at every so-manieth frame, which costs less and says the same."""
 
 
 def moving_links(robot: Robot) -> tuple[str, ...]:
@@ -80,7 +77,7 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
         return packed_link_clearances(arrays, kinds, params, q, FLOOR, model.config.clearance_high)
 
     batches = Batches(kept, model, clearances, settings.trivial_share, settings.weight_limit)
-    objective = _Objective(model, robot, settings)
+    loss_of = _Loss(model, robot, settings)
 
     def validate() -> float:
         if not len(held_out):
@@ -88,13 +85,15 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
         rng = np.random.default_rng(7)
         source = Batches(held_out, model, clearances, settings.trivial_share, settings.weight_limit)
         with torch.no_grad():
-            return float(np.mean([objective(source.draw(settings.batch, rng)).item() for _ in range(8)]))
+            parts = [loss_of(source.draw(settings.batch, rng), run.fraction, rng).item() for _ in range(8)]
+            return float(np.mean(parts))
 
     def loss(rng: np.random.Generator) -> Float[Tensor, ""]:
         batch = batches.draw(settings.batch, rng)
-        if settings.condition_drop == 0:
-            return objective(batch)
-        return objective(batch, torch.from_numpy(rng.random(settings.batch) < settings.condition_drop))
+        dropped = None
+        if settings.condition_drop > 0:
+            dropped = torch.from_numpy(rng.random(settings.batch) < settings.condition_drop)
+        return loss_of(batch, run.fraction, rng, dropped)
 
     run.loop(loss, validate, "planner")
     with run.averaged():
@@ -126,39 +125,77 @@ def _model_config(settings: PlannerTraining, robot: Robot, encoder: Encoder) -> 
         denoiser_settings=settings.denoiser_settings or DENOISERS[settings.denoiser][1](),
         null_condition=settings.condition_drop > 0,
         schedule=settings.schedule,
+        sampler=settings.sampler,
+        frames=settings.frames,
+        parametrization=settings.parametrization,
+        rows=settings.rows,
+        target=settings.target,
+        objective=settings.objective,
+        sees_clearances=settings.sees_clearances,
     )
 
 
-class _Objective:
-    """The loss of a batch: L_simple on the joints, and L_point through forward kinematics (paper, eq. L)."""
+class _Loss:
+    """The loss of a batch: the objective's on the rows, L_point and L_collision (paper, eq. L)."""
 
     def __init__(self, model: MotionModel, robot: Robot, settings: PlannerTraining) -> None:
-        self.model, self.settings = model, settings
-        self.kinematics = ForwardKinematics(robot)
-        self.links = [robot.link_names.index(link) for link in moving_links(robot)]
-        self.half_range = torch.from_numpy(model.normalizer.half_range)
-        self.middle = torch.from_numpy(model.normalizer.middle)
+        self.model, self.settings = model, settings.losses
+        kinematics = ForwardKinematics(robot)
+        rng = np.random.default_rng(settings.seed)
+        self.points = (
+            SurfacePoints(kinematics, self.settings.points, rng) if self.settings.point > 0 else None
+        )
+        self.arm = ArmDistance(kinematics) if self.settings.collision > 0 else None
         self.bf16 = fast_bf16()
 
-    def __call__(self, batch: Batch, dropped: Bool[Tensor, "n"] | None = None) -> Float[Tensor, ""]:
-        """`dropped`: samples whose condition is hidden from the denoiser."""
-        features, level, condition = (
-            torch.from_numpy(a) for a in (batch.features, batch.level, batch.condition)
+    def __call__(
+        self,
+        batch: Batch,
+        fraction: float,
+        rng: np.random.Generator,
+        dropped: Bool[Tensor, "n"] | None = None,
+    ) -> Float[Tensor, ""]:
+        """`fraction` of the training is done; `dropped`: samples whose condition is hidden."""
+        model, losses = self.model, self.settings
+        features, level, condition, target, weight = (
+            torch.from_numpy(a)
+            for a in (batch.features, batch.level, batch.condition, batch.target, batch.weight)
         )
-        clean, weight = torch.from_numpy(batch.clean), torch.from_numpy(batch.weight)
         with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
             if batch.clouds is not None:
-                z = self.model.encoder(batch.clouds)
+                z = model.encoder(batch.clouds)
                 condition = torch.cat([z, condition[:, z.shape[1] :]], 1)
-            predicted = self.model.denoise(features, level, condition, dropped)
-        error = (predicted - clean)[:, 1:-1].square().mean((1, 2))
-        if self.settings.point_weight > 0:
-            frames = slice(POINT_FRAMES // 2, None, POINT_FRAMES)
-            line = torch.from_numpy(batch.line[:, frames].copy())
-            moved = self._origins(predicted[:, frames], line) - self._origins(clean[:, frames], line)
-            error = error + self.settings.point_weight * (moved / POINT_UNIT).square().sum(-1).mean((1, 2))
+            output = model.denoise(features, level, condition, dropped)
+        error = losses.joint * (output - target)[:, 1:-1].square().mean((1, 2))
+        collision_weight = losses.collision_weight(fraction)
+        if self.points is not None or collision_weight > 0:
+            error = error + self._in_space(batch, output, collision_weight, rng)
         return (weight * error).mean()
 
-    def _origins(self, x: Float[Tensor, "n frames dof"], line: Tensor) -> Float[Tensor, "n frames links 3"]:
-        q = (line + x * self.model.residual_scale) * self.half_range + self.middle
-        return self.kinematics.links(q)[..., self.links, :3, 3]
+    def _in_space(
+        self,
+        batch: Batch,
+        output: Float[Tensor, "n rows dof"],
+        collision_weight: float,
+        rng: np.random.Generator,
+    ) -> Float[Tensor, "n"]:
+        """L_point and L_collision of each sample, at a few frames."""
+        model, losses = self.model, self.settings
+        last = model.config.frames - 1
+        frames = sorted(rng.choice(np.arange(1, last), min(losses.frames, last - 1), replace=False).tolist())
+        noisy, signal, noise_level, clean, base = (
+            torch.from_numpy(np.ascontiguousarray(a))
+            for a in (batch.noisy, batch.signal, batch.noise_level, batch.clean, batch.base)
+        )
+        predicted = model.objective.clean(noisy, output, signal, noise_level)
+        # the ends are held, whatever is predicted there
+        predicted = torch.cat([clean[:, :1], predicted[:, 1:-1], clean[:, -1:]], 1)
+        q = model.joints_at(predicted, base, frames)
+        error = q.new_zeros(len(q))
+        if self.points is not None:
+            moved = self.points(q) - self.points(model.joints_at(clean, base, frames))
+            error = error + losses.point * (moved / POINT_UNIT).square().sum(-1).mean((1, 2))
+        if self.arm is not None and collision_weight > 0:
+            near = hinge(self.arm(q, batch.kinds, batch.params), losses.safe_distance) / POINT_UNIT
+            error = error + collision_weight * near.sum(-1).mean(1)
+        return error
