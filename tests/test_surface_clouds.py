@@ -12,6 +12,14 @@ from robotdiffuse.scenes.surface_clouds import surface_clouds
 from robotdiffuse.transforms import rotation_from_quaternion
 
 
+@pytest.fixture(autouse=True, params=["compiled", "tensors"])
+def both_ways(request, monkeypatch):
+    """Every test with the compiled code for whole surfaces, and with PyTorch alone, as on other devices."""
+    if request.param == "tensors":
+        monkeypatch.setattr(module, "COMPILED_ON", ())
+    return request.param
+
+
 def seeded(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
