@@ -124,7 +124,8 @@ def print_summary(summary: "DataSummary") -> None:
         made += f" of {summary.planned:,} planned"
     lost = ", ".join(f"{counts.get(name, 0):,} {name}" for name in ("unsolved", "refused", "thinned"))
     table = Table(show_header=False, title=f"{escape(summary.robot)}: {made} motions", title_justify="left")
-    table.add_row("frames", f"{summary.frames:,}, even in {summary.timing}")
+    spacing = "length" if summary.timing == "arc" else "time"
+    table.add_row("frames", f"{summary.frames:,}, evenly spaced in {spacing}")
     table.add_row("on disk", f"{size_in_words(summary.bytes)} in {summary.shards:,} shards")
     table.add_row("splits", ", ".join(f"{name} {n:,}" for name, n in summary.splits.items()))
     table.add_row(
@@ -134,7 +135,7 @@ def print_summary(summary: "DataSummary") -> None:
         f"{100 * summary.safety_distance:.3g} cm, or what start and goal have, kept by "
         f"{100 * summary.kept:.1f} %; where both have it, by {100 * summary.kept_throughout:.1f} %"
     )
-    table.add_row("safety distance", f"{safety} of the searches")
+    table.add_row("safety distance", safety)
     table.add_row("goals reached", f"{summary.goals_reached:.1f} per problem")
     console.print(table)
 

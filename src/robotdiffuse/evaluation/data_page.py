@@ -159,10 +159,11 @@ def _about(columns: DataColumns) -> str:
 
 def _tiles(summary: DataSummary) -> str:
     made = f"of {summary.planned:,} motions" if summary.trajectories < summary.planned else "motions"
+    frames = f"{summary.frames:,}" if summary.frames < 1e6 else f"{summary.frames / 1e6:.1f} M"
     train, *held_out = ((name, f"{count:,}") for name, count in summary.splits.items())
     tiles = (
         (f"{summary.trajectories:,}", made),
-        (f"{summary.frames:,}", "frames"),
+        (frames, "frames"),
         (size_in_words(summary.bytes), f"in {summary.shards:,} shards"),
         (f"{100 * summary.success:.1f} %", "of problems solved"),
         (

@@ -1,10 +1,30 @@
 """The PyBullet world (extra `sim`): a collision oracle that shares no code with ours, cameras and replay."""
 
-from robotdiffuse.simulation.camera import DepthCamera, DepthImage, point_cloud, render
-from robotdiffuse.simulation.film import FilmSettings, write_gif, write_png
-from robotdiffuse.simulation.oracle import OracleContact, PyBulletOracle
-from robotdiffuse.simulation.replay import Replay, ReplayContact, ReplaySettings, replay
-from robotdiffuse.simulation.world import World
+import os
+
+
+def _import_pybullet() -> None:
+    """PyBullet prints when it was built as it is imported, past Python's own streams."""
+    kept = [os.dup(stream) for stream in (1, 2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        for stream in (1, 2):
+            os.dup2(nowhere, stream)
+        import pybullet  # noqa: F401
+    finally:
+        for stream, copy in zip((1, 2), kept, strict=True):
+            os.dup2(copy, stream)
+            os.close(copy)
+        os.close(nowhere)
+
+
+_import_pybullet()
+
+from robotdiffuse.simulation.camera import DepthCamera, DepthImage, point_cloud, render  # noqa: E402
+from robotdiffuse.simulation.film import FilmSettings, write_gif, write_png  # noqa: E402
+from robotdiffuse.simulation.oracle import OracleContact, PyBulletOracle  # noqa: E402
+from robotdiffuse.simulation.replay import Replay, ReplayContact, ReplaySettings, replay  # noqa: E402
+from robotdiffuse.simulation.world import World  # noqa: E402
 
 __all__ = [
     "DepthCamera",
