@@ -43,7 +43,7 @@ def test_info_prints_figures_and_writes_the_page(folder, capsys):
     printed = capsys.readouterr().out
     for text in (
         "panda: 5 motions",
-        "100, even in arc",
+        "100, evenly spaced in length",
         "9: 71.4 % solved",
         "rop_dense",
         "length [rad]",
