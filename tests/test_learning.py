@@ -17,7 +17,7 @@ from robotdiffuse.learning.checkpoint import (
     save_model,
 )
 from robotdiffuse.learning.config import EncoderTraining, settings_from_json, settings_to_json
-from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
 from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
 from robotdiffuse.learning.encoders.point_autoencoder import chamfer, nearest
@@ -33,7 +33,7 @@ def small_model(seed: int = 0) -> MotionModel:
     """A model for the arm of boxes, with random weights in the last layer too."""
     torch.manual_seed(seed)
     robot = box_arm()
-    kind, settings = DENOISERS["transformer"]
+    kind, _ = DENOISERS["transformer"]
     config = MotionModelConfig(
         robot=robot.name,
         joint_names=robot.joint_names,
@@ -43,7 +43,7 @@ def small_model(seed: int = 0) -> MotionModel:
         links=("l1", "l2", "l3"),
         frames=16,
         encoder_settings=SMALL_ENCODER,
-        denoiser_settings=settings(width=16, layers=2, heads=2, hidden=32, patch=4),
+        denoiser_settings=TransformerSettings(width=16, layers=2, heads=2, hidden=32, patch=4),
     )
     model = MotionModel(config)
     assert isinstance(model.denoiser, kind)
