@@ -73,6 +73,10 @@ class FilmSettings:
 DEFAULT = FilmSettings()
 
 
+FLAT = 0.02
+"""Obstacles that rise no further above the arm's foot are ground [m]."""
+
+
 def write_png(
     robot: Robot, scene: Scene, run: Replay, file: str | Path, settings: FilmSettings = DEFAULT
 ) -> None:
@@ -195,9 +199,12 @@ def _extent(world: World, poses: Float[ndarray, "n dof"]) -> tuple[Float[ndarray
             if meshes
         ]
     low, high = np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))
-    wide = low - NEAR, high + NEAR
+    wide, foot = (low - NEAR, high + NEAR), low[2]
     for body in world.obstacles.values():
-        box = np.clip(pybullet.getAABB(body, physicsClientId=world.client), *wide)
+        bounds = np.array(pybullet.getAABB(body, physicsClientId=world.client))
+        if bounds[1, 2] <= foot + FLAT:
+            continue  # what the arm stands on may leave the image
+        box = np.clip(bounds, *wide)
         low, high = np.minimum(low, box[0]), np.maximum(high, box[1])
     return low, high
 
