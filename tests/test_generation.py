@@ -17,13 +17,15 @@ from numpy import ndarray
 from factory_runs import contents, in_this_process
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.generation import FAMILIES, GenerationSettings, factory, generate, problems
+from robotdiffuse.evaluation.data_rows import path_of, problem_of
+from robotdiffuse.generation import GenerationSettings, factory, generate, problems
 from robotdiffuse.generation.problems import draw_problem
 from robotdiffuse.generation.shard_maker import NUMBERS, make_shard, resample
 from robotdiffuse.learning.shards import check_shard, read_manifest, read_shard
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.scenes.families import FAMILIES, floor_of
 from robotdiffuse.scenes.rop import pack_scene
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion
@@ -81,7 +83,7 @@ def test_a_finished_folder_is_left_as_it_is(folder: Path) -> None:
 def test_shards_are_whole_and_what_the_manifest_says(folder: Path) -> None:
     manifest = read_manifest(folder)
     assert (manifest.trajectories, manifest.shard, manifest.slots) == (12, 4, 12)
-    assert tuple(manifest.families) == tuple(FAMILIES)
+    assert tuple(manifest.families) == tuple(MIX)
     assert set(manifest.versions) == {"robotdiffuse", "python", "numpy", "numba", "zarr"}
     for index in range(SETTINGS.shards):
         shard = check_shard(folder, index, manifest)
@@ -98,8 +100,8 @@ def checked_problem(row: dict[str, Any]) -> tuple[Problem, CollisionChecker]:
     rng = np.random.default_rng([SETTINGS.seed, int(row["seed"])])
     drawn = draw_problem(SETTINGS, PANDA, rng)
     assert row["family"] == drawn.family
-    floor = list(SETTINGS.families.values())[drawn.family].floor
-    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor:]), SETTINGS.slots)
+    floor = floor_of(list(SETTINGS.families.values())[drawn.family])
+    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor is not None :]), SETTINGS.slots)
     np.testing.assert_array_equal(row["obstacle_kinds"], kinds)
     np.testing.assert_array_equal(row["obstacle_params"], params)
     np.testing.assert_array_equal(row["start"], drawn.start)
@@ -322,3 +324,19 @@ def test_bad_mixes_are_refused(mix: dict[str, float], message: str) -> None:
 
 def test_the_papers_mix_needs_two_slots() -> None:
     assert GenerationSettings().slots == 2 and SETTINGS.slots == 12
+
+
+def test_furniture_among_the_families(tmp_path: Path) -> None:
+    """Fingers in a compartment, a crate or on a table at both ends; scenes with their own floor."""
+    settings = replace(SETTINGS, mix={"shelf": 1.0, "crate": 1.0, "table": 1.0}, trajectories=6, shard=6)
+    generate(settings, tmp_path, 1)
+    manifest, shard = read_manifest(tmp_path), check_shard(tmp_path, 0, read_manifest(tmp_path))
+    assert manifest.slots == 16 and len(set(shard["family"].tolist())) > 1
+    robot = load_robot("panda")
+    for row in range(6):
+        problem = problem_of(manifest, robot, shard, row)
+        assert problem.scene.shapes[0].name == "floor" and len(problem.scene.shapes) > 4
+        assert verify(problem, path_of(robot, shard, row)).valid
+        pose = shard["target_pose"][row]
+        reached = link_pose(robot, shard["trajectories"][row, -1].astype(float), robot.tip)
+        np.testing.assert_allclose(reached[:3, 3], pose[4:], atol=1e-5)

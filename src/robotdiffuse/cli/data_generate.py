@@ -18,7 +18,10 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
     parser.add_argument("--trajectories", type=count, metavar="N", help="motions to make (default: 140000)")
     parser.add_argument("--seed", type=natural, metavar="N", help="random seed (default: 0)")
     parser.add_argument(
-        "--mix", type=shares, metavar="NAME=P,...", help="shares of rop and rop_dense (default: rop=1)"
+        "--mix",
+        type=shares,
+        metavar="NAME=P,...",
+        help="shares of rop, rop_dense, shelf, crate and table (default: rop=1)",
     )
     parser.add_argument(
         "--trivial-share",

@@ -12,8 +12,10 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.learning.shards import Manifest, Shard, read_shard, shard_indices
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.furniture import FLOOR, FURNITURE
 from robotdiffuse.scenes.rop import RopSettings, floor_box, unpack_scene
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.types import Path, Trajectory
 
 
@@ -37,9 +39,16 @@ def family_settings(manifest: Manifest, family: int) -> RopSettings:
         raise InputError(f"families.{names[family]} in the manifest: {error}") from None
 
 
+def family_floor(manifest: Manifest, family: int) -> Box | None:
+    """The floor of a family's scenes; None if they have none. Raises InputError as `family_settings`."""
+    if 0 <= family < len(manifest.families) and family_names(manifest)[family] in FURNITURE:
+        return FLOOR
+    return floor_box(family_settings(manifest, family))
+
+
 def scene_of(manifest: Manifest, shard: Shard, row: int) -> Scene:
     """The scene of a row: the family's floor first, if it has one, then the obstacles."""
-    floor = floor_box(family_settings(manifest, int(shard["family"][row])))
+    floor = family_floor(manifest, int(shard["family"][row]))
     obstacles = unpack_scene(shard["obstacle_kinds"][row], shard["obstacle_params"][row]).shapes
     return Scene([*([] if floor is None else [floor]), *obstacles])
 

@@ -1,6 +1,6 @@
 """The data factory: random problems, solved by Shared-Tree Informed RRT*, judged, and kept in shards."""
 
 from robotdiffuse.generation.factory import generate
-from robotdiffuse.generation.settings import FAMILIES, GenerationSettings
+from robotdiffuse.generation.settings import GenerationSettings
 
-__all__ = ["FAMILIES", "GenerationSettings", "generate"]
+__all__ = ["GenerationSettings", "generate"]

@@ -14,6 +14,7 @@ from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, in
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.rop_problems import base_spheres, free_configuration
+from robotdiffuse.scenes.furniture import FurnitureSettings, Region, sample_furniture, sample_target
 from robotdiffuse.scenes.rop import RopSettings, sample_scene
 from robotdiffuse.scenes.scene import Scene
 
@@ -45,18 +46,23 @@ def draw_problem(settings: GenerationSettings, robot: Robot, rng: Generator) -> 
 
     Target `position`: the positions of the tip at start and goal are uniform in the family's region, as the
     authors' are; configurations come from inverse kinematics. Target `pose`: the start, and the first goal,
-    whose tip pose is the target, are uniform among the free configurations with the tip in the region. Scenes
-    that leave no start or no goal are drawn anew. Raises InputError if the settings leave none at all.
+    whose tip pose is the target, are uniform among the free configurations with the tip in the region. Among
+    furniture start and goal are poses with the fingers in two of its regions. Scenes that leave no start or
+    no goal are drawn anew. Raises InputError if the settings leave none at all.
     """
     shares = np.array(list(settings.mix.values()))
     family = int(rng.choice(len(shares), p=shares / shares.sum()))
     name, rules = list(settings.families.items())[family]
     keep_out = base_spheres(robot)
     for _ in range(SCENES):
-        scene = sample_scene(rules, rng, keep_out)
-        checker = CollisionChecker(robot, scene)
-        ends = _by_position if settings.target == "position" else _by_pose
-        found = ends(robot, rules, checker, settings.goals, rng)
+        if isinstance(rules, FurnitureSettings):
+            furnished = sample_furniture(rules, rng, keep_out)
+            scene = furnished.scene
+            found = _by_region(robot, furnished.regions, CollisionChecker(robot, scene), settings.goals, rng)
+        else:
+            scene = sample_scene(rules, rng, keep_out)
+            ends = _by_position if settings.target == "position" else _by_pose
+            found = ends(robot, rules, CollisionChecker(robot, scene), settings.goals, rng)
         if found is not None:
             return TargetProblem(family, scene, *found)
     raise InputError(
@@ -92,6 +98,19 @@ def _by_pose(
         others = _reaching(robot, T_base_tip, count - 1, checker, rng, FULL_POSE)
         goals = np.concatenate([goals, others])
     return start.astype(np.float32), goals, T_base_tip
+
+
+def _by_region(
+    robot: Robot, regions: tuple[Region, ...], checker: CollisionChecker, count: int, rng: Generator
+) -> _Ends | None:
+    """From one place among the furniture to another."""
+    first, second = (regions[i] for i in rng.choice(len(regions), 2, replace=False))
+    start = _reaching(robot, sample_target(first, rng), 1, checker, rng, FULL_POSE)
+    if not len(start):
+        return None
+    T_base_tip = sample_target(second, rng)
+    goals = _reaching(robot, T_base_tip, count, checker, rng, FULL_POSE)
+    return (start[0], goals, T_base_tip) if len(goals) else None
 
 
 def _random_position(rules: RopSettings, rng: Generator) -> Float[ndarray, "4 4"]:

@@ -4,10 +4,10 @@ from dataclasses import dataclass, field
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.planners.shared_tree import SharedTreeSettings
-from robotdiffuse.scenes.rop import ROP, ROP_DENSE, RopSettings
+from robotdiffuse.scenes.families import FAMILIES, most_obstacles
+from robotdiffuse.scenes.furniture import FurnitureSettings
+from robotdiffuse.scenes.rop import RopSettings
 
-FAMILIES: dict[str, RopSettings] = {"rop": ROP, "rop_dense": ROP_DENSE}
-"""Families of scenes by name."""
 TARGETS = ("position", "pose")
 TIMINGS = ("arc", "time")
 
@@ -27,7 +27,8 @@ class GenerationSettings:
     trivial_share: float = 1.0
     """Share that is kept of the problems that the straight line solves; 1 is the paper's distribution."""
     target: str = "position"
-    """What is given of the tip's goal: its position alone, as in the paper, or the whole pose."""
+    """What is given of the tip's goal: its position alone, as in the paper, or the whole pose. Among
+    furniture it is always the pose, with the fingers in a compartment, say."""
     goals: int = 10
     """Most goal configurations of a target, found by inverse kinematics (the paper's k)."""
     frames: int = 254
@@ -64,14 +65,14 @@ class GenerationSettings:
             raise InputError(f"goals is {self.goals}; it must be at most 127")
 
     @property
-    def families(self) -> dict[str, RopSettings]:
+    def families(self) -> dict[str, RopSettings | FurnitureSettings]:
         """Those of the mix, in its order."""
         return {name: FAMILIES[name] for name in self.mix}
 
     @property
     def slots(self) -> int:
         """Most obstacles of a scene, the floor left out."""
-        return max(family.obstacles[1] for family in self.families.values())
+        return max(most_obstacles(family) for family in self.families.values())
 
     @property
     def shards(self) -> int:

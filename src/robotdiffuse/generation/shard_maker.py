@@ -15,6 +15,7 @@ from robotdiffuse.planners.shared_tree import SharedTreeSearch
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.families import floor_of
 from robotdiffuse.scenes.rop import pack_scene
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.transforms import quaternion_from_rotation
@@ -100,8 +101,8 @@ def _row(
     k, dof = drawn.goals.shape
     goals, goal_costs = np.full((settings.goals, dof), np.nan), np.full(settings.goals, np.nan)
     goals[:k], goal_costs[:k] = drawn.goals, search.goal_costs
-    floor = list(settings.families.values())[drawn.family].floor
-    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor:]), settings.slots)
+    floor = floor_of(list(settings.families.values())[drawn.family])
+    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor is not None :]), settings.slots)
     wxyz = quaternion_from_rotation(drawn.T_base_tip[:3, :3])
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
     return {

@@ -14,7 +14,7 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.scenes.rop import Range, _distance
+from robotdiffuse.scenes.rop import Range, obstacle_distance
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.transforms import rotation_about, rotation_z_to, transform
@@ -258,7 +258,7 @@ def sample_furniture(
 
 
 def _clear(shapes: list[Box | Sphere], keep_out: Float[ndarray, "m 4"]) -> bool:
-    return all((_distance(shape, keep_out[:, :3]) > keep_out[:, 3]).all() for shape in shapes)
+    return all((obstacle_distance(shape, keep_out[:, :3]) > keep_out[:, 3]).all() for shape in shapes)
 
 
 Corner = tuple[float, float, float]

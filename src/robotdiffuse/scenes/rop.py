@@ -104,7 +104,7 @@ def sample_scene(
             if (
                 keep_out is None
                 or len(keep_out) == 0
-                or (_distance(shape, keep_out[:, :3]) > keep_out[:, 3]).all()
+                or (obstacle_distance(shape, keep_out[:, :3]) > keep_out[:, 3]).all()
             ):
                 break
         else:
@@ -127,7 +127,7 @@ def _obstacle(settings: RopSettings, rng: Generator) -> Sphere | Box:
     return Box(center, (side, side, side), wxyz)
 
 
-def _distance(shape: Sphere | Box, points: Float[ndarray, "m 3"]) -> Float[ndarray, "m"]:
+def obstacle_distance(shape: Sphere | Box, points: Float[ndarray, "m 3"]) -> Float[ndarray, "m"]:
     """From the shape to the points, negative or zero inside [m]."""
     local = points - shape.center
     if isinstance(shape, Sphere):
