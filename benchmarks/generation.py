@@ -2,8 +2,8 @@
 
     python benchmarks/generation.py [--problems 1000]
 
-Prints the report that is kept in benchmarks/results/generation.txt. The shares are those of a second run under
-the profiler, which makes Python look slower than it is beside compiled code.
+Prints the report that is kept in benchmarks/results/generation.txt. The shares are those of a second run
+under the profiler, which makes Python look slower than it is beside compiled code.
 """
 
 import argparse
