@@ -221,13 +221,13 @@ def test_robot_info(capsys: pytest.CaptureFixture[str]) -> None:
 def test_data_generate_is_resumed_and_refuses_other_settings(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ("data", "generate", "--out", "shards", "--problems", 20, "--workers", 1)
+    command = ("data", "generate", "--out", "set", "--trajectories", 4, "--shard", 2, "--workers", 1)
     assert run(*command) == 0
     first = capsys.readouterr().out
-    assert int(first.split()[0]) > 0 and run(*command) == 0
+    assert first == "4 trajectories of 254 frames in set\n" and run(*command) == 0
     assert capsys.readouterr().out == first
     assert run(*command, "--seed", 1) == 2
-    assert "other settings" in capsys.readouterr().err
+    assert "seed 0, not 1" in capsys.readouterr().err
 
 
 def test_demo(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
