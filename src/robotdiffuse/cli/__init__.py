@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli import data, plan, planners, robot, simulate, train, view
+from robotdiffuse.cli import bench, data, plan, planners, robot, simulate, train, view
 from robotdiffuse.errors import InputError
 
 SOLVED, NO_PLAN, BAD_INPUT, STOPPED = 0, 1, 2, 130
@@ -21,6 +21,7 @@ COMMANDS = (
     robot.add,
     data.add,
     train.add,
+    bench.add,
 )
 """Each adds one command to the parser and sets its function as `run`."""
 

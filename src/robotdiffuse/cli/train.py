@@ -31,10 +31,16 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     planner.add_argument("--data", required=True, metavar="FOLDER", help="folder with shards of trajectories")
     planner.add_argument(
+        "--config",
+        default="compact",
+        metavar="NAME",
+        help="compact (default), paper, or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
+    )
+    planner.add_argument(
         "--encoder",
-        required=True,
         metavar="FOLDER",
-        help="folder with a trained encoder, or the name of one to train along: pointnet, dgcnn",
+        help="folder with a trained encoder, or the name of one to train along: pointnet, dgcnn; needed "
+        "unless the config names one",
     )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the data's robot")
     _add_shared(planner)
@@ -57,25 +63,26 @@ def _add_shared(parser: argparse.ArgumentParser) -> None:
 def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, object]:
     """The options that were given; the others keep the defaults of the settings."""
     given: dict[str, object] = {name: getattr(arguments, name) for name in names}
-    given = {name: value for name, value in given.items() if value is not None}
-    return given | {"minutes": None} if "samples" in given else given
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def run_encoder(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.config import EncoderTraining
     from robotdiffuse.learning.encoder_training import train_encoder
 
-    settings = EncoderTraining(**_given(arguments, ("name", *SHARED)))  # type: ignore[arg-type]
+    given = _given(arguments, ("name", *SHARED))
+    if "samples" in given:
+        given["minutes"] = None
+    settings = EncoderTraining(**given)  # type: ignore[arg-type]
     _report(train_encoder(settings, arguments.out), arguments.out)
     return 0
 
 
 def run_planner(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.learning.config import PlannerTraining
+    from robotdiffuse.learning.configs import planner_training
     from robotdiffuse.learning.training import train_planner
 
-    given = _given(arguments, ("data", "encoder", "robot", *SHARED))
-    settings = PlannerTraining(**given)  # type: ignore[arg-type]
+    settings = planner_training(arguments.config, _given(arguments, ("data", "encoder", "robot", *SHARED)))
     _report(train_planner(settings, arguments.out), arguments.out)
     return 0
 

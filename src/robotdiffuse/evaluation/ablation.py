@@ -1,0 +1,217 @@
+"""The paper's Table 2: every row trained at the same budget and tried on the same held-out problems."""
+
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict, dataclass
+from pathlib import Path as FilePath
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.evaluation.metrics import LinkPathLength
+from robotdiffuse.learning.checkpoint import load_model
+from robotdiffuse.learning.config import EncoderTraining
+from robotdiffuse.learning.configs import planner_training
+from robotdiffuse.learning.encoder_training import train_encoder
+from robotdiffuse.learning.training import train_planner
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode
+from robotdiffuse.planners.rrt_connect import RRTConnect
+from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.rop_problems import sample_problem
+from robotdiffuse.scenes.rop import ROP
+from robotdiffuse.types import Path
+from robotdiffuse.verify import Verifier, VerifySettings
+
+SEED = 20261121
+"""Of the held-out problems; data are drawn from other seed sequences."""
+SEARCH_TIME = 10.0
+"""Problems that this much search does not solve are left out [s]."""
+ENCODER = "compression_autoencoder"
+
+
+class Row(NamedTuple):
+    config: str
+    """By its name in `learning.configs`."""
+    guided: bool
+    """Whether collision guidance is used in sampling."""
+    paper: tuple[float, float, float, float]
+    """Success %, collision %, length, time s, as the paper has them."""
+
+
+ROWS: dict[str, Row] = {
+    "PointNet": Row("table2_pointnet", True, (69.4, 26.7, 17.154, 42)),
+    "DGCNN": Row("table2_dgcnn", True, (73.4, 22.5, 16.864, 64)),
+    "U-Net": Row("table2_unet", True, (59.3, 29.7, 17.358, 27)),
+    "Transformer": Row("table2_transformer", True, (69.0, 16.5, 17.137, 32)),
+    "Decoder-only": Row("table2_decoder_only", True, (62.8, 23.8, 16.195, 23)),
+    "Noise": Row("table2_noise", True, (64.5, 41.6, 17.628, 15)),
+    "Joint-only": Row("table2_joint", False, (68.1, 21.1, 16.148, 15)),
+    "Joint&Point": Row("table2_joint_point", False, (74.0, 19.5, 14.762, 15)),
+    "JPC": Row("table2_jpc", False, (79.1, 9.2, 14.571, 15)),
+    "Ours": Row("table2_jpc", True, (84.9, 9.8, 14.218, 15)),
+}
+
+
+@dataclass(frozen=True)
+class AblationSettings:
+    data: str
+    """Folder of a data set."""
+    out: str
+    """Folder for the trained networks; what is there is kept, and what was interrupted goes on."""
+    samples: int = 300_000
+    """Training samples of each row: the equal budget."""
+    encoder_samples: int = 300_000
+    """Clouds that the frozen encoder is trained on first."""
+    problems: int = 500
+    """Held-out problems that the straight line does not solve and search does."""
+    candidates: int = 16
+    """Trajectories sampled for each problem."""
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "encoder_samples", "problems", "candidates"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1")
+
+
+@dataclass(frozen=True, eq=False)
+class RowResult:
+    """Figures of a row, one value for each problem."""
+
+    name: str
+    single: Float[ndarray, "n"]
+    """Share of the sampled trajectories that passed the judge."""
+    best: Float[ndarray, "n"]
+    """1 where any of them did."""
+    collided: Float[ndarray, "n"]
+    """Share of the sampled trajectories in collision."""
+    length: Float[ndarray, "m"]
+    """Link path length of the shortest that passed, of the problems that have one [m]."""
+    seconds: Float[ndarray, "n"]
+    """Wall time of encoding and sampling."""
+
+
+def held_out_problems(count: int) -> list[Problem]:
+    """ROP problems that the straight line does not solve and search does."""
+    robot, found, index = load_robot("panda"), [], 0
+    while len(found) < count:
+        problem = sample_problem(robot, ROP, np.random.default_rng([SEED, index]))
+        index += 1
+        line = Path(robot.joint_names, np.stack([problem.start, goal_of(problem)]))
+        if Verifier(problem, VerifySettings()).path(line).valid:
+            continue
+        if RRTConnect().plan(problem, SEARCH_TIME, seed=1).solved:
+            found.append(problem)
+    return found
+
+
+def goal_of(problem: Problem) -> Float[ndarray, "dof"]:
+    assert isinstance(problem.goal, JointGoal)
+    return problem.goal.positions[0]
+
+
+def run_ablation(
+    settings: AblationSettings,
+    rows: list[str],
+    workers: int = 1,
+    report: Callable[[str], None] = lambda text: None,
+) -> list[RowResult]:
+    """Train what the rows need, and try every row. Killed, the same call goes on with what is missing.
+
+    Raises InputError for an unknown row, listing the known, and for data that do not fit.
+    """
+    for name in rows:
+        if name not in ROWS:
+            raise unknown_name("row of Table 2", name, ROWS)
+    if workers < 1:
+        raise InputError(f"workers is {workers}; it must be at least 1")
+    encoder = FilePath(settings.out) / ENCODER
+    if not (encoder / "encoder.json").exists():
+        report(f"training {ENCODER}: {settings.encoder_samples:,} clouds")
+        train_encoder(
+            EncoderTraining(name=ENCODER, minutes=None, samples=settings.encoder_samples), str(encoder)
+        )
+    configs = list(dict.fromkeys(ROWS[name].config for name in rows))
+    results = {}
+    # fresh interpreters: forked ones could inherit locks of running threads
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        for config in _done(pool, _train, [(settings, config) for config in configs]):
+            report(f"trained {config}")
+        for result in _done(pool, _try, [(settings, name) for name in rows]):
+            results[result.name] = result
+            report(f"tried {result.name}: {100 * result.single.mean():.1f} % of samples")
+    return [results[name] for name in rows]
+
+
+def _done(pool: ProcessPoolExecutor, work: Callable, arguments: list[tuple]) -> Iterator:
+    for job in as_completed([pool.submit(work, *each) for each in arguments]):
+        yield job.result()
+
+
+def _train(settings: AblationSettings, config: str) -> str:
+    out = FilePath(settings.out) / config
+    if not (out / "model.json").exists():
+        given = {"data": settings.data, "samples": settings.samples}
+        alone = {"encoder": str(FilePath(settings.out) / ENCODER)}
+        jointly = config in ("table2_pointnet", "table2_dgcnn")
+        train_planner(planner_training(config, given if jointly else given | alone), str(out))
+    return config
+
+
+def _try(settings: AblationSettings, name: str) -> RowResult:
+    row, robot = ROWS[name], load_robot("panda")
+    weights = str(FilePath(settings.out) / row.config)
+    defaults = RobotDiffuseSettings()
+    planner = RobotDiffuse(
+        RobotDiffuseSettings(
+            weights=weights,
+            samples=settings.candidates,
+            guidance_steps=defaults.guidance_steps if row.guided else 0,
+            points=load_model(weights, robot).config.encoder_settings.cloud,
+        )
+    )
+    model, measure = planner.model(robot), LinkPathLength(robot)
+    assert model is not None
+    single, collided, lengths, seconds = [], [], [], []
+    for i, problem in enumerate(held_out_problems(settings.problems)):
+        rng, checker = np.random.default_rng([SEED, 1, i]), CollisionChecker(robot, problem.scene)
+        began = time.perf_counter()
+        code = encode(model, checker, planner.settings.points, rng)
+        q = planner.sample(model, checker, code, problem.start, goal_of(problem)[None], rng).q
+        seconds.append(time.perf_counter() - began)
+        passed, hit = _judged(problem, q)
+        single.append(passed.mean())
+        collided.append(hit.mean())
+        if passed.any():
+            lengths.append(measure(q[passed]).min())
+    shares = np.array(single)
+    return RowResult(
+        name, shares, (shares > 0) * 1.0, np.array(collided), np.array(lengths), np.array(seconds)
+    )
+
+
+def _judged(
+    problem: Problem, q: Float[ndarray, "n frames dof"]
+) -> tuple[Bool[ndarray, "n"], Bool[ndarray, "n"]]:
+    """Which trajectories pass the judge, and which are in collision."""
+    judge, passed, hit = Verifier(problem, VerifySettings()), [], []
+    for frames in q.astype(np.float64):
+        frames[0], frames[-1] = problem.start, goal_of(problem)
+        violation = judge.path(Path(problem.robot.joint_names, frames)).violation
+        passed.append(violation is None)
+        hit.append(violation is not None and violation.kind.endswith("collision"))
+    return np.array(passed), np.array(hit)
+
+
+def settings_line(settings: AblationSettings) -> str:
+    """The budget, for the head of a report."""
+    known = asdict(settings)
+    return ", ".join(
+        f"{name} {known[name]:,}" for name in ("samples", "encoder_samples", "problems", "candidates")
+    )
