@@ -20,7 +20,7 @@ class LinkPathLength:
         self._kinematics = ForwardKinematics(robot, torch.float64)
         self._links = [i for i, link in enumerate(robot.link_names) if robot.link_frame(link) > 0]
 
-    def __call__(self, q: Float[ndarray, "*batch frames dof"]) -> Float[ndarray, "*batch"]:
+    def __call__(self, q: Float[ndarray, "n frames dof"]) -> Float[ndarray, "n"]:
         """Of motions through these configurations [rad]."""
         with torch.inference_mode():
             T = self._kinematics.links(torch.from_numpy(np.asarray(q, np.float64)))
