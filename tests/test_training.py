@@ -23,7 +23,7 @@ from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSet
 from robotdiffuse.learning.losses import LossSettings
 from robotdiffuse.learning.shards import shard_path, split_of, write_manifest, write_shard
 from robotdiffuse.learning.training import moving_links, train_planner
-from robotdiffuse.learning.training_run import TrainingRun
+from robotdiffuse.learning.training_run import TrainingRun, Validation
 from robotdiffuse.scenes.sampling import BOX, SPHERE, sample_surfaces_batch
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
@@ -179,6 +179,8 @@ def test_planner_learns_which_side(tmp_path, data, arm):
     rows = read_log(out)
     assert float(rows[-1]["loss"]) < 0.3 * float(rows[0]["loss"])
     assert report["samples"] == 8000
+    assert 0.0 <= report["success"] <= 1.0 and float(rows[-1]["success"]) == pytest.approx(report["success"])
+    assert list((out / "tensorboard").iterdir()), "the extra `train` is installed: a log for TensorBoard"
     model = load_model(out, arm)
     about = json.loads((out / "model.json").read_text())
     assert about["training"]["trajectories"] == len(load_data(str(data), arm, model.encoder, FRAMES, print))
@@ -233,7 +235,7 @@ def test_losses_that_are_not_finite_are_skipped(tmp_path):
         bad = calls[-1] in (4, 10, 11, 12)
         return (module.weight * (float("nan") if bad else 1.0)).square().sum()
 
-    run.loop(loss, lambda: 0.0, "test")
+    run.loop(loss, lambda: Validation(0.0), "test")
     assert torch.isfinite(module.weight).all()
     assert run.at.samples == 40
     assert run.at.rollbacks == 1
@@ -255,7 +257,7 @@ def test_hopeless_training_stops(tmp_path):
         identity={},
     )
     with pytest.raises(InputError, match="not finite"):
-        run.loop(lambda rng: module.weight.sum() * float("nan"), lambda: 0.0, "test")
+        run.loop(lambda rng: module.weight.sum() * float("nan"), lambda: Validation(0.0), "test")
 
 
 def test_other_settings_need_another_folder(tmp_path, data):

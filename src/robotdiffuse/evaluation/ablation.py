@@ -15,6 +15,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.evaluation.metrics import LinkPathLength
+from robotdiffuse.generation.workers import prepare_worker, stop_pool
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.config import EncoderTraining
 from robotdiffuse.learning.configs import planner_training
@@ -140,12 +141,16 @@ def run_ablation(
     configs = list(dict.fromkeys(ROWS[name].config for name in rows))
     results = {}
     # fresh interpreters: forked ones could inherit locks of running threads
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, context, initializer=prepare_worker)
+    try:
         for config in _done(pool, _train, [(settings, config) for config in configs]):
             report(f"trained {config}")
         for result in _done(pool, _try, [(settings, name) for name in rows]):
             results[result.name] = result
             report(f"tried {result.name}: {100 * result.single.mean():.1f} % of samples")
+    finally:
+        stop_pool(pool)  # a training that is told to end stores a checkpoint first
     return [results[name] for name in rows]
 
 

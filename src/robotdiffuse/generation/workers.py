@@ -46,7 +46,7 @@ def on_this_machine(settings: GenerationSettings, indices: list[int], workers: i
     # fresh interpreters: forked ones could inherit locks of running threads
     context = multiprocessing.get_context("spawn")
     queue = list(reversed(indices))
-    pool = ProcessPoolExecutor(min(workers, len(indices)), context, initializer=_prepare_worker)
+    pool = ProcessPoolExecutor(min(workers, len(indices)), context, initializer=prepare_worker)
     running = {}
     try:
         while queue or running:
@@ -59,7 +59,7 @@ def on_this_machine(settings: GenerationSettings, indices: list[int], workers: i
     except BrokenProcessPool:
         raise InputError(f"a worker process was killed, or could not be started; {GO_ON}") from None
     finally:
-        _stop(pool)
+        stop_pool(pool)
 
 
 @contextmanager
@@ -75,7 +75,7 @@ def _interrupts_not_passed_on() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _stop(pool: ProcessPoolExecutor) -> None:
+def stop_pool(pool: ProcessPoolExecutor) -> None:
     """End the processes now: what they are at is made again by the next call."""
     processes = list((pool._processes or {}).values())
     pool.shutdown(wait=False, cancel_futures=True)
@@ -83,7 +83,7 @@ def _stop(pool: ProcessPoolExecutor) -> None:
         process.terminate()
 
 
-def _prepare_worker() -> None:
+def prepare_worker() -> None:
     """A worker ends with its parent, even where that is killed."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -166,6 +166,8 @@ class PlannerTraining:
     """Share of the batch whose straight line is free. They teach to leave the line alone."""
     smooth_noise: bool = True
     """Noise with the covariance of the trajectories over the frames; otherwise white (the paper's)."""
+    validation_problems: int = 32
+    """Held-out problems that are planned, without guidance, at every checkpoint."""
     bad_steps: int = 10
     """So many steps in a row with a loss that is not finite take training back to the last checkpoint."""
     threads: int = 1

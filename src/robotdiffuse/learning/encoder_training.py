@@ -10,7 +10,7 @@ from robotdiffuse.learning.batches import fast_bf16, random_scenes, scene_clouds
 from robotdiffuse.learning.checkpoint import save_encoder
 from robotdiffuse.learning.config import EncoderTraining, settings_to_json
 from robotdiffuse.learning.encoders import Autoencoder, Encoder, make_encoder
-from robotdiffuse.learning.training_run import TrainingRun
+from robotdiffuse.learning.training_run import TrainingRun, Validation
 from robotdiffuse.learning.versions import versions
 from robotdiffuse.scenes.sampling import BOX, NONE
 from robotdiffuse.transforms import rotation_from_quaternion
@@ -54,7 +54,7 @@ def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
         with torch.no_grad():
             return _reconstruction(module, *random_scenes(count, settings.max_obstacles, rng), most, rng)
 
-    run.loop(loss, lambda: judge(128, 123)[0].item(), "encoder")
+    run.loop(loss, lambda: Validation(judge(128, 123)[0].item()), "encoder")
     with run.averaged(), torch.no_grad():
         rng = np.random.default_rng(settings.seed + 1)
         scenes = random_scenes(READ, settings.max_obstacles, rng)

@@ -16,7 +16,8 @@ from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import Encoder, encoder_name, make_encoder
 from robotdiffuse.learning.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
-from robotdiffuse.learning.training_run import TrainingRun
+from robotdiffuse.learning.training_run import TrainingRun, Validation
+from robotdiffuse.learning.validation import planning_success
 from robotdiffuse.learning.versions import versions
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics
@@ -24,6 +25,8 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 
+VALIDATION_SAMPLES = 4
+"""Trajectories sampled for each problem of a validation."""
 HELD_OUT = 2000
 """Most trajectories of the split for validation that are looked at."""
 FLOOR = Scene([Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")])
@@ -39,8 +42,9 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     """Train the motion predictor; write model.safetensors and model.json, all that planning needs.
 
     The same call continues a run that was interrupted. Returns `validation`, the loss on trajectories kept
-    aside, and `samples`. Raises InputError if the data, the encoder or the folder do not fit, and
-    KeyboardInterrupt, after a checkpoint, on Ctrl-C.
+    aside, `success`, the share of the motions that it samples for them by itself that are free, and
+    `samples`. Raises InputError if the data, the encoder or the folder do not fit, and KeyboardInterrupt,
+    after a checkpoint, on Ctrl-C.
     """
     robot = load_robot(settings.robot)
     torch.manual_seed(settings.seed)
@@ -79,14 +83,16 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     batches = Batches(kept, model, clearances, settings.trivial_share, settings.weight_limit)
     loss_of = _Loss(model, robot, settings)
 
-    def validate() -> float:
+    def validate() -> Validation:
         if not len(held_out):
-            return float("nan")
+            return Validation(float("nan"))
         rng = np.random.default_rng(7)
         source = Batches(held_out, model, clearances, settings.trivial_share, settings.weight_limit)
         with torch.no_grad():
             parts = [loss_of(source.draw(settings.batch, rng), run.fraction, rng).item() for _ in range(8)]
-            return float(np.mean(parts))
+        count = settings.validation_problems
+        success = planning_success(model, robot, held_out, FLOOR, count, VALIDATION_SAMPLES, rng)
+        return Validation(float(np.mean(parts)), success)
 
     def loss(rng: np.random.Generator) -> Float[Tensor, ""]:
         batch = batches.draw(settings.batch, rng)
@@ -97,7 +103,10 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
 
     run.loop(loss, validate, "planner")
     with run.averaged():
-        report = {"validation": validate(), "samples": float(run.at.samples)}
+        held_out_loss, success = validate()
+        report = {"validation": held_out_loss, "samples": float(run.at.samples)}
+        if success is not None:
+            report["success"] = success
         about = {
             "settings": settings_to_json(settings),
             "data": data.digest,

@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import math
+import shutil
 import signal
 import threading
 import time
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,8 +30,16 @@ FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", 
 """Settings that may differ between the parts of one run."""
 LOG_EVERY = 50
 """Steps per row of log.csv."""
-COLUMNS = ("step", "samples", "minutes", "learning_rate", "loss", "validation", "skipped")
+COLUMNS = ("step", "samples", "minutes", "learning_rate", "loss", "validation", "success", "skipped")
 MAX_ROLLBACKS = 5
+
+
+class Validation(NamedTuple):
+    loss: float
+    """On data that are kept aside."""
+    success: float | None = None
+    """Share of sampled motions that are free, of a planner's network."""
+
 
 LossFn = Callable[[np.random.Generator], Float[Tensor, ""]]
 """Draws a batch and returns its loss."""
@@ -96,7 +106,7 @@ class TrainingRun:
     def loop(
         self,
         loss: Callable[[np.random.Generator], Float[Tensor, ""]],
-        validate: Callable[[], float],
+        validate: Callable[[], Validation],
         title: str,
     ) -> None:
         """Train to the end. Ctrl-C stores a checkpoint first, then raises KeyboardInterrupt."""
@@ -112,7 +122,7 @@ class TrainingRun:
                     self.at.seconds += now - last
                     rate, last = self.settings.batch / max(now - last, 1e-9), now
                     if self.at.step % LOG_EVERY == 0:
-                        self._log(self.settings.learning_rate * self._lr(), "")
+                        self._log(self.settings.learning_rate * self._lr(), None)
                         text = f"{self.rows[-1]['loss']:.4f}" if self.rows else ""
                         progress.update(task, completed=self.fraction, rate=f"{rate:,.0f}/s", loss=text)
                     if now - saved > self.settings.checkpoint_seconds:
@@ -176,31 +186,35 @@ class TrainingRun:
                 for name, p in self.parameters.items():
                     p.copy_(kept[name])
 
-    def _log(self, rate: float, validation: float | str) -> None:
+    def _log(self, rate: float, validation: Validation | None) -> None:
         loss = (
             float(np.mean(self._losses)) if self._losses else self.rows[-1]["loss"] if self.rows else math.nan
         )
         self._losses.clear()
-        minutes = round(self.at.seconds / 60, 3)
+        held_out, success = validation or (None, None)
         row = (
             self.at.step,
             self.at.samples,
-            minutes,
+            round(self.at.seconds / 60, 3),
             f"{rate:.3g}",
-            f"{loss:.5g}",
-            validation,
+            float(f"{loss:.5g}"),
+            "" if held_out is None else f"{held_out:.5g}",
+            "" if success is None else f"{success:.4g}",
             self.at.skipped,
         )
-        self.rows.append(dict(zip(COLUMNS, (*row[:4], float(row[4]), *row[5:]), strict=True)))
+        self.rows.append(dict(zip(COLUMNS, row, strict=True)))
 
-    def _checkpoint(self, validate: Callable[[], float], console: Console, title: str) -> None:
+    def _checkpoint(self, validate: Callable[[], Validation], console: Console, title: str) -> None:
         with self.averaged():
             validation = validate()
-        self._log(self.settings.learning_rate * self._lr(), f"{validation:.5g}")
+        self._log(self.settings.learning_rate * self._lr(), validation)
         self.save()
+        self._plot()
+        planned = "" if validation.success is None else f"{validation.success:.1%} of samples free, "
         console.print(
             f"{title}: {self.fraction:.1%}, {self.at.samples:,} samples in {self.at.seconds / 60:.1f} min, "
-            f"loss {self.rows[-1]['loss']:.4f}, validation {validation:.4f}, {self.at.skipped} steps skipped",
+            f"loss {self.rows[-1]['loss']:.4f}, validation {validation.loss:.4f}, {planned}"
+            f"{self.at.skipped} steps skipped",
             highlight=False,
         )
 
@@ -226,6 +240,20 @@ class TrainingRun:
         writer.writeheader()
         writer.writerows(self.rows)
         write_atomically(self.out / "log.csv", text.getvalue(), make_folder=True)
+
+    def _plot(self) -> None:
+        """Write the log for TensorBoard, where that is installed (extra `train`)."""
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            return
+        folder = self.out / "tensorboard"
+        shutil.rmtree(folder, ignore_errors=True)  # all of it anew: a resumed run leaves no second curve
+        with SummaryWriter(str(folder)) as writer:
+            for row in self.rows:
+                for name in ("learning_rate", "loss", "validation", "success"):
+                    if row.get(name, "") != "":
+                        writer.add_scalar(name, float(row[name]), int(row["samples"]))
 
     def _restore(self, check: bool) -> None:
         tensors, notes = read_tensors(self._file)

@@ -18,6 +18,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import BUNDLED, load_model
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.validation import link_clearances
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.base import Call, usable_goals
 from robotdiffuse.planners.rrt_connect import Ends, RRTConnect, RRTConnectSettings, random_state, search_space
@@ -161,9 +162,7 @@ class RobotDiffuse:
         order = np.argsort(np.linalg.norm(goals - start, axis=1))[: max(settings.samples // 4, 1)]
         counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(order))]
 
-        def clearances(q: ndarray) -> ndarray:
-            near = checker.link_clearances(q.reshape(-1, q.shape[-1]), model.config.clearance_high)
-            return near.reshape(*q.shape[:2], -1)
+        clearances = link_clearances(checker, model.config.clearance_high)
 
         def guide(q: ndarray, _level: float) -> ndarray:
             return guidance(q, settings.guidance_steps)[0]
