@@ -84,6 +84,7 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     base = ["bench", "ablation", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*base, "--rows", "Ourz"]) == 2
     assert "known: " in capsys.readouterr().err
+    assert main(base) == 2 and "no data set" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main([*base, "--samples", "0"])
     command = ["train", "planner", "--config", "papr", "--data", "d", "--encoder", "e", "--out", "o"]

@@ -20,6 +20,7 @@ from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.config import EncoderTraining
 from robotdiffuse.learning.configs import planner_training
 from robotdiffuse.learning.encoder_training import train_encoder
+from robotdiffuse.learning.shards import read_manifest
 from robotdiffuse.learning.training import train_planner
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode
 from robotdiffuse.planners.rrt_connect import RRTConnect
@@ -132,6 +133,7 @@ def run_ablation(
             raise unknown_name("row of Table 2", name, ROWS)
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
+    read_manifest(settings.data).check_robot(load_robot("panda"))
     encoder = FilePath(settings.out) / ENCODER
     if not (encoder / "encoder.json").exists():
         report(f"training {ENCODER}: {settings.encoder_samples:,} clouds")
