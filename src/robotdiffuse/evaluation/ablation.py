@@ -36,6 +36,8 @@ SEED = 20261121
 SEARCH_TIME = 10.0
 """Problems that this much search does not solve are left out [s]."""
 ENCODER = "compression_autoencoder"
+PATIENCE = 20.0
+"""A training that is told to end stores a checkpoint first; after this it is killed [s]."""
 
 
 class Row(NamedTuple):
@@ -152,7 +154,7 @@ def run_ablation(
             results[result.name] = result
             report(f"tried {result.name}: {100 * result.single.mean():.1f} % of samples")
     finally:
-        stop_pool(pool)  # a training that is told to end stores a checkpoint first
+        stop_pool(pool, PATIENCE)
     return [results[name] for name in rows]
 
 

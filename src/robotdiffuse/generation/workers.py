@@ -7,6 +7,7 @@ import platform
 import signal
 import socket
 import threading
+import time
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -75,12 +76,17 @@ def _interrupts_not_passed_on() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def stop_pool(pool: ProcessPoolExecutor) -> None:
-    """End the processes now: what they are at is made again by the next call."""
+def stop_pool(pool: ProcessPoolExecutor, patience: float = 0.0) -> None:
+    """Tell the processes to end; kill those that have not after `patience` [s]."""
     processes = list((pool._processes or {}).values())
     pool.shutdown(wait=False, cancel_futures=True)
     for process in processes:
         process.terminate()
+    until = time.monotonic() + patience
+    for process in processes:
+        process.join(max(until - time.monotonic(), 0.0))
+        if patience > 0 and process.is_alive():
+            process.kill()
 
 
 def prepare_worker() -> None:
