@@ -205,9 +205,9 @@ def main() -> None:
         outcomes.append(Outcome(result.solved, length, result.planning_time))
         stages.append(result.stage)
         if result.path is not None and result.trajectory is not None:
-            oracle = PyBulletOracle(case.problem.robot, case.problem.scene)
             moved = Path(result.trajectory.joint_names, result.trajectory.positions)
-            refuted += any(oracle.check_path(path) is not None for path in (result.path, moved))
+            with PyBulletOracle(case.problem.robot, case.problem.scene) as oracle:
+                refuted += any(oracle.check_path(path) is not None for path in (result.path, moved))
     print_table(
         "",
         ["(c) whole planner", "solved", "length*", "ms median / p95"],

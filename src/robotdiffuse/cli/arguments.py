@@ -4,12 +4,17 @@ import argparse
 import math
 
 
+def _number(text: str) -> float:
+    """nan if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def positive(text: str) -> float:
     """A positive, finite number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _number(text)
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
     return value
@@ -32,10 +37,7 @@ def count(text: str) -> int:
 def assignment(text: str) -> tuple[str, float]:
     """NAME=VALUE with a finite value."""
     name, _, number = text.partition("=")
-    try:
-        value = float(number)
-    except ValueError:
-        value = math.nan
+    value = _number(number)
     if not name or not math.isfinite(value):
         raise argparse.ArgumentTypeError(f"{text!r} is not NAME=NUMBER")
     return name, value
@@ -43,10 +45,7 @@ def assignment(text: str) -> tuple[str, float]:
 
 def not_negative(text: str) -> float:
     """A finite number of at least 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _number(text)
     if not 0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
     return value

@@ -18,7 +18,7 @@ from robotdiffuse.evaluation.metrics import LinkPathLength
 from robotdiffuse.generation.workers import prepare_worker, stop_pool
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.config import EncoderTraining
-from robotdiffuse.learning.configs import planner_training
+from robotdiffuse.learning.configs import CONFIGS, planner_training
 from robotdiffuse.learning.encoder_training import train_encoder
 from robotdiffuse.learning.shards import read_manifest
 from robotdiffuse.learning.training import train_planner
@@ -150,7 +150,8 @@ def run_ablation(
     try:
         for config in _done(pool, _train, [(settings, config) for config in configs]):
             report(f"trained {config}")
-        for result in _done(pool, _try, [(settings, name) for name in rows]):
+        problems = held_out_problems(settings.problems)
+        for result in _done(pool, _try, [(settings, name, problems) for name in rows]):
             results[result.name] = result
             report(f"tried {result.name}: {100 * result.single.mean():.1f} % of samples")
     finally:
@@ -168,12 +169,12 @@ def _train(settings: AblationSettings, config: str) -> str:
     if not (out / "model.json").exists():
         given = {"data": settings.data, "samples": settings.samples}
         alone = {"encoder": str(FilePath(settings.out) / ENCODER)}
-        jointly = config in ("table2_pointnet", "table2_dgcnn")
-        train_planner(planner_training(config, given if jointly else given | alone), str(out))
+        names_one = "encoder" in CONFIGS[config].changes
+        train_planner(planner_training(config, given if names_one else given | alone), str(out))
     return config
 
 
-def _try(settings: AblationSettings, name: str) -> RowResult:
+def _try(settings: AblationSettings, name: str, problems: list[Problem]) -> RowResult:
     row, robot = ROWS[name], load_robot("panda")
     weights = str(FilePath(settings.out) / row.config)
     defaults = RobotDiffuseSettings()
@@ -188,7 +189,7 @@ def _try(settings: AblationSettings, name: str) -> RowResult:
     model, measure = planner.model(robot), LinkPathLength(robot)
     assert model is not None
     single, collided, lengths, seconds = [], [], [], []
-    for i, problem in enumerate(held_out_problems(settings.problems)):
+    for i, problem in enumerate(problems):
         rng, checker = np.random.default_rng([SEED, 1, i]), CollisionChecker(robot, problem.scene)
         began = time.perf_counter()
         code = encode(model, checker, planner.settings.points, rng)

@@ -51,11 +51,11 @@ def generate(
     wanted = manifest_of(settings)
     with _alone_in(out):
         try:
-            _tidy(out)
+            remove_leftovers(out)
             _claim(wanted, out)
             return _fill(settings, out, workers, cluster, progress or _silent)
         finally:
-            _tidy(out)
+            remove_leftovers(out)
 
 
 def _silent(_done: int, _total: int) -> None:
@@ -124,13 +124,6 @@ def _alone_in(out: Path) -> Iterator[None]:
         yield
     finally:
         os.close(folder)
-
-
-def _tidy(out: Path) -> None:
-    """Remove what is half-written, by a killed process or for want of room on the disk."""
-    remove_leftovers(out)
-    for leftover in out.glob(f".{MANIFEST}.*"):
-        leftover.unlink(missing_ok=True)
 
 
 def manifest_of(settings: GenerationSettings) -> Manifest:

@@ -31,7 +31,7 @@ from robotdiffuse.scenes.surface_clouds import surface_clouds
 
 VIEWS = ("full", "partial")
 BLOCK = 16
-"""Shards that are shuffled together: 16 of the usual 1,000 rows map 114 MB."""
+"""Shards that are shuffled together: 16 of the usual 500 rows map 57 MB."""
 MAX_THREADS = 8
 """Most threads that make batches ahead."""
 CAMERA_CENTER = (0.0, 0.0, 0.4)
