@@ -2,12 +2,18 @@
 
 import os
 import platform
+from collections.abc import Iterable, Sequence
 from datetime import date
 from importlib.metadata import version
 from pathlib import Path
+from typing import TypeVar
 
+import numpy as np
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
+
+Item = TypeVar("Item")
 
 
 def header(*packages: str) -> str:
@@ -30,3 +36,22 @@ def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
     for row in rows:
         table.add_row(*row)
     Console(width=120).print(table)
+
+
+def progress(items: Sequence[Item], title: str) -> Iterable[Item]:
+    """The items, with a bar beside the report rather than in it."""
+    return track(items, title, transient=True, console=Console(stderr=True))
+
+
+def share(passed: Sequence[bool]) -> str:
+    """With the 95 % interval of Wilson."""
+    p, low, high = wilson(passed)
+    return f"{100 * p:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def wilson(passed: Sequence[bool]) -> tuple[float, float, float]:
+    """A share, and its 95 % interval by E. B. Wilson 1927."""
+    n, p, z = len(passed), float(np.mean(passed)), 1.96
+    middle, half = p + z**2 / (2 * n), z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
+    low, high = ((middle + side * half) / (1 + z**2 / n) for side in (-1, 1))
+    return p, max(low, 0.0), min(high, 1.0)
