@@ -73,6 +73,7 @@ def planner_settings(data, **changes) -> PlannerTraining:
         batch=16,
         warmup_steps=3,
         learning_rate=3e-3,
+        turns=0,
         denoiser_settings=SMALL_DENOISER,
     )
     return replace(settings, **changes)
@@ -212,6 +213,17 @@ def test_codes_are_kept_beside_the_data(data, arm):
     again = load_data(str(data), arm, encoder, FRAMES, said.append)
     np.testing.assert_array_equal(again.codes, first.codes)
     assert again.digest == first.digest
+
+
+def test_turned_copies_are_for_training_alone(data, arm):
+    encoder, said = load_encoder(data.parent / "encoder"), []
+    plain = load_data(str(data), arm, encoder, FRAMES, said.append)
+    turned = load_data(str(data), arm, encoder, FRAMES, said.append, turns=2)
+    assert turned.validation == plain.validation and len(turned) > len(plain)
+    for split, more in zip(plain.split(10**6), turned.split(10**6), strict=True):
+        same = (split.q[:, None, :, 1:] == more.q[None, :, :, 1:]).all((2, 3))
+        assert same.any(axis=1).all() and same.any(axis=0).all()
+    np.testing.assert_array_equal(plain.split(10**6)[1].q, turned.split(10**6)[1].q)
 
 
 def test_losses_that_are_not_finite_are_skipped(tmp_path):

@@ -65,6 +65,10 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     rng = np.random.default_rng([settings.seed, number])
     drawn = draw_problem(settings, robot, rng)
     checker = CollisionChecker(robot, drawn.scene)
+    lines_free = [_line_is_free(settings, checker, drawn.start, goal) for goal in drawn.goals]
+    thinned = rng.random() >= settings.trivial_share
+    if thinned and all(lines_free):
+        return "thinned"  # whichever goal a search would choose
     search = SharedTreeSearch(
         checker, drawn.start, drawn.goals, settings.search, random_state(settings.seed, number)
     )
@@ -72,9 +76,8 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     path = search.path()
     if path is None:
         return "unsolved"
-    goal = drawn.goals[search.best_goal]
-    line_free = _line_is_free(settings, checker, drawn.start, goal)
-    if line_free and rng.random() >= settings.trivial_share:
+    goal, line_free = drawn.goals[search.best_goal], lines_free[search.best_goal]
+    if thinned and line_free:
         return "thinned"
     goals = JointGoal(drawn.goals.astype(np.float64))
     judge = Verifier(Problem(robot, drawn.scene, drawn.start.astype(np.float64), goals), VerifySettings())

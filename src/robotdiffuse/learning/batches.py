@@ -17,7 +17,8 @@ from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.checkpoint import fingerprint
 from robotdiffuse.learning.encoders import Encoder
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.learning.shards import SPLITS, Shard, check_shard, read_manifest, shard_indices, split_of
+from robotdiffuse.learning.shards import SPLITS, check_shard, read_manifest, shard_indices, split_of
+from robotdiffuse.learning.turns import turned, turns_about_vertical
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import BOX, SPHERE
 from robotdiffuse.scenes.surface_clouds import surface_clouds
@@ -87,9 +88,17 @@ class TrajectoryData:
 
 
 def load_data(
-    folder: str, robot: Robot, encoder: Encoder | None, frames: int, report: Callable[[str], None]
+    folder: str,
+    robot: Robot,
+    encoder: Encoder | None,
+    frames: int,
+    report: Callable[[str], None],
+    turns: int = 0,
 ) -> TrajectoryData:
     """The rows for training and validation of a data set, at `frames` frames, with the codes of their scenes.
+
+    turns: copies of each row for training that are turned by random angles, see `learning.turns`; none if the
+        robot's first joint is not vertical.
 
     Codes are kept beside the shards, in files named by shard and encoder; where the folder cannot be written
     they are made each time. Without an encoder there are none. `report` is told what is being done. Raises
@@ -101,20 +110,30 @@ def load_data(
         raise InputError(f"data folder {folder} holds no shard; make some with: robotdiffuse data generate")
     parts: dict[str, list[tuple[ndarray, ...]]] = {"train": [], "validation": []}
     digest, rows = hashlib.sha256(), 0
+    if turns and not turns_about_vertical(robot):
+        report(f"data: no turned copies, for {robot.joint_names[0]} does not turn about the base's vertical")
+        turns = 0
     encoder_print = "" if encoder is None else fingerprint(encoder)
     for i, index in enumerate(indices):
         shard = check_shard(folder, index, manifest)
         digest.update(shard.fingerprint.encode())
-        split = split_of(shard["obstacle_kinds"], shard["obstacle_params"])
-        codes = np.zeros((len(shard), 0), np.float16)
-        if encoder is not None:
-            codes = _cached_codes(FilePath(folder), shard, encoder, f"{shard.fingerprint}-{encoder_print}")
+        kinds, params = shard["obstacle_kinds"], shard["obstacle_params"]
+        split, trivial = split_of(kinds, params), shard["line_free"]
+        q = resample_evenly(shard["trajectories"][:], frames)
+        key = f"{shard.fingerprint}-{encoder_print}"
+        codes = _codes(FilePath(folder), kinds, params, encoder, key)
         for name, found in parts.items():
             of = split == SPLITS.index(name)
-            q = resample_evenly(shard["trajectories"][of], frames)
-            kinds, params = shard["obstacle_kinds"][of], shard["obstacle_params"][of]
-            found.append((q, kinds, params, shard["line_free"][of], codes[of]))
-            rows += len(q)
+            found.append((q[of], kinds[of], params[of], trivial[of], codes[of]))
+            rows += int(of.sum())
+        train = split == SPLITS.index("train")
+        for turn in range(1, turns + 1):
+            rng = np.random.default_rng([int(shard.fingerprint, 16), turn])
+            q_turned, params_turned, clear = turned(robot, q, params, rng)
+            codes = _codes(FilePath(folder), kinds, params_turned, encoder, f"{key}-turn{turn}")
+            of = train & clear
+            parts["train"].append((q_turned[of], kinds[of], params_turned[of], trivial[of], codes[of]))
+            rows += int(of.sum())
         report(f"data: {i + 1} of {len(indices)} shards, {rows:,} trajectories")
     ordered = parts["train"] + parts["validation"]
     q, kinds, params, trivial, codes = (np.concatenate(arrays) for arrays in zip(*ordered, strict=True))
@@ -151,17 +170,25 @@ def resample_evenly(q: Float32[ndarray, "n stored dof"], frames: int) -> Float32
     return even
 
 
-def _cached_codes(folder: FilePath, shard: Shard, encoder: Encoder, key: str) -> Float[ndarray, "n code"]:
+def _codes(
+    folder: FilePath,
+    kinds: Int8[ndarray, "n k"],
+    params: Float32[ndarray, "n k 10"],
+    encoder: Encoder | None,
+    key: str,
+) -> Float[ndarray, "n code"]:
+    """Codes of packed scenes, kept in a file named by `key`; of no numbers where there is no encoder."""
+    if encoder is None:
+        return np.zeros((len(kinds), 0), np.float16)
     cache = folder / "codes" / f"{key}.npy"
     if cache.is_file():
         try:
             codes = np.load(cache)
-            if len(codes) == len(shard):
+            if len(codes) == len(kinds):
                 return codes
         except (OSError, ValueError, EOFError):
             pass  # damaged: made again below
-    rng = np.random.default_rng(int(key[:8], 16))
-    codes = encode_scenes(encoder, shard["obstacle_kinds"], shard["obstacle_params"], rng)
+    codes = encode_scenes(encoder, kinds, params, np.random.default_rng(int(key[:8], 16)))
     try:
         buffer = BytesIO()
         np.save(buffer, codes)

@@ -85,6 +85,12 @@ def check_kind(field: str, name: str, settings: object, table: Mapping[str, tupl
         )
 
 
+def check_gradients(sees_gradients: bool, sees_clearances: bool) -> None:
+    """Raises InputError if gradients of clearances are to be seen without clearances."""
+    if sees_gradients and not sees_clearances:
+        raise InputError("sees_gradients is True and sees_clearances is False; gradients need clearances too")
+
+
 def _length(samples: int | None, minutes: float | None) -> None:
     if (samples is None) == (minutes is None):
         raise InputError(f"samples is {samples} and minutes is {minutes}; give exactly one of them")
@@ -164,6 +170,8 @@ class PlannerTraining:
     """The paper's losses of joints, points and collision."""
     trivial_share: float = 0.1
     """Share of the batch whose straight line is free. They teach to leave the line alone."""
+    turns: int = 3
+    """Copies of each trajectory turned about the vertical with their scenes, if the first joint is so."""
     smooth_noise: bool = True
     """Noise with the covariance of the trajectories over the frames; otherwise white (the paper's)."""
     validation_problems: int = 32
@@ -197,13 +205,18 @@ class PlannerTraining:
     """What the network predicts: clean (the paper's), noise or velocity."""
     sees_clearances: bool = True
     """Whether the denoiser is told the links' clearances along the noisy trajectory (beyond the paper)."""
+    sees_gradients: bool = False
+    """Whether it is told too which way each frame's joints would take the arm too close to obstacles."""
 
     def __post_init__(self) -> None:
         _length(self.samples, self.minutes)
+        if self.turns < 0:
+            raise InputError(f"turns is {self.turns}; it must be at least 0")
         if not 0.0 <= self.trivial_share <= 1.0:
             raise InputError(f"trivial_share is {self.trivial_share}; it must be between 0 and 1")
         if not 0.0 <= self.condition_drop < 1.0:
             raise InputError(f"condition_drop is {self.condition_drop}; it must be at least 0 and below 1")
+        check_gradients(self.sees_gradients, self.sees_clearances)
         check_kind("denoiser", self.denoiser, self.denoiser_settings, DENOISERS)
         if self.encoder_settings is not None:
             check_kind("encoder", self.encoder, self.encoder_settings, ENCODERS)

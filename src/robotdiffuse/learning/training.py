@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from robotdiffuse.collision.arrays import compile_robot, robot_groups
-from robotdiffuse.collision.packed import packed_link_clearances
+from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.learning.batches import Batch, Batches, fast_bf16, load_data
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_model
 from robotdiffuse.learning.config import PlannerTraining, settings_to_json
@@ -60,6 +60,7 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
         None if settings.jointly else encoder,
         model.config.frames,
         lambda text: print(text, file=sys.stderr),
+        settings.turns,
     )
     kept, held_out = data.split(HELD_OUT)
     hard = kept.q[~kept.trivial]
@@ -78,7 +79,11 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     arrays = compile_robot(robot)
 
     def clearances(kinds: np.ndarray, params: np.ndarray, q: np.ndarray) -> np.ndarray:
-        return packed_link_clearances(arrays, kinds, params, q, FLOOR, model.config.clearance_high)
+        given, config = (arrays, kinds, params, q, FLOOR, model.config.clearance_high), model.config
+        if config.sees_gradients:
+            told = packed_clearances_and_gradients(*given, config.gradient_margin)
+            return np.concatenate(told, axis=-1)
+        return packed_link_clearances(*given)
 
     batches = Batches(kept, model, clearances, settings.trivial_share, settings.weight_limit)
     loss_of = _Loss(model, robot, settings)
@@ -141,6 +146,7 @@ def _model_config(settings: PlannerTraining, robot: Robot, encoder: Encoder) -> 
         target=settings.target,
         objective=settings.objective,
         sees_clearances=settings.sees_clearances,
+        sees_gradients=settings.sees_gradients,
     )
 
 
