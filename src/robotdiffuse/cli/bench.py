@@ -2,8 +2,12 @@
 
 import argparse
 import os
+from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import count
+
+if TYPE_CHECKING:
+    from numpy import ndarray
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -29,6 +33,14 @@ def add(commands: argparse._SubParsersAction) -> None:
     ablation.set_defaults(run=run_ablation)
 
 
+def _share(values: "ndarray") -> tuple[str, str]:
+    """Mean of shares and its interval, in per cent."""
+    from robotdiffuse.evaluation.metrics import bootstrap_interval
+
+    low, high = (100 * x for x in bootstrap_interval(values))
+    return f"{100 * values.mean():.1f}", f"{low:.1f} to {high:.1f}"
+
+
 def run_ablation(arguments: argparse.Namespace) -> int:
     import sys
 
@@ -37,7 +49,6 @@ def run_ablation(arguments: argparse.Namespace) -> int:
     from rich.table import Table
 
     from robotdiffuse.evaluation import ablation
-    from robotdiffuse.evaluation.metrics import bootstrap_interval
 
     names = ("data", "out", "samples", "encoder_samples", "problems")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
@@ -46,9 +57,11 @@ def run_ablation(arguments: argparse.Namespace) -> int:
     results = ablation.run_ablation(
         settings, rows, arguments.workers, lambda text: print(text, file=sys.stderr, flush=True)
     )
-    table = Table(title=f"Table 2: {ablation.settings_line(settings)}", title_justify="left", box=None)
+    title = f"Table 2: {ablation.settings_line(settings)}"
+    table = Table(title=title, title_justify="left", box=None, padding=(0, 1))
     table.add_column("row")
-    for column in (
+    columns = (
+        "guided",
         "single %",
         "95 %",
         "best %",
@@ -56,27 +69,24 @@ def run_ablation(arguments: argparse.Namespace) -> int:
         "95 %",
         "length m",
         "ms",
-        "paper: suc",
-        "col",
-        "len",
-        "s",
-    ):
+        "unguided %",
+        "95 %",
+    )
+    for column in (*columns, "paper: suc", "col", "len", "s"):
         table.add_column(column, justify="right")
     for result in results:
-        low, high = (100 * x for x in bootstrap_interval(result.single))
-        low_hit, high_hit = (100 * x for x in bootstrap_interval(result.collided))
-        length = f"{result.length.mean():.3f}" if len(result.length) else "-"
-        paper = ablation.ROWS[result.name].paper
+        tried = result.as_in_paper
+        row = ablation.ROWS.get(result.name)
         table.add_row(
             result.name,
-            f"{100 * result.single.mean():.1f}",
-            f"{low:.1f} to {high:.1f}",
-            f"{100 * result.best.mean():.1f}",
-            f"{100 * result.collided.mean():.1f}",
-            f"{low_hit:.1f} to {high_hit:.1f}",
-            length,
-            f"{1e3 * np.median(result.seconds):.0f}",
-            *(f"{value:g}" for value in paper),
+            "yes" if tried is result.guided else "no",
+            *_share(tried.single),
+            f"{100 * tried.best.mean():.1f}",
+            *_share(tried.collided),
+            f"{tried.length.mean():.3f}" if len(tried.length) else "-",
+            f"{1e3 * np.median(tried.seconds):.0f}",
+            *_share(result.alone.single),
+            *("-" if row is None else f"{value:g}" for value in (row.paper if row else (0,) * 4)),
         )
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    Console(width=None if sys.stdout.isatty() else 170).print(table)
     return 0

@@ -1,4 +1,8 @@
-"""The paper's Table 2: every row trained at the same budget and tried on the same held-out problems."""
+"""The paper's Table 2: every row trained at the same budget and tried on the same held-out problems.
+
+Collision guidance alone, without a network, solves many problems. So what a row owes to its network is told
+by trying it without guidance, and by a control: guidance of trajectories that no network made.
+"""
 
 import multiprocessing
 import time
@@ -20,9 +24,10 @@ from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.config import EncoderTraining
 from robotdiffuse.learning.configs import CONFIGS, planner_training
 from robotdiffuse.learning.encoder_training import train_encoder
+from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.shards import read_manifest
 from robotdiffuse.learning.training import train_planner
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode, unlearned_starts
 from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -36,6 +41,10 @@ SEED = 20261121
 SEARCH_TIME = 10.0
 """Problems that this much search does not solve are left out [s]."""
 ENCODER = "compression_autoencoder"
+CONTROL = "no network"
+"""The line and random bumps in place of a network's samples."""
+CONTROL_FRAMES = 48
+"""As many as the rows' networks have."""
 PATIENCE = 20.0
 """A training that is told to end stores a checkpoint first; after this it is killed [s]."""
 
@@ -85,10 +94,9 @@ class AblationSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class RowResult:
-    """Figures of a row, one value for each problem."""
+class Tried:
+    """Figures of a network, one value for each problem."""
 
-    name: str
     single: Float[ndarray, "n"]
     """Share of the sampled trajectories that passed the judge."""
     best: Float[ndarray, "n"]
@@ -99,6 +107,18 @@ class RowResult:
     """Link path length of the shortest that passed, of the problems that have one [m]."""
     seconds: Float[ndarray, "n"]
     """Wall time of encoding and sampling."""
+
+
+class RowResult(NamedTuple):
+    name: str
+    alone: Tried
+    """Without guidance."""
+    guided: Tried
+    """With it."""
+
+    @property
+    def as_in_paper(self) -> Tried:
+        return self.guided if self.name not in ROWS or ROWS[self.name].guided else self.alone
 
 
 def held_out_problems(count: int) -> list[Problem]:
@@ -143,7 +163,7 @@ def run_ablation(
             EncoderTraining(name=ENCODER, minutes=None, samples=settings.encoder_samples), str(encoder)
         )
     configs = list(dict.fromkeys(ROWS[name].config for name in rows))
-    results = {}
+    tried: dict[tuple[str | None, bool], Tried] = {}
     # fresh interpreters: forked ones could inherit locks of running threads
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, context, initializer=prepare_worker)
@@ -151,12 +171,19 @@ def run_ablation(
         for config in _done(pool, _train, [(settings, config) for config in configs]):
             report(f"trained {config}")
         problems = held_out_problems(settings.problems)
-        for result in _done(pool, _try, [(settings, name, problems) for name in rows]):
-            results[result.name] = result
-            report(f"tried {result.name}: {100 * result.single.mean():.1f} % of samples")
+        trials = [
+            (settings, config, guided, problems) for config in (*configs, None) for guided in (False, True)
+        ]
+        for config, guided, result in _done(pool, _try, trials):
+            tried[config, guided] = result
+            how = "with" if guided else "without"
+            report(f"tried {config or CONTROL} {how} guidance: {100 * result.single.mean():.1f} % of samples")
     finally:
         stop_pool(pool, PATIENCE)
-    return [results[name] for name in rows]
+    results = [
+        RowResult(name, *(tried[ROWS[name].config, guided] for guided in (False, True))) for name in rows
+    ]
+    return [*results, RowResult(CONTROL, tried[None, False], tried[None, True])]
 
 
 def _done(pool: ProcessPoolExecutor, work: Callable, arguments: list[tuple]) -> Iterator:
@@ -174,26 +201,17 @@ def _train(settings: AblationSettings, config: str) -> str:
     return config
 
 
-def _try(settings: AblationSettings, name: str, problems: list[Problem]) -> RowResult:
-    row, robot = ROWS[name], load_robot("panda")
-    weights = str(FilePath(settings.out) / row.config)
-    defaults = RobotDiffuseSettings()
-    planner = RobotDiffuse(
-        RobotDiffuseSettings(
-            weights=weights,
-            samples=settings.candidates,
-            guidance_steps=defaults.guidance_steps if row.guided else 0,
-            points=load_model(weights, robot).config.encoder_settings.cloud,
-        )
-    )
-    model, measure = planner.model(robot), LinkPathLength(robot)
-    assert model is not None
+def _try(
+    settings: AblationSettings, config: str | None, guided: bool, problems: list[Problem]
+) -> tuple[str | None, bool, Tried]:
+    robot = load_robot("panda")
+    measure = LinkPathLength(robot)
+    draw = _unlearned(settings.candidates, guided) if config is None else _learned(settings, config, guided)
     single, collided, lengths, seconds = [], [], [], []
     for i, problem in enumerate(problems):
         rng, checker = np.random.default_rng([SEED, 1, i]), CollisionChecker(robot, problem.scene)
         began = time.perf_counter()
-        code = encode(model, checker, planner.settings.points, rng)
-        q = planner.sample(model, checker, code, problem.start, goal_of(problem)[None], rng).q
+        q = draw(checker, problem, rng)
         seconds.append(time.perf_counter() - began)
         passed, hit = _judged(problem, q)
         single.append(passed.mean())
@@ -201,9 +219,44 @@ def _try(settings: AblationSettings, name: str, problems: list[Problem]) -> RowR
         if passed.any():
             lengths.append(measure(q[passed]).min())
     shares = np.array(single)
-    return RowResult(
-        name, shares, (shares > 0) * 1.0, np.array(collided), np.array(lengths), np.array(seconds)
+    arrays = (shares, (shares > 0) * 1.0, np.array(collided), np.array(lengths), np.array(seconds))
+    return config, guided, Tried(*arrays)
+
+
+Draw = Callable[[CollisionChecker, Problem, np.random.Generator], ndarray]
+"""Candidates for a problem [candidates, frames, dof]."""
+
+
+def _learned(settings: AblationSettings, config: str, guided: bool) -> Draw:
+    weights, robot = str(FilePath(settings.out) / config), load_robot("panda")
+    steps = RobotDiffuseSettings().guidance_steps if guided else 0
+    points = load_model(weights, robot).config.encoder_settings.cloud
+    planner = RobotDiffuse(
+        RobotDiffuseSettings(
+            weights=weights, samples=settings.candidates, guidance_steps=steps, points=points
+        )
     )
+    model = planner.model(robot)
+    assert model is not None
+
+    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
+        code = encode(model, checker, points, rng)
+        return planner.sample(model, checker, code, problem.start, goal_of(problem)[None], rng).q
+
+    return draw
+
+
+def _unlearned(candidates: int, guided: bool) -> Draw:
+    """The control takes as many gradient steps as a network's samples do, all of them one after the other."""
+    defaults = RobotDiffuseSettings()
+    steps = defaults.guidance_steps * (defaults.sampling_steps - defaults.sampling_steps // 2)
+
+    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
+        robot = problem.robot
+        q = unlearned_starts(problem.start, goal_of(problem), candidates, CONTROL_FRAMES, robot, rng)
+        return CollisionGuidance(checker)(q, steps)[0] if guided else q
+
+    return draw
 
 
 def _judged(

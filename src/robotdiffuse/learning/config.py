@@ -123,6 +123,8 @@ class EncoderTraining:
     """The paper's lambda: weight of the sum of squared weights, in the unit of the reconstruction's loss."""
     threads: int = 1
     """Threads of PyTorch: one thread beside other work is several times faster than two."""
+    device: str | None = None
+    """cpu or cuda; None: cuda if there is one."""
     checkpoint_seconds: float = 60.0
     encoder: EncoderSettings | None = field(default=None, metadata=of_kind("name", ENCODERS))
     """None: the defaults of that encoder."""
@@ -170,7 +172,7 @@ class PlannerTraining:
     """The paper's losses of joints, points and collision."""
     trivial_share: float = 0.1
     """Share of the batch whose straight line is free. They teach to leave the line alone."""
-    turns: int = 3
+    turns: int = 5
     """Copies of each trajectory turned about the vertical with their scenes, if the first joint is so."""
     smooth_noise: bool = True
     """Noise with the covariance of the trajectories over the frames; otherwise white (the paper's)."""
@@ -180,6 +182,8 @@ class PlannerTraining:
     """So many steps in a row with a loss that is not finite take training back to the last checkpoint."""
     threads: int = 1
     """Threads of PyTorch: one thread beside other work is several times faster than two."""
+    device: str | None = None
+    """cpu or cuda; None: cuda if there is one."""
     checkpoint_seconds: float = 120.0
     encoder_settings: EncoderSettings | None = field(default=None, metadata=of_kind("encoder", ENCODERS))
     """Of an encoder that is trained along; None: its defaults."""

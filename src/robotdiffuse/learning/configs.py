@@ -13,8 +13,8 @@ from robotdiffuse.learning.denoisers import PAPER_SIZE
 from robotdiffuse.learning.losses import LossSettings
 
 JOINT = LossSettings()
-JOINT_POINT = LossSettings(point=0.3)
-JOINT_POINT_COLLISION = LossSettings(point=0.3, collision=0.05, begin=0.3)
+JOINT_POINT = LossSettings(point=0.3, frames=4)
+JOINT_POINT_COLLISION = LossSettings(point=0.3, collision=0.05, begin=0.3, frames=4)
 """The paper gives no weights; these make the three losses of one size when predictions are 5 cm off."""
 
 _ROW = {"sees_clearances": False, "condition_drop": 0.1, "losses": JOINT_POINT_COLLISION}
