@@ -13,7 +13,7 @@ from pathlib import Path as File
 from typing import NamedTuple
 
 import numpy as np
-from problems import RUNS, SEARCH_TIME, SEED, Case, Drawn, draw_cases, families_of, goal_of
+from problems import RUNS, SEARCH_TIME, SEED, Case, Drawn, draw_cases, families_of, goal_of, judged
 from report import header, print_table, progress, share
 
 from robotdiffuse.collision import CollisionChecker
@@ -30,7 +30,6 @@ from robotdiffuse.problem import Problem
 from robotdiffuse.scenes.families import FAMILIES
 from robotdiffuse.simulation.oracle import PyBulletOracle
 from robotdiffuse.types import Path
-from robotdiffuse.verify import VerifySettings, verifier
 
 
 class Outcome(NamedTuple):
@@ -39,16 +38,6 @@ class Outcome(NamedTuple):
     """[rad]"""
     seconds: float
     """CPU time."""
-
-
-def judged(problem: Problem, q: np.ndarray) -> np.ndarray:
-    """Which trajectories, taken frame by frame as they are, pass the judge."""
-    judge, start, goal = verifier(problem, VerifySettings()), problem.start, goal_of(problem)
-    verdicts = []
-    for frames in q.astype(np.float64):
-        frames[0], frames[-1] = start, goal
-        verdicts.append(judge.path(Path(problem.robot.joint_names, frames)).valid)
-    return np.array(verdicts)
 
 
 def network_alone(planner: RobotDiffuse, cases: list[Case], title: str) -> list[str]:

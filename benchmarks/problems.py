@@ -15,7 +15,7 @@ from pathlib import Path as File
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from rich.console import Console
 from rich.progress import Progress
@@ -143,6 +143,16 @@ def shortest_of_runs(problem: Problem, search_time: float) -> float:
         if len(path):
             lengths.append(float(kernel.path_length(kernel.shortcut(space, path, 120, state))))
     return min(lengths)
+
+
+def judged(problem: Problem, q: Float[ndarray, "count frames dof"]) -> Bool[ndarray, "count"]:
+    """Which trajectories, taken frame by frame as they are, pass the judge."""
+    judge, start, goal = verifier(problem, VerifySettings()), problem.start, goal_of(problem)
+    verdicts = []
+    for frames in q.astype(np.float64):
+        frames[0], frames[-1] = start, goal
+        verdicts.append(judge.path(Path(problem.robot.joint_names, frames)).valid)
+    return np.array(verdicts, bool)
 
 
 def families_of(text: str) -> list[str]:
