@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.collision import distance, lane_clearance, lanes
+from robotdiffuse.collision import clearance_gradients, distance, lane_clearance, lanes
 from robotdiffuse.collision.arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import Robot
@@ -41,6 +41,23 @@ class CollisionChecker:
         """
         arrays = self.robot_arrays, self.scene_arrays
         return lane_clearance.link_clearances(*arrays, self._rows(q), np.float32(limit)) - self.padding
+
+    def clearances_and_gradients(
+        self, q: Float[ndarray, "n dof"], limit: float, margin: float
+    ) -> tuple[Float[ndarray, "n links"], Float[ndarray, "n dof"]]:
+        """`link_clearances`, and the gradients by the joints of how far the arm is too close [m/rad].
+
+        That is the root of the sum of h² over the covering spheres, with the hinge h = max(0, margin - D) on
+        their signed distances to the scene; 0 where no link is within the margin [m].
+        """
+        links, gradients = clearance_gradients.clearances_and_gradients(
+            self.robot_arrays,
+            self.scene_arrays,
+            self._rows(q),
+            np.float32(limit),
+            np.float32(margin) + self.padding,
+        )
+        return links - self.padding, gradients
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
         """Distance between the links of each checked pair [m], at most 1 m."""

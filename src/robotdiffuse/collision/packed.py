@@ -1,4 +1,5 @@
-"""Link clearances of many configurations in as many packed scenes: the denoiser's input in training."""
+"""Link clearances of many configurations in as many packed scenes, and gradients: the denoiser's input in
+training."""
 
 import numpy as np
 from jaxtyping import Float32, Int8
@@ -6,6 +7,7 @@ from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision.arrays import RobotArrays, SceneArrays, compile_scene
+from robotdiffuse.collision.clearance_gradients import clearances_and_gradients_into
 from robotdiffuse.collision.compiled import allocation_free
 from robotdiffuse.collision.lane_clearance import clearances_into, make_clearance_workspace
 from robotdiffuse.scenes.scene import Scene
@@ -49,6 +51,22 @@ def _unpack(kinds, params, spheres, boxes):
     return n, m
 
 
+@njit(cache=True)
+def _scene(empty, spheres, boxes):
+    """These spheres and boxes, and nothing else."""
+    return SceneArrays(
+        spheres,
+        boxes,
+        empty.cylinders,
+        empty.capsules,
+        empty.points,
+        empty.cell_first,
+        empty.grid,
+        empty.nearest,
+        empty.grid_frame,
+    )
+
+
 @njit(cache=True, nogil=True)
 def _packed_link_clearances(robot, empty, fixed_boxes, kinds, params, q, limit):
     first = np.searchsorted(robot.frame, 1)
@@ -60,19 +78,26 @@ def _packed_link_clearances(robot, empty, fixed_boxes, kinds, params, q, limit):
     work = make_clearance_workspace(robot, len(spheres) + len(boxes) + 1)
     for b in range(len(q)):
         n, m = _unpack(kinds[b], params[b], spheres, boxes[fixed:])
-        scene = SceneArrays(
-            spheres[:n],
-            boxes[: fixed + m],
-            empty.cylinders,
-            empty.capsules,
-            empty.points,
-            empty.cell_first,
-            empty.grid,
-            empty.nearest,
-            empty.grid_frame,
-        )
+        scene = _scene(empty, spheres[:n], boxes[: fixed + m])
         clearances_into(robot, scene, q[b], limit, work, out[b])
     return out
+
+
+@njit(cache=True, nogil=True)
+def _packed_gradients(robot, empty, fixed_boxes, kinds, params, q, limit, margin):
+    first = np.searchsorted(robot.frame, 1)
+    out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
+    gradients = np.empty(q.shape, np.float32)
+    spheres = np.empty((kinds.shape[1], 4), np.float32)
+    fixed = len(fixed_boxes)
+    boxes = np.empty((kinds.shape[1] + fixed, 15), np.float32)
+    boxes[:fixed] = fixed_boxes
+    work = make_clearance_workspace(robot, len(spheres) + len(boxes) + 1)
+    for b in range(len(q)):
+        n, m = _unpack(kinds[b], params[b], spheres, boxes[fixed:])
+        scene = _scene(empty, spheres[:n], boxes[: fixed + m])
+        clearances_and_gradients_into(robot, scene, q[b], limit, margin, work, out[b], gradients[b])
+    return out, gradients
 
 
 def packed_link_clearances(
@@ -91,3 +116,18 @@ def packed_link_clearances(
     return _packed_link_clearances(
         robot, fixed_arrays, fixed_arrays.boxes, kinds, params, q, np.float32(limit)
     )
+
+
+def packed_clearances_and_gradients(
+    robot: RobotArrays,
+    kinds: Int8[ndarray, "batch obstacles"],
+    params: Float32[ndarray, "batch obstacles 10"],
+    q: Float32[ndarray, "batch frames dof"],
+    fixed: Scene,
+    limit: float,
+    margin: float,
+) -> tuple[Float32[ndarray, "batch frames links"], Float32[ndarray, "batch frames dof"]]:
+    """`packed_link_clearances` and the gradients of `CollisionChecker.clearances_and_gradients` [m/rad]."""
+    fixed_arrays = compile_scene(fixed)
+    arguments = robot, fixed_arrays, fixed_arrays.boxes, kinds, params, q
+    return _packed_gradients(*arguments, np.float32(limit), np.float32(margin))

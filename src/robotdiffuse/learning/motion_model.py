@@ -11,7 +11,7 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.config import check_kind, of_kind
+from robotdiffuse.learning.config import check_gradients, check_kind, of_kind
 from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
 from robotdiffuse.learning.denoisers.layers import Linear
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
@@ -28,7 +28,8 @@ MAX_POINTS = 2048
 is for, if it is not for clouds of any size."""
 
 ClearanceFn = Callable[[ndarray], ndarray]
-"""Joint values [count, rows, dof] (float32) to clearances of the links, [count, rows, links] [m]."""
+"""Joint values [count, rows, dof] (float32) to clearances of the links, [count, rows, links] [m]; for a model
+that sees gradients, to [count, rows, links + dof], see `CollisionChecker.clearances_and_gradients`."""
 GuideFn = Callable[[ndarray, float], ndarray]
 """Predicted joint values [count, frames, dof] (float32), noise level in (0, 1]; to improved joint values."""
 
@@ -73,8 +74,16 @@ class MotionModelConfig:
     """What the network predicts: clean, noise or velocity."""
     sees_clearances: bool = True
     """Whether the denoiser is told the clearances of the links along the noisy trajectory."""
+    sees_gradients: bool = False
+    """Whether it is told too which way the joints would take the arm too close to obstacles, see
+    `CollisionChecker.clearances_and_gradients`."""
+    gradient_margin: float = 0.1
+    """Closer than this is too close [m]."""
+    gradient_unit: float = 2.0
+    """Such gradients are told as 1, and larger ones too [m/rad]."""
 
     def __post_init__(self) -> None:
+        check_gradients(self.sees_gradients, self.sees_clearances)
         check_kind("encoder", self.encoder, self.encoder_settings, ENCODERS)
         if self.sampler not in SAMPLERS:
             raise unknown_name("sampler", self.sampler, SAMPLERS)
@@ -108,6 +117,7 @@ class MotionModel(TrajectoryRows):
         self.encoder = make_encoder(config.encoder, config.encoder_settings)
         condition = config.encoder_settings.code + 2 * self.dof
         features = 2 * self.dof + (len(config.links) if config.sees_clearances else 0)
+        features += self.dof if config.sees_gradients else 0
         self.denoiser = DENOISERS[config.denoiser][0](
             config.denoiser_settings, self.rows, self.dof, features, condition
         )
@@ -139,14 +149,19 @@ class MotionModel(TrajectoryRows):
     def features(
         self, x: Float[ndarray, "batch rows dof"], between: Between, clearances: ClearanceFn
     ) -> Float[ndarray, "batch rows features"]:
-        """The denoiser's input for noisy rows: the rows, normalised joint values, clearances of the links."""
+        """The denoiser's input for noisy rows: the rows, normalised joint values, clearances of the links and
+        gradients, each as far as it sees them."""
         unit = self.at_sites(x, between)
         if not self.config.sees_clearances:
             return np.concatenate([x, unit], axis=-1)
         low, high = self.config.clearance_low, self.config.clearance_high
-        near = np.clip(clearances(self.normalizer.from_unit(unit)), low, high)
+        told = clearances(self.normalizer.from_unit(unit))
+        near = np.clip(told[..., : len(self.config.links)], low, high)
         near = (near - (low + high) / 2) * (2 / (high - low))
-        return np.concatenate([x, unit, near.astype(np.float32, copy=False)], axis=-1)
+        parts = [x, unit, near.astype(np.float32, copy=False)]
+        if self.config.sees_gradients:
+            parts.append(np.clip(told[..., -self.dof :] / np.float32(self.config.gradient_unit), -1, 1))
+        return np.concatenate(parts, axis=-1)
 
     def condition(
         self,

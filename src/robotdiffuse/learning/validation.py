@@ -1,14 +1,12 @@
 """A validation that plans: what a network in training would solve by itself, without guidance or search."""
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.batches import TrajectoryData, encode_scenes
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel, MotionModelConfig
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.rop import unpack_scene
 from robotdiffuse.scenes.scene import Scene
@@ -52,7 +50,7 @@ def _sampled_free(
     else:
         code = data.codes[row]
     start, goal = q[0].astype(np.float64), q[-1].astype(np.float64)
-    clearances = link_clearances(checker, model.config.clearance_high)
+    clearances = link_clearances(checker, model.config)
     sampled = model.sample(code.astype(np.float32), start, goal, candidates, rng, clearances)
     share = np.linspace(0, 1, BETWEEN, endpoint=False)[:, None]
     dense = sampled[:, :-1, None] + share * np.diff(sampled, axis=1)[:, :, None]
@@ -60,10 +58,15 @@ def _sampled_free(
     return np.all(free, axis=1, keepdims=True)[:, 0]
 
 
-def link_clearances(checker: CollisionChecker, limit: float) -> Callable[[ndarray], ndarray]:
-    """What a model is told: joint values [n, m, dof] to clearances [n, m, links] [m], at most `limit`."""
+def link_clearances(checker: CollisionChecker, config: MotionModelConfig) -> ClearanceFn:
+    """What a model of this config is told of the obstacles."""
+    limit = config.clearance_high
 
     def clearances(q: ndarray) -> ndarray:
-        return checker.link_clearances(q.reshape(-1, q.shape[-1]), limit).reshape(*q.shape[:2], -1)
+        rows = q.reshape(-1, q.shape[-1])
+        if config.sees_gradients:
+            told = checker.clearances_and_gradients(rows, limit, config.gradient_margin)
+            return np.concatenate(told, axis=-1).reshape(*q.shape[:2], -1)
+        return checker.link_clearances(rows, limit).reshape(*q.shape[:2], -1)
 
     return clearances

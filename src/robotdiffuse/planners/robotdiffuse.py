@@ -162,7 +162,7 @@ class RobotDiffuse:
         order = np.argsort(np.linalg.norm(goals - start, axis=1))[: max(settings.samples // 4, 1)]
         counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(order))]
 
-        clearances = link_clearances(checker, model.config.clearance_high)
+        clearances = link_clearances(checker, model.config)
 
         def guide(q: ndarray, _level: float) -> ndarray:
             return guidance(q, settings.guidance_steps)[0]
