@@ -2,8 +2,14 @@
 
 import csv
 import json
+import random
 import shutil
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,14 +19,15 @@ from box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning import training
-from robotdiffuse.learning.batches import load_data, random_scenes, resample_evenly
-from robotdiffuse.learning.checkpoint import load_encoder, load_model, save_encoder
-from robotdiffuse.learning.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.batches import Batch, Batches, fast_bf16, load_data, random_scenes, resample_evenly
+from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors, save_encoder
+from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, settings_to_json
 from robotdiffuse.learning.denoisers import TransformerSettings, UNetSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.encoder_training import train_encoder
 from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
 from robotdiffuse.learning.losses import LossSettings
+from robotdiffuse.learning.processes import Processes
 from robotdiffuse.learning.shards import shard_path, split_of, write_manifest, write_shard
 from robotdiffuse.learning.training import moving_links, train_planner
 from robotdiffuse.learning.training_run import TrainingRun, Validation
@@ -118,6 +125,127 @@ def test_encoder_learns(tmp_path):
     assert report["distance"] < 0.8 * report["distance_of_constant"]
     codes = load_encoder(tmp_path)(torch.zeros(1, 0, 3))
     assert codes.shape == (1, 8)
+
+
+def start(kind, settings, out, *launcher):
+    """A training of training_processes.py, in a process group of its own."""
+    file = out.parent / f"{out.name}.json"
+    file.write_text(json.dumps(settings_to_json(settings)))
+    script = str(Path(__file__).with_name("training_processes.py"))
+    return subprocess.Popen(
+        [sys.executable, *launcher, script, kind, str(file), str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def test_killed_training_ends_the_same(tmp_path, data):
+    """By kill -9, at a random moment after the first checkpoint."""
+    settings = planner_settings(data, samples=1600, validation_problems=1)
+    train_planner(settings, str(tmp_path / "whole"))
+    out = tmp_path / "killed"
+    run = start("slow", replace(settings, checkpoint_seconds=0.2), out)
+    while not (out / "training.safetensors").exists():
+        assert run.poll() is None, run.communicate()[0]
+        time.sleep(0.01)
+    time.sleep(random.random())
+    run.kill()
+    run.communicate()
+    assert run.returncode == -signal.SIGKILL and not (out / "model.safetensors").exists()
+    train_planner(settings, str(out))
+    files = [tmp_path / part / "model.safetensors" for part in ("whole", "killed")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
+    """A step of two is that of one on both their batches; they resume, and skip a bad step, together."""
+    out = tmp_path / "two"
+    settings = planner_settings(data, samples=160, gradient_norm=1e6, validation_problems=1, device="cpu")
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    run = start("two", settings, out, *launcher)
+    said = run.communicate()[0]
+    assert run.returncode == 0, said
+    assert said.count("planner: 100.0%, 160 samples") == 2, "the first process alone reports"
+    first, second = json.loads((out / "seen.json").read_text())
+    assert first == second
+    assert first["report"] == first["again"]
+    assert first["skipped"] == 1 and first["samples"] == 20
+    files = [out / part / "model.safetensors" for part in ("whole", "parts")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    with pytest.raises(InputError, match="processes = '2', now it is '1'"):
+        train_planner(settings, str(out / "parts"))
+
+    draw, gradients = Batches.draw, {}
+
+    def both(self, count, rng):
+        if gradients:
+            return draw(self, count, rng)
+        parts = [draw(self, count // 2, np.random.default_rng(seed)) for seed in (0, [0, 1])]
+        fields = ((name, [getattr(part, name) for part in parts]) for name in vars(parts[0]))
+        return Batch(**{name: None if a is None else np.concatenate([a, b]) for name, (a, b) in fields})
+
+    def step(self, loss):
+        original(self, loss)
+        gradients.update(
+            {name: p.grad.clone() for name, p in self.parameters.items()} if not gradients else {}
+        )
+
+    original = TrainingRun.step
+    monkeypatch.setattr(Batches, "draw", both)
+    monkeypatch.setattr(TrainingRun, "step", step)
+    train_planner(replace(settings, samples=32, batch=32), str(tmp_path / "one"))
+    averaged, _ = read_tensors(out / "first_step.safetensors")
+    assert averaged.keys() == gradients.keys()
+    wanted, found = (torch.cat([g[name].flatten() for name in averaged]) for g in (gradients, averaged))
+    # products in bf16 have 8 digits, and are rounded for each batch
+    assert (found - wanted).norm() < (0.01 if fast_bf16() else 1e-5) * wanted.norm()
+
+
+def test_takes_in_data_that_are_still_being_made(tmp_path, data, monkeypatch, capsys):
+    """Shards that appear are drawn from after the next checkpoint; a whole folder is read once."""
+    shard_path(data, 1).rename(tmp_path / "later")
+    known = []
+    original = TrainingRun.step
+
+    def step(self, loss):
+        original(self, loss)
+        if self.at.step == 3:
+            (tmp_path / "later").rename(shard_path(data, 1))
+
+    read = training.load_data
+
+    def count_reading(*given):
+        known.append(read(*given))
+        return known[-1]
+
+    monkeypatch.setattr(TrainingRun, "step", step)
+    monkeypatch.setattr(training, "load_data", count_reading)
+    settings = planner_settings(data, checkpoint_seconds=0.0, samples=96, validation_problems=1)
+    train_planner(settings, str(tmp_path / "out"))
+    assert len(known) == 2 and len(known[0]) < len(known[1])
+    assert f"grown to {len(known[1]):,} trajectories" in capsys.readouterr().err
+    about = json.loads((tmp_path / "out" / "model.json").read_text())["training"]
+    assert about["trajectories"] == len(known[1]) and about["data"] == known[1].digest
+
+
+def test_device_is_checked(data, tmp_path, monkeypatch):
+    for name, message in (("tpu", "unknown device 'tpu'; known: cpu, cuda"), ("cuda", "no CUDA device")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        with pytest.raises(InputError, match=message):
+            train_planner(planner_settings(data, device=name), str(tmp_path / "out"))
+    Processes("cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
+    with pytest.raises(InputError, match="has trained on cpu; start a new process"):
+        Processes("cuda")
+
+
+def test_training_without_accelerate_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "accelerate", None)
+    with pytest.raises(InputError, match=r"pip install \"robotdiffuse\[train\]\""):
+        Processes(None)
 
 
 @pytest.mark.parametrize("kind", ["encoder", "planner"])
@@ -239,6 +367,7 @@ def test_losses_that_are_not_finite_are_skipped(tmp_path):
         gradient_norm=1.0,
         bad_steps=3,
         identity={},
+        processes=Processes("cpu"),
     )
     calls = []
 
@@ -267,6 +396,7 @@ def test_hopeless_training_stops(tmp_path):
         gradient_norm=1.0,
         bad_steps=3,
         identity={},
+        processes=Processes("cpu"),
     )
     with pytest.raises(InputError, match="not finite"):
         run.loop(lambda rng: module.weight.sum() * float("nan"), lambda: Validation(0.0), "test")

@@ -1,17 +1,24 @@
 """robotdiffuse train encoder, robotdiffuse train planner"""
 
 import argparse
+import os
+from contextlib import nullcontext
 
-from robotdiffuse.cli.arguments import count, natural, positive
+from robotdiffuse.cli.arguments import count, natural, positive, share
+from robotdiffuse.errors import InputError
 
-SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
+SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads", "device")
+PARTS = ("denoiser", "objective", "sampler", "parametrization", "rows", "target", "condition_drop", "frames")
+"""Of the planner's config."""
 
 
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "train",
         help="train the encoder or the planner's network",
-        description="Train a network. Ctrl-C stops after a checkpoint; the same command continues.",
+        description="Train a network. Ctrl-C stops after a checkpoint; the same command continues. Several "
+        "processes, each with a GPU of its own if there are as many: "
+        "torchrun --nproc-per-node N -m robotdiffuse train ...",
     )
     kinds = parser.add_subparsers(title="networks", metavar="NETWORK", required=True)
 
@@ -43,7 +50,27 @@ def add(commands: argparse._SubParsersAction) -> None:
         "unless the config names one",
     )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the data's robot")
+    planner.add_argument(
+        "--generate",
+        type=count,
+        metavar="N",
+        help="meanwhile fill the data folder with N processes; training begins with the first shard, and "
+        "takes in the others",
+    )
     _add_shared(planner)
+    parts = planner.add_argument_group("parts of the model, instead of the config's")
+    parts.add_argument(
+        "--denoiser", metavar="NAME", help="transformer, encoder_decoder, decoder_only or unet"
+    )
+    parts.add_argument("--objective", metavar="NAME", help="what is predicted: clean, noise or velocity")
+    parts.add_argument("--sampler", metavar="NAME", help="for planning: ddim, ddpm, dpm_solver or euler")
+    parts.add_argument("--parametrization", metavar="NAME", help="of motions: frames or b_spline")
+    parts.add_argument("--rows", type=count, metavar="N", help="control points of b_spline")
+    parts.add_argument("--target", metavar="NAME", help="residual, to the straight line, or absolute")
+    parts.add_argument(
+        "--condition-drop", type=share, metavar="P", help="share without condition, for its guidance"
+    )
+    parts.add_argument("--frames", type=count, metavar="N", help="frames of a motion")
     planner.set_defaults(run=run_planner)
 
 
@@ -58,6 +85,7 @@ def _add_shared(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch", type=count, metavar="N", help="samples per step")
     parser.add_argument("--learning-rate", type=positive, metavar="X", help="highest learning rate")
     parser.add_argument("--threads", type=count, metavar="N", help="threads of PyTorch")
+    parser.add_argument("--device", metavar="NAME", help="cpu or cuda (default: cuda if there is one)")
 
 
 def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, object]:
@@ -79,15 +107,31 @@ def run_encoder(arguments: argparse.Namespace) -> int:
 
 
 def run_planner(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.learning.configs import planner_training
+    from robotdiffuse.cli.background_factory import filled_meanwhile
+    from robotdiffuse.learning.configs import CONFIGS, planner_training
+    from robotdiffuse.learning.denoisers import PAPER_SIZE
     from robotdiffuse.learning.training import train_planner
 
-    settings = planner_training(arguments.config, _given(arguments, ("data", "encoder", "robot", *SHARED)))
-    _report(train_planner(settings, arguments.out), arguments.out)
+    if arguments.config not in CONFIGS:
+        known = "".join(f"\n  {name}: {config.description}" for name, config in CONFIGS.items())
+        raise InputError(f"unknown config {arguments.config!r}; known:{known}")
+    given = _given(arguments, ("data", "encoder", "robot", *SHARED, *PARTS))
+    if "denoiser" in given and CONFIGS[arguments.config].changes.get("denoiser_settings") is not None:
+        # the config's are of its own denoiser; those of another of the same size
+        given["denoiser_settings"] = PAPER_SIZE.get(arguments.denoiser)
+    settings = planner_training(arguments.config, given)
+    meanwhile = nullcontext()
+    if arguments.generate is not None:
+        meanwhile = filled_meanwhile(settings.data, arguments.generate, settings.robot)
+    with meanwhile:
+        report = train_planner(settings, arguments.out)
+    _report(report, arguments.out)
     return 0
 
 
 def _report(figures: dict[str, float], out: str) -> None:
+    if int(os.environ.get("RANK", "0")) > 0:
+        return  # torchrun's first process tells
     for name, value in figures.items():
         print(f"{name}: {value:.6g}")
     print(f"wrote {out}")

@@ -6,10 +6,11 @@ from jaxtyping import Float, Float32, Int8
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.learning.batches import fast_bf16, random_scenes, scene_clouds
+from robotdiffuse.learning.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.checkpoint import save_encoder
 from robotdiffuse.learning.config import EncoderTraining, settings_to_json
 from robotdiffuse.learning.encoders import Autoencoder, Encoder, make_encoder
+from robotdiffuse.learning.processes import Processes, on_cpu
 from robotdiffuse.learning.training_run import TrainingRun, Validation
 from robotdiffuse.learning.versions import versions
 from robotdiffuse.scenes.sampling import BOX, NONE
@@ -34,36 +35,50 @@ def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
     of the reconstruction, see the encoder's `loss`, and those of `linear_readout`. Raises InputError if the
     folder holds a different run, and KeyboardInterrupt, after a checkpoint, on Ctrl-C.
     """
+    processes = Processes(settings.device)
     torch.manual_seed(settings.seed)
-    module = make_encoder(settings.name, settings.encoder)
+    module = make_encoder(settings.name, settings.encoder).to(processes.device)
     assert isinstance(module, Autoencoder)  # by EncoderTraining
     run = TrainingRun(
-        module, out, settings, average=0.999, weight_decay=0.0, gradient_norm=1.0, bad_steps=10, identity={}
+        module,
+        out,
+        settings,
+        average=0.999,
+        weight_decay=0.0,
+        gradient_norm=1.0,
+        bad_steps=10,
+        identity={},
+        processes=processes,
     )
     most = settings.points if module.any_size else module.settings.cloud
 
     def loss(rng: np.random.Generator) -> Float[Tensor, ""]:
         points = int(rng.integers(max(1, most // 8), most + 1)) if module.any_size else most
         scenes = random_scenes(settings.batch, settings.max_obstacles, rng)
-        error, _ = _reconstruction(module, *scenes, points, rng)
+        error, _ = _reconstruction(module, *scenes, points, rng, processes)
         theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()
         return error + settings.regularization * theta
 
     def judge(count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
         rng = np.random.default_rng(seed)
         with torch.no_grad():
-            return _reconstruction(module, *random_scenes(count, settings.max_obstacles, rng), most, rng)
+            scenes = random_scenes(count, settings.max_obstacles, rng)
+            return _reconstruction(module, *scenes, most, rng, processes)
 
     run.loop(loss, lambda: Validation(judge(128, 123)[0].item()), "encoder")
+    if not processes.first:
+        return processes.share(None)
     with run.averaged(), torch.no_grad():
         rng = np.random.default_rng(settings.seed + 1)
         scenes = random_scenes(READ, settings.max_obstacles, rng)
-        clouds = scene_clouds(module, *scenes, rng).split(256)
-        module.standardize(torch.cat([module.encode(part) for part in clouds]))
-        report = judge(512, settings.seed + 2)[1] | linear_readout(module, settings.max_obstacles, rng)
+        report = judge(512, settings.seed + 2)[1]
+        trained = on_cpu(module)
+        clouds = scene_clouds(trained, *scenes, rng).split(256)
+        trained.standardize(torch.cat([trained.encode(part) for part in clouds]))
+        report |= linear_readout(trained, settings.max_obstacles, rng)
         about = {"settings": settings_to_json(settings), "samples": run.at.samples, **report, **versions()}
-        save_encoder(module, out, about)
-    return report
+        save_encoder(trained, out, about)
+    return processes.share(report)
 
 
 def _reconstruction(
@@ -72,9 +87,10 @@ def _reconstruction(
     params: Float32[ndarray, "n k 10"],
     points: int,
     rng: np.random.Generator,
+    processes: Processes,
 ) -> tuple[Float[Tensor, ""], dict[str, float]]:
-    cloud = scene_clouds(module, kinds, params, rng, points)
-    with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+    cloud = scene_clouds(module, kinds, params, rng, points).to(processes.device)
+    with processes.autocast():
         return module.loss(cloud, rng)
 
 

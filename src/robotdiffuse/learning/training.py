@@ -1,6 +1,7 @@
 """Training of the motion predictor, with a frozen encoder or one that is trained along."""
 
-import sys
+import copy
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -9,13 +10,15 @@ from torch import Tensor
 
 from robotdiffuse.collision.arrays import compile_robot, robot_groups
 from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
-from robotdiffuse.learning.batches import Batch, Batches, fast_bf16, load_data
+from robotdiffuse.learning.batches import Batch, Batches, TrajectoryData, load_data
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_model
 from robotdiffuse.learning.config import PlannerTraining, settings_to_json
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import Encoder, encoder_name, make_encoder
+from robotdiffuse.learning.growing_data import GrowingData
 from robotdiffuse.learning.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
+from robotdiffuse.learning.processes import Processes, on_cpu
 from robotdiffuse.learning.training_run import TrainingRun, Validation
 from robotdiffuse.learning.validation import planning_success
 from robotdiffuse.learning.versions import versions
@@ -45,28 +48,29 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     aside, `success`, the share of the motions that it samples for them by itself that are free, and
     `samples`. Raises InputError if the data, the encoder or the folder do not fit, and KeyboardInterrupt,
     after a checkpoint, on Ctrl-C.
+
+    While the data factory is still filling the folder, the shards that are there are used, and new ones from
+    the next checkpoint on; such a run is not reproducible, see `GrowingData`. Where torchrun started several
+    processes, all call this and get the same result, see `TrainingRun`.
     """
+    processes = Processes(settings.device)
     robot = load_robot(settings.robot)
     torch.manual_seed(settings.seed)
-    if settings.jointly:
-        encoder = make_encoder(settings.encoder, settings.encoder_settings)
-    else:
-        encoder = load_encoder(settings.encoder)
+    frozen = None if settings.jointly else load_encoder(settings.encoder)
+    encoder = frozen or make_encoder(settings.encoder, settings.encoder_settings)
     model = MotionModel(_model_config(settings, robot, encoder))
-    model.encoder = encoder
-    data = load_data(
-        settings.data,
-        robot,
-        None if settings.jointly else encoder,
-        model.config.frames,
-        lambda text: print(text, file=sys.stderr),
-        settings.turns,
-    )
-    kept, held_out = data.split(HELD_OUT)
+    # codes are made on the CPU: the frozen one stays there
+    model.encoder = copy.deepcopy(encoder)
+
+    def read(report: Callable[[str], None]) -> TrajectoryData:
+        return load_data(settings.data, robot, frozen, model.config.frames, report, settings.turns)
+
+    data = GrowingData(settings.data, read, processes)
+    kept, held_out = data.now.split(HELD_OUT)
     hard = kept.q[~kept.trivial]
     model.fit_statistics((hard if len(hard) else kept.q)[:20_000], settings.smooth_noise)
     run = TrainingRun(
-        model,
+        model.to(processes.device),
         out,
         settings,
         average=settings.average,
@@ -74,7 +78,10 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
         gradient_norm=settings.gradient_norm,
         bad_steps=settings.bad_steps,
         identity={"robot": robot.name, "encoder_fingerprint": fingerprint(encoder)},
+        processes=processes,
     )
+    # batches are made, and validations planned, on the CPU
+    here = on_cpu(model)
 
     arrays = compile_robot(robot)
 
@@ -85,18 +92,29 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
             return np.concatenate(told, axis=-1)
         return packed_link_clearances(*given)
 
-    batches = Batches(kept, model, clearances, settings.trivial_share, settings.weight_limit)
-    loss_of = _Loss(model, robot, settings)
+    def batches_of(rows: TrajectoryData) -> Batches:
+        return Batches(rows, here, clearances, settings.trivial_share, settings.weight_limit)
+
+    batches = batches_of(kept)
+    loss_of = _Loss(model, robot, settings, processes)
+
+    def take_in_new_data() -> None:
+        nonlocal batches, held_out
+        if data.grow():
+            kept, held_out = data.now.split(HELD_OUT)
+            batches = batches_of(kept)
 
     def validate() -> Validation:
         if not len(held_out):
             return Validation(float("nan"))
         rng = np.random.default_rng(7)
-        source = Batches(held_out, model, clearances, settings.trivial_share, settings.weight_limit)
+        source = batches_of(held_out)
+        if here is not model:
+            here.load_state_dict(model.state_dict())
         with torch.no_grad():
             parts = [loss_of(source.draw(settings.batch, rng), run.fraction, rng).item() for _ in range(8)]
         count = settings.validation_problems
-        success = planning_success(model, robot, held_out, FLOOR, count, VALIDATION_SAMPLES, rng)
+        success = planning_success(here, robot, held_out, FLOOR, count, VALIDATION_SAMPLES, rng)
         return Validation(float(np.mean(parts)), success)
 
     def loss(rng: np.random.Generator) -> Float[Tensor, ""]:
@@ -106,7 +124,9 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
             dropped = torch.from_numpy(rng.random(settings.batch) < settings.condition_drop)
         return loss_of(batch, run.fraction, rng, dropped)
 
-    run.loop(loss, validate, "planner")
+    run.loop(loss, validate, "planner", take_in_new_data)
+    if not processes.first:
+        return processes.share(None)
     with run.averaged():
         held_out_loss, success = validate()
         report = {"validation": held_out_loss, "samples": float(run.at.samples)}
@@ -114,15 +134,15 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
             report["success"] = success
         about = {
             "settings": settings_to_json(settings),
-            "data": data.digest,
-            "trajectories": len(data),
-            "encoder": fingerprint(encoder),
+            "data": data.now.digest,
+            "trajectories": len(data.now),
+            "encoder": fingerprint(model.encoder),
             "minutes": round(run.at.seconds / 60, 2),
             **report,
             **versions(),
         }
         save_model(model, out, about)
-    return report
+    return processes.share(report)
 
 
 def _model_config(settings: PlannerTraining, robot: Robot, encoder: Encoder) -> MotionModelConfig:
@@ -153,15 +173,16 @@ def _model_config(settings: PlannerTraining, robot: Robot, encoder: Encoder) -> 
 class _Loss:
     """The loss of a batch: the objective's on the rows, L_point and L_collision (paper, eq. L)."""
 
-    def __init__(self, model: MotionModel, robot: Robot, settings: PlannerTraining) -> None:
-        self.model, self.settings = model, settings.losses
-        kinematics = ForwardKinematics(robot)
+    def __init__(
+        self, model: MotionModel, robot: Robot, settings: PlannerTraining, processes: Processes
+    ) -> None:
+        self.model, self.settings, self.processes = model, settings.losses, processes
+        kinematics = ForwardKinematics(robot, device=processes.device)
         rng = np.random.default_rng(settings.seed)
         self.points = (
             SurfacePoints(kinematics, self.settings.points, rng) if self.settings.point > 0 else None
         )
         self.arm = ArmDistance(kinematics) if self.settings.collision > 0 else None
-        self.bf16 = fast_bf16()
 
     def __call__(
         self,
@@ -171,16 +192,17 @@ class _Loss:
         dropped: Bool[Tensor, "n"] | None = None,
     ) -> Float[Tensor, ""]:
         """`fraction` of the training is done; `dropped`: samples whose condition is hidden."""
-        model, losses = self.model, self.settings
+        model, losses, device = self.model, self.settings, self.processes.device
         features, level, condition, target, weight = (
-            torch.from_numpy(a)
+            torch.from_numpy(a).to(device)
             for a in (batch.features, batch.level, batch.condition, batch.target, batch.weight)
         )
-        with torch.autocast("cpu", torch.bfloat16, enabled=self.bf16):
+        with self.processes.autocast():
             if batch.clouds is not None:
-                z = model.encoder(batch.clouds)
+                z = model.encoder(batch.clouds.to(device))
                 condition = torch.cat([z, condition[:, z.shape[1] :]], 1)
-            output = model.denoise(features, level, condition, dropped)
+            hidden = None if dropped is None else dropped.to(device)
+            output = model.denoise(features, level, condition, hidden)
         error = losses.joint * (output - target)[:, 1:-1].square().mean((1, 2))
         collision_weight = losses.collision_weight(fraction)
         if self.points is not None or collision_weight > 0:
@@ -199,7 +221,7 @@ class _Loss:
         last = model.config.frames - 1
         frames = sorted(rng.choice(np.arange(1, last), min(losses.frames, last - 1), replace=False).tolist())
         noisy, signal, noise_level, clean, base = (
-            torch.from_numpy(np.ascontiguousarray(a))
+            torch.from_numpy(np.ascontiguousarray(a)).to(output.device)
             for a in (batch.noisy, batch.signal, batch.noise_level, batch.clean, batch.base)
         )
         predicted = model.objective.clean(noisy, output, signal, noise_level)

@@ -8,11 +8,11 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -25,8 +25,9 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
 from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, settings_to_json
+from robotdiffuse.learning.processes import Processes
 
-FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder")
+FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder", "device")
 """Settings that may differ between the parts of one run."""
 LOG_EVERY = 50
 """Steps per row of log.csv."""
@@ -60,7 +61,11 @@ class TrainingRun:
     """Trains a module's parameters; picks up where an earlier run in the same folder stopped.
 
     After a resumption everything is as if it had not been interrupted: weights, their average, moments of the
-    optimiser and the random state come from the checkpoint.
+    optimiser and the random states come from the checkpoint.
+
+    Several processes, started by torchrun, are one run: each draws batches of its own, of the settings' size,
+    and takes the step of their mean gradient. The first one validates, shows progress and writes all files;
+    the others read the folder too. They stop, skip and roll back together.
     """
 
     def __init__(
@@ -74,9 +79,13 @@ class TrainingRun:
         gradient_norm: float,
         bad_steps: int,
         identity: dict[str, str],
+        processes: Processes,
     ) -> None:
-        """`identity`: what else must be the same when the run is resumed, e.g. the robot."""
-        self.module, self.settings, self.out = module, settings, FilePath(out)
+        """`identity`: what else must be the same when the run is resumed, e.g. the robot.
+
+        The module is on the device of `processes`.
+        """
+        self.module, self.settings, self.out, self.processes = module, settings, FilePath(out), processes
         self.parameters: dict[str, nn.Parameter] = {
             n: p for n, p in module.named_parameters() if p.requires_grad
         }
@@ -85,9 +94,11 @@ class TrainingRun:
         self.optimizer = torch.optim.AdamW(
             self.parameters.values(), lr=0.0, betas=(0.9, 0.99), weight_decay=weight_decay, fused=True
         )
-        self.rng = np.random.default_rng(settings.seed)
+        # the first process draws what a run of one process draws
+        seed = [settings.seed, processes.index] if processes.index else settings.seed
+        self.rng = np.random.default_rng(seed)
         self.at = Position()
-        self.identity = identity
+        self.identity = identity | ({} if processes.count == 1 else {"processes": str(processes.count)})
         self.rows: list[dict[str, float | int | str]] = []
         self._losses: list[float] = []
         self._bad = 0
@@ -108,28 +119,37 @@ class TrainingRun:
         loss: Callable[[np.random.Generator], Float[Tensor, ""]],
         validate: Callable[[], Validation],
         title: str,
+        after_checkpoint: Callable[[], None] | None = None,
     ) -> None:
-        """Train to the end. Ctrl-C stores a checkpoint first, then raises KeyboardInterrupt."""
+        """Train to the end. Ctrl-C stores a checkpoint first, then raises KeyboardInterrupt.
+
+        `after_checkpoint` is called after all checkpoints but the last.
+        """
         threads = torch.get_num_threads()
         torch.set_num_threads(self.settings.threads)
         try:
-            with _stop_requested() as stop, _progress() as progress:
+            with _stop_requested() as stop, _progress(shown=self.processes.first) as progress:
                 task = progress.add_task(title, total=1.0, rate="", loss="")
                 last = saved = time.monotonic()
-                while self.fraction < 1.0 and not stop.is_set():
+                stopped: float | bool = False
+                while self.fraction < 1.0 and not stopped:
                     self.step(loss)
                     now = time.monotonic()
-                    self.at.seconds += now - last
-                    rate, last = self.settings.batch / max(now - last, 1e-9), now
+                    due = now - saved > self.settings.checkpoint_seconds
+                    elapsed, stopped, due = self.processes.mean(now - last, stop.is_set(), due)
+                    self.at.seconds += elapsed
+                    rate, last = self._samples_per_step / max(elapsed, 1e-9), now
                     if self.at.step % LOG_EVERY == 0:
                         self._log(self.settings.learning_rate * self._lr(), None)
                         text = f"{self.rows[-1]['loss']:.4f}" if self.rows else ""
                         progress.update(task, completed=self.fraction, rate=f"{rate:,.0f}/s", loss=text)
-                    if now - saved > self.settings.checkpoint_seconds:
+                    if due:
                         self._checkpoint(validate, progress.console, title)
+                        if after_checkpoint is not None:
+                            after_checkpoint()
                         saved = time.monotonic()
                 self._checkpoint(validate, progress.console, title)
-                if stop.is_set():
+                if stopped:
                     raise KeyboardInterrupt
         finally:
             torch.set_num_threads(threads)
@@ -140,19 +160,24 @@ class TrainingRun:
         self.optimizer.zero_grad(set_to_none=True)
         value = loss(self.rng)
         value.backward()
+        mean = self.processes.average(self.parameters.values(), value.item())
         norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.gradient_norm)
         self.at.step += 1
-        self.at.samples += self.settings.batch
-        if not (math.isfinite(value.item()) and math.isfinite(norm.item())):
+        self.at.samples += self._samples_per_step
+        if not (math.isfinite(mean) and math.isfinite(norm.item())):
             self._skip()
             return
         self._bad = 0
         self.optimizer.step()
-        self._losses.append(value.item())
+        self._losses.append(mean)
         with torch.no_grad():
             decay = min(self.average_decay, self.at.step / (self.at.step + 10))
             for name, p in self.parameters.items():
                 self.average[name].lerp_(p, 1 - decay)
+
+    @property
+    def _samples_per_step(self) -> int:
+        return self.settings.batch * self.processes.count
 
     def _lr(self) -> float:
         warmup = min(1.0, (self.at.step + 1) / max(1, self.settings.warmup_steps))
@@ -205,10 +230,14 @@ class TrainingRun:
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
 
     def _checkpoint(self, validate: Callable[[], Validation], console: Console, title: str) -> None:
-        with self.averaged():
-            validation = validate()
+        validation = None
+        if self.processes.first:
+            with self.averaged():
+                validation = validate()
         self._log(self.settings.learning_rate * self._lr(), validation)
         self.save()
+        if validation is None:
+            return
         self._plot()
         planned = "" if validation.success is None else f"{validation.success:.1%} of samples free, "
         console.print(
@@ -219,7 +248,16 @@ class TrainingRun:
         )
 
     def save(self) -> None:
-        """Write training.safetensors and log.csv, each whole or not at all."""
+        """Write training.safetensors and log.csv, each whole or not at all.
+
+        When a process returns, the checkpoint is there: none ends the run before.
+        """
+        states = self.processes.gather(self.rng.bit_generator.state)
+        if self.processes.first:
+            self._write(states)
+        self.processes.gather(None)
+
+    def _write(self, random_states: Sequence[Mapping[str, Any]]) -> None:
         moments = self.optimizer.state
         tensors: dict[str, Tensor] = {f"module.{name}": t for name, t in self.module.state_dict().items()}
         tensors |= {f"average.{name}": t for name, t in self.average.items()}
@@ -230,7 +268,8 @@ class TrainingRun:
             "settings": settings_to_json(self.settings),
             "identity": self.identity,
             "at": asdict(self.at),
-            "random": self.rng.bit_generator.state,
+            "random": random_states[0],
+            "random_elsewhere": random_states[1:],
             "losses": self._losses,
             "rows": self.rows,
         }
@@ -262,18 +301,20 @@ class TrainingRun:
                 self._check_same(notes)
             state = {k.removeprefix("module."): t for k, t in tensors.items() if k.startswith("module.")}
             self.module.load_state_dict(state)
-            self.average = {name: tensors[f"average.{name}"] for name in self.parameters}
+            device = self.processes.device
+            self.average = {name: tensors[f"average.{name}"].to(device) for name in self.parameters}
             self.optimizer.state.clear()
             for name, p in self.parameters.items():
                 found = {
-                    key: tensors[f"optimizer.{key}.{name}"]
+                    key: tensors[f"optimizer.{key}.{name}"].to(device)
                     for key in ("step", "exp_avg", "exp_avg_sq")
                     if f"optimizer.{key}.{name}" in tensors
                 }
                 if found:
                     self.optimizer.state[p] = found
             self.at = Position(**notes["at"])
-            self.rng.bit_generator.state = notes["random"]
+            states = [notes["random"], *notes.get("random_elsewhere", [])]
+            self.rng.bit_generator.state = states[self.processes.index]
             self._losses, self.rows = list(notes["losses"]), list(notes["rows"])
         except (KeyError, TypeError, RuntimeError) as error:
             raise InputError(
@@ -282,7 +323,8 @@ class TrainingRun:
 
     def _check_same(self, notes: dict) -> None:
         now, before = json.loads(json.dumps(settings_to_json(self.settings))), notes["settings"]
-        now, before = now | self.identity, before | notes["identity"]
+        alone = {"processes": "1"}
+        now, before = now | alone | self.identity, before | alone | notes["identity"]
         for name, value in now.items():
             if name not in FREE_SETTINGS and before.get(name) != value:
                 raise InputError(
@@ -307,10 +349,11 @@ def _stop_requested() -> Iterator[threading.Event]:
 
 
 @contextmanager
-def _progress() -> Iterator[Progress]:
+def _progress(shown: bool) -> Iterator[Progress]:
     columns = (
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:.1f} %"),
         TextColumn("{task.fields[rate]}"), TextColumn("loss {task.fields[loss]}"), TimeRemainingColumn(),
     )  # fmt: skip
-    with Progress(*columns, console=Console(stderr=True, soft_wrap=True)) as progress:
+    console = Console(stderr=True, soft_wrap=True)
+    with Progress(*columns, console=console, disable=not shown) as progress:
         yield progress

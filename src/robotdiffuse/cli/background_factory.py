@@ -1,0 +1,134 @@
+"""The data factory beside a training: a process of its own that fills the folder meanwhile."""
+
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from robotdiffuse.errors import InputError
+
+if TYPE_CHECKING:
+    from robotdiffuse.generation import GenerationSettings
+
+PATIENCE = 20.0
+"""Until a factory that was told to end is killed [s]: it may be writing a shard."""
+POLL = 0.2
+"""Between two looks for the first shard [s]."""
+
+
+@contextmanager
+def filled_meanwhile(folder: str, workers: int, robot: str) -> Iterator[None]:
+    """Within, so many processes fill the folder with what its manifest says, a new one with the default data.
+
+    Begins when there is a shard; what is missing at the end is made by the next call. Of several processes of
+    torchrun the first starts the factory, the others wait for the shard. `robot`: of a new folder. Raises
+    InputError if the folder cannot be filled.
+    """
+    if int(os.environ.get("RANK", "0")) > 0:
+        while not _has_shard(folder):
+            time.sleep(POLL)
+        yield
+        return
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    factory = context.Process(target=_fill, args=(folder, workers, robot, theirs))
+    # Ctrl-C is for this process, which then ends the factory: it never hears it, see `_fill`
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        factory.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    theirs.close()
+    try:
+        _wait_for_shard(folder, ours)
+        yield
+    finally:
+        _end(factory)
+    error = _message(ours)
+    if error:
+        print(f"robotdiffuse: the data factory ended early: {error}", file=sys.stderr)
+
+
+def _has_shard(folder: str) -> bool:
+    from robotdiffuse.learning.shards import shard_indices
+
+    return bool(shard_indices(folder))
+
+
+def _wait_for_shard(folder: str, connection: Connection) -> None:
+    """Until the factory works, and there is a shard; its error, if it has one, is raised."""
+    begun = False
+    while not (begun and _has_shard(folder)):
+        if not connection.poll(POLL):
+            continue
+        error = _message(connection)
+        if error is None:
+            raise InputError(f"the data factory for {folder} was killed, or could not be started")
+        if error:
+            raise InputError(error)
+        begun = True
+        if not _has_shard(folder):
+            print(f"data: waiting for the first shard in {folder}", file=sys.stderr)
+
+
+def _message(connection: Connection) -> str | None:
+    """The next one, an error or "" for the beginning; None if there is none and the factory has ended."""
+    try:
+        return connection.recv()
+    except EOFError:
+        return None
+
+
+def _end(factory: multiprocessing.process.BaseProcess) -> None:
+    if factory.pid is not None and factory.is_alive():
+        os.kill(factory.pid, signal.SIGINT)
+        factory.join(PATIENCE)
+    if factory.is_alive():
+        factory.kill()
+    factory.join()
+
+
+def _fill(folder: str, workers: int, robot: str, connection: Connection) -> None:
+    """The factory's process: tells that it began, or its error; ends on SIGINT, and with its parent."""
+    os.setpgrp()  # the terminal's Ctrl-C does not reach it
+    begun = False
+
+    def tell(_done: int, _total: int) -> None:
+        nonlocal begun
+        if not begun:
+            begun = True
+            connection.send("")
+
+    try:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        from robotdiffuse.generation import generate
+        from robotdiffuse.generation.workers import prepare_worker
+
+        prepare_worker()
+        generate(_settings(folder, robot), Path(folder), workers, progress=tell)
+    except InputError as error:
+        connection.send(str(error))
+    except KeyboardInterrupt:
+        pass
+
+
+def _settings(folder: str, robot: str) -> "GenerationSettings":
+    from robotdiffuse.generation import GenerationSettings
+    from robotdiffuse.learning.shards import MANIFEST, read_manifest
+    from robotdiffuse.planners.shared_tree import SharedTreeSettings
+
+    if not (Path(folder) / MANIFEST).exists():
+        return GenerationSettings(robot=robot)
+    found = read_manifest(folder).settings
+    try:
+        return GenerationSettings(**found | {"search": SharedTreeSettings(**found["search"])})
+    except (KeyError, TypeError) as error:
+        raise InputError(
+            f"{folder}/{MANIFEST} has settings that are not of this version's data factory: {error}"
+        ) from None
