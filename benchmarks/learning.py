@@ -15,6 +15,7 @@ Methods, all with the same checks, and with the straight line where what they se
 
 - network: as RobotDiffuse plans, without its final search: one batch of 16 samples under guidance, refined if
   none is free, shortcuts. `as sampled`: without the shortcuts.
+- bumps, as refined: the control for the latter, one batch of the line and 15 random bumps, refined.
 - network, repeated: small batches of samples from few steps, refined, shortened, until time is over.
 - bumps, repeated: the control. The line and 3 random bumps, refined and shortened alike; fresh bumps again.
 - shared tree: the anytime planner of the data factory, of which a round is some RRT-Connect and RRT*.
@@ -139,6 +140,13 @@ def as_sampled(arena: Arena) -> Iterator[ndarray | None]:
     yield from found.q[found.free]
 
 
+def as_refined(arena: Arena) -> Iterator[ndarray | None]:
+    count, frames = arena.planner.settings.samples, arena.model.config.frames
+    q = unlearned_starts(arena.start, arena.goals[0], count, frames, PANDA, arena.rng)
+    found = arena.planner.refine(arena.checker, q)
+    yield from found.q[found.free]
+
+
 def network_repeated(arena: Arena) -> Iterator[ndarray | None]:
     checker, settings = arena.checker, arena.planner.settings
     draft = RobotDiffuse(replace(settings, weights=None, **DRAFT))
@@ -179,11 +187,15 @@ def shared_tree(arena: Arena) -> Iterator[ndarray | None]:
 METHODS: dict[str, Method] = {
     "network": network,
     "network, as sampled": as_sampled,
+    "bumps, as refined": as_refined,
     "network, repeated": network_repeated,
     "bumps, repeated": bumps_repeated,
     "shared tree": shared_tree,
 }
-PAIRS = [(a, b) for a in ("network", "network, repeated") for b in ("bumps, repeated", "shared tree")]
+PAIRS = [
+    *((a, b) for a in ("network", "network, repeated") for b in ("bumps, repeated", "shared tree")),
+    *(("network, as sampled", b) for b in ("bumps, as refined", "shared tree")),
+]
 
 
 class Found(NamedTuple):
@@ -195,10 +207,20 @@ class Found(NamedTuple):
     """The way of the origins of all links, the paper's length [m]."""
     bending: Float[ndarray, "n marks"]
     """Integral of |q''(u)|^2 du over u in [0, 1], over the squared length of the path."""
+    answered: Float[ndarray, "n marks"]
+    """1 where a path passes the judge for what the method sees, else 0."""
 
 
-def answers(task: Task, arena: Arena, method: Method) -> list[ndarray | None]:
-    """The path that a method has at each mark; None if none, or if it is not free in the whole scene."""
+class Answer(NamedTuple):
+    """The path that a method has at a mark; None if it has none."""
+
+    path: ndarray | None
+    free: bool
+    """Whether it is free in the whole scene."""
+
+
+def answers(task: Task, arena: Arena, method: Method) -> list[Answer]:
+    """At each mark."""
     paths: list[tuple[float, ndarray]] = []
     began = time.process_time()
     for path in method(arena):
@@ -212,7 +234,7 @@ def answers(task: Task, arena: Arena, method: Method) -> list[ndarray | None]:
     for mark in MARKS:
         there = sorted((path for spent, path in paths if spent <= mark), key=kernel.path_length)
         answer = next((path for path in there if judge.passes(path)), None)
-        at_marks.append(answer if answer is not None and whole.passes(answer) else None)
+        at_marks.append(Answer(answer, answer is not None and whole.passes(answer)))
     return at_marks
 
 
@@ -233,7 +255,10 @@ class Judge:
 
 def compare(tasks: list[Task], planner: RobotDiffuse, title: str) -> dict[str, Found]:
     links = LinkPathLength(PANDA)
-    found = {name: Found(*(np.full((len(tasks), len(MARKS)), np.nan) for _ in range(3))) for name in METHODS}
+    shape = len(tasks), len(MARKS)
+    found = {
+        name: Found(*(np.full(shape, np.nan) for _ in range(3)), answered=np.zeros(shape)) for name in METHODS
+    }
     for i, task in enumerate(progress(tasks, title)):
         for name, method in METHODS.items():
             arena = Arena(task.seen, planner, i)
@@ -241,8 +266,9 @@ def compare(tasks: list[Task], planner: RobotDiffuse, title: str) -> dict[str, F
                 continue
             line = arena.line()
             tried = method if line is None else lambda _arena, line=line: iter([line])
-            for m, path in enumerate(answers(task, arena, tried)):
-                if path is not None:
+            for m, (path, free) in enumerate(answers(task, arena, tried)):
+                found[name].answered[i, m] = path is not None
+                if path is not None and free:
                     even = resample(path.astype(np.float64), FRAMES)
                     length = float(kernel.path_length(path))
                     found[name].length[i, m] = length
@@ -260,7 +286,8 @@ def print_found(title: str, found: dict[str, Found]) -> None:
     for name, figures in found.items():
         for m, mark in enumerate(MARKS):
             solved = np.isfinite(figures.length[:, m])
-            row = [name, f"{1e3 * mark:.0f}", f"{100 * solved.mean():.1f} %"]
+            shares = (figures.answered[:, m], solved)
+            row = [name, f"{1e3 * mark:.0f}", *(f"{100 * share.mean():.1f} %" for share in shares)]
             if solved.any():
                 ratio = figures.length[solved, m] / shortest[solved]
                 row += [f"{ratio.mean():.3f}", f"{np.percentile(ratio, 95):.3f}"]
@@ -268,8 +295,8 @@ def print_found(title: str, found: dict[str, Found]) -> None:
                     f"{figures.links[solved, m].mean():.2f}",
                     f"{np.median(figures.bending[solved, m]):.0f}",
                 ]
-            rows.append(row + [""] * (7 - len(row)))
-    columns = ["", "CPU ms", "solved", "length*", "95th percentile", "link path, m", "bending**"]
+            rows.append(row + [""] * (8 - len(row)))
+    columns = ["", "CPU ms", "has a plan", "solved", "length*", "95th", "link path, m", "bending**"]
     print_table(title, columns, rows)
 
 
@@ -400,6 +427,7 @@ def main() -> None:
         print_found(f"\n== {name}, {len(tasks)} problems", found)
         words += print_pairs(name, found)
     print(
+        "has a plan: it passes the judge for what the method sees; solved: it is free in the whole scene\n"
         "*  joint-space length over the shortest that any method found, mean and 95th percentile over the\n"
         "   problems that the method solved by then\n"
         f"** integral of |q''(u)|^2 du over u in [0, 1], over the squared length, of the path at {FRAMES}\n"
