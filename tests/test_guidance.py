@@ -117,7 +117,7 @@ def test_point_clouds_guide_too() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("margin", -0.1), ("self_margin", -1.0), ("push", 0.0), ("width", 0.0), ("relax", 1.5)],
+    [("margin", -0.1), ("self_margin", -1.0), ("push", 0.0), ("width", 0.0), ("length", 1.5)],
 )
 def test_bad_settings_are_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"guidance.{name} is {value}"):

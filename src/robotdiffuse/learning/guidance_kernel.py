@@ -1,10 +1,14 @@
-"""Compiled gradient steps that move whole trajectories out of collision."""
+"""Compiled descent of whole trajectories down their costs; `guidance` has the costs' formulas and sources."""
+
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from numba import njit
+from numpy import ndarray
 
 from robotdiffuse.collision.compiled import allocation_free
-from robotdiffuse.collision.distance import cost_gradient_at
+from robotdiffuse.collision.distance import CAP, cost_gradient_at
 from robotdiffuse.collision.lane_clearance import (
     clearances_into,
     count_obstacles,
@@ -14,67 +18,127 @@ from robotdiffuse.collision.lane_clearance import (
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
+OFF = -CAP
+"""A margin that nothing is ever within: the cost does not act."""
+
+
+class Steps(NamedTuple):
+    """What one round of steps does: `GuidanceSettings` as compiled code takes them."""
+
+    margin: np.float32
+    """[m] here and below, or OFF."""
+    self_margin: np.float32
+    limit_margin: np.float32
+    """[rad], or OFF."""
+    push: np.float32
+    kernel: Float[ndarray, "frames frames"]
+    """Weights by which pushes spread over neighbouring frames."""
+    smoothness: np.float32
+    length: np.float32
 
 
 @njit(cache=True, nogil=True)
-def descend(robot, scene, q, lower, upper, kernel, margin, self_margin, push, relax, steps):
-    """Moves trajectories q[count, frames, dof] down their collision cost, in place; the ends stay.
+def descend(robot, scene, q, lower, upper, steps, prefix, suffix, count):
+    """Moves trajectories q[batch, frames, dof] by `count` rounds, in place; the first `prefix` and the last
+    `suffix` frames, at least one each, stay. Returns the margins' costs [batch] that the last round met.
 
-    Each frame in cost is pushed by a Gauss-Newton step -g 2c / (g.g), at most `push` [rad]: for one contact
-    just what clears it, whatever the scale. `kernel` [frames, frames] spreads the pushes over neighbouring
-    frames, as the metric of CHOMP does (M. Zucker et al., IJRR 2013): a weighted mean, falling off where no
-    frame is pushed. Then every inner frame moves by the share `relax` towards the middle of its neighbours.
-    A trajectory without cost is left as it is. Returns the costs [count] met in the last step.
+    Each frame within a margin is pushed out of it, the pushes are spread over its neighbours, then the steps
+    of smoothness and length follow. A trajectory of which no frame is within a margin is left as it is,
+    unless no margin is on.
     """
-    count, n, dof = q.shape
+    batch, n, dof = q.shape
+    first, last = prefix, n - suffix
     frames = np.empty((dof + 1, 12), np.float32)
     pushes, active = np.empty((n, dof), np.float32), np.empty(n, np.float32)
     gradient = np.empty(dof, np.float32)
-    costs = np.zeros(count, np.float32)
+    costs = np.zeros(batch, np.float32)
     work = make_clearance_workspace(robot, count_obstacles(scene))
-    links = np.empty((n, len(robot.frame) - np.searchsorted(robot.frame, 1)), np.float32)
-    pairs = np.empty((n, len(robot.pairs)), np.float32)
-    for b in range(count):
-        for _ in range(steps):
+    links = np.full((n, len(robot.frame) - np.searchsorted(robot.frame, 1)), CAP)
+    pairs = np.full((n, len(robot.pairs)), CAP)
+    pushed = max(steps.margin, steps.self_margin, steps.limit_margin) > OFF
+    for b in range(batch):
+        for _ in range(count):
             total = _ZERO
-            clearances_into(robot, scene, q[b], margin, work, links)
-            pair_clearances_into(robot, q[b], self_margin, work, pairs)
-            for i in range(1, n - 1):
+            if steps.margin > OFF:
+                clearances_into(robot, scene, q[b], steps.margin, work, links)
+            if steps.self_margin > OFF:
+                pair_clearances_into(robot, q[b], steps.self_margin, work, pairs)
+            for i in range(first, last):
                 gradient[:] = _ZERO
                 cost = cost_gradient_at(
-                    robot, scene, q[b, i], links[i], pairs[i], margin, self_margin, frames, gradient
+                    robot,
+                    scene,
+                    q[b, i],
+                    links[i],
+                    pairs[i],
+                    steps.margin,
+                    steps.self_margin,
+                    frames,
+                    gradient,
                 )
                 total += cost
-                active[i] = _ZERO
-                square = _ZERO
-                for j in range(dof):
-                    square += gradient[j] * gradient[j]
-                if cost <= _ZERO or square <= np.float32(1e-12):
-                    continue
-                active[i] = _ONE
-                scale = np.float32(2.0) * cost / square
-                scale = min(scale, push / np.sqrt(square))
-                for j in range(dof):
-                    pushes[i, j] = -scale * gradient[j]
+                active[i] = _push_away(cost, gradient, steps.push, pushes[i])
+                if steps.limit_margin > OFF:
+                    cost = _push_inside(q[b, i], lower, upper, steps.limit_margin, steps.push, pushes[i])
+                    total += cost
+                    if cost > _ZERO:
+                        active[i] = _ONE
             costs[b] = total
-            if total <= _ZERO:
+            if pushed and total <= _ZERO:
                 break
-            _spread(q[b], pushes, active, kernel, lower, upper)
-            _relax(q[b], relax)
+            _spread(q[b], first, last, pushes, active, steps.kernel, lower, upper)
+            if steps.smoothness > _ZERO:
+                _smooth(q[b], first, last, steps.smoothness, lower, upper)
+            _shorten(q[b], first, last, steps.length)
     return costs
 
 
+@njit(cache=True)
+def _push_away(cost, gradient, push, pushed):
+    """The Gauss-Newton step -g 2c / (g.g) of the collision costs, at most `push` [rad], into pushed[dof].
+
+    For one contact it is just what clears it, whatever the scale. Returns 1 if there is one, else 0.
+    """
+    pushed[:] = _ZERO
+    square = _ZERO
+    for j in range(len(gradient)):
+        square += gradient[j] * gradient[j]
+    if cost <= _ZERO or square <= np.float32(1e-12):
+        return _ZERO
+    scale = np.float32(2.0) * cost / square
+    scale = min(scale, push / np.sqrt(square))
+    for j in range(len(gradient)):
+        pushed[j] = -scale * gradient[j]
+    return _ONE
+
+
+@njit(cache=True)
+def _push_inside(q, lower, upper, margin, push, pushed):
+    """Adds to pushed[dof] the Newton step of the limits' cost, each at most `push` [rad]. Returns the cost.
+
+    Where a joint's range is narrower than two margins, its middle is far enough from both limits.
+    """
+    cost = _ZERO
+    for j in range(len(q)):
+        near = min(margin, np.float32(0.5) * (upper[j] - lower[j]))
+        step = max(lower[j] + near - q[j], _ZERO) - max(q[j] - upper[j] + near, _ZERO)
+        cost += np.float32(0.5) * step * step
+        pushed[j] += min(max(step, -push), push)
+    return cost
+
+
 @allocation_free(fastmath=True)
-def _spread(q, pushes, active, kernel, lower, upper):
-    n, dof = q.shape
-    for i in range(1, n - 1):
+def _spread(q, first, last, pushes, active, kernel, lower, upper):
+    """Each frame takes a weighted mean of the pushes of its neighbours, falling off where none is pushed."""
+    dof = q.shape[1]
+    for i in range(first, last):
         weight = _ZERO
-        for k in range(1, n - 1):
+        for k in range(first, last):
             weight += kernel[i, k] * active[k]
         if weight <= np.float32(1e-4):
             continue
         weight = _ONE / max(weight, _ONE)
-        for k in range(1, n - 1):
+        for k in range(first, last):
             if active[k] > _ZERO and kernel[i, k] > np.float32(1e-3):
                 share = weight * kernel[i, k]
                 for j in range(dof):
@@ -84,9 +148,31 @@ def _spread(q, pushes, active, kernel, lower, upper):
 
 
 @allocation_free(fastmath=True)
-def _relax(q, share):
+def _smooth(q, first, last, share, lower, upper):
+    """Each frame by a share of the way to where the accelerations that it is part of are smallest: Newton's
+    step in that frame alone. Every third frame at a time, for these do not meet."""
     n, dof = q.shape
+    for offset in range(3):
+        for i in range(first + offset, last, 3):
+            for j in range(dof):
+                gradient = np.float32(-2.0) * (q[i - 1, j] - np.float32(2.0) * q[i, j] + q[i + 1, j])
+                curvature = np.float32(4.0)
+                if i >= 2:
+                    gradient += q[i - 2, j] - np.float32(2.0) * q[i - 1, j] + q[i, j]
+                    curvature += _ONE
+                if i + 2 < n:
+                    gradient += q[i, j] - np.float32(2.0) * q[i + 1, j] + q[i + 2, j]
+                    curvature += _ONE
+                # the middle of two neighbours is within the limits, but this may not be
+                q[i, j] = min(max(q[i, j] - share * gradient / curvature, lower[j]), upper[j])
+
+
+@allocation_free(fastmath=True)
+def _shorten(q, first, last, share):
+    """Each frame by a share of the way to the middle of its neighbours, where the two steps that it is part
+    of are shortest: Newton's step in that frame alone. Every second frame at a time."""
+    dof = q.shape[1]
     for parity in range(2):
-        for i in range(1 + parity, n - 1, 2):
+        for i in range(first + parity, last, 2):
             for j in range(dof):
                 q[i, j] += share * (np.float32(0.5) * (q[i - 1, j] + q[i + 1, j]) - q[i, j])

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import ceil
 
 import numpy as np
 import torch
@@ -221,45 +222,97 @@ class MotionModel(TrajectoryRows):
         guide: GuideFn | None = None,
         eta: float = 0.0,
         guidance_scale: float = 1.0,
+        sampler: str | None = None,
+        guided_share: float = 0.5,
+        prefix: Float[ndarray, "k dof"] | None = None,
+        suffix: Float[ndarray, "m dof"] | None = None,
     ) -> Float[ndarray, "count frames dof"]:
         """Trajectories from start to goal [rad] (float64, the ends exact), of a model from `load_model`.
 
         code: z of the scene, from `encode`.
         clearances: see ClearanceFn.
         steps: calls of the denoiser.
-        guide: improves the predicted clean trajectories in the second half of the steps, the last included
-            (paper, section Motion Guided Generation); it need not keep the ends.
+        guide: improves the predicted clean trajectories in some of the steps (paper, section Motion Guided
+            Generation). It need not keep the ends, but should keep more known frames, and move away from
+            them smoothly.
         eta: share of fresh noise per step, see `ddim`.
         guidance_scale: of classifier-free guidance, see `denoise_guided`; only 1 for a model that was trained
             without dropping its condition.
+        sampler: name in SAMPLERS; None: the one that the checkpoint names.
+        guided_share: share of the steps that are guided, the last ones: 0 none, 1 all.
+        prefix: known first frames [rad], from the start on; None: the start alone.
+        suffix: known last frames [rad], up to the goal; None: the goal alone.
+
+        Known frames are in the result as they are. Like the ends, they are written over the noisy and the
+        predicted trajectories, and what is unknown moves along by `regression`, so that with smooth noise the
+        result goes on from them in a step like its others: with the Panda's weights and 8 known frames at
+        most 1.9 times as long as the last known one or the median of the others (10.9 times where they are
+        written over, no more). With white noise, the paper's, nothing is promised. Training knew the ends
+        alone, so known frames should be such as the model would have sampled: of a path like its own, about
+        as far apart. An arm that plans anew while it moves follows what it is committed to, and goes on:
+
+            prefix = moving[i : i + 6]
+            q = model.sample(
+                code, prefix[0], goal, 16, rng, clearances, prefix=prefix,
+                guide=lambda q, level: guidance(q, 4, prefix=6)[0],
+            )
         """
         if guidance_scale != 1.0 and not self.config.null_condition:
             raise InputError(
                 f"guidance_scale is {guidance_scale}; it must be 1, for this model was trained with "
                 "condition_drop 0 and knows no motions without a condition"
             )
-        between = self.between(start[None], goal[None])
+        sampler = self.config.sampler if sampler is None else sampler
+        if sampler not in SAMPLERS:
+            raise unknown_name("sampler", sampler, SAMPLERS)
+        if not 0 <= guided_share <= 1:
+            raise InputError(f"guided_share is {guided_share}; it must be between 0 and 1")
+        prefix, suffix = known_frames("prefix", prefix, start, 0), known_frames("suffix", suffix, goal, -1)
+        between = self.around(prefix, suffix)
+        regression = self.regression(between)
         condition = torch.from_numpy(self.condition(code, start, goal)).expand(count, -1)
         levels = self.config.schedule.steps
         signal, noise = (a.astype(np.float32) for a in (self.schedule.signal, self.schedule.noise))
-        guided: Int[ndarray, "n"] = self.schedule.sampling_levels(steps)[steps // 2 : -1]
+        unguided = steps - ceil(guided_share * steps - 1e-9)
+        guided: Int[ndarray, "n"] = self.schedule.sampling_levels(steps)[unguided:-1]
+
+        def follow(x: ndarray) -> ndarray:
+            if regression is not None:
+                x += regression @ (self.hold(x.copy(), between) - x)
+            return self.hold(x, between)
+
+        def draw_noise() -> ndarray:
+            noise = self.draw_noise(count, rng)
+            return noise if regression is None else noise - regression @ noise
 
         def predict(x: ndarray, level: int) -> ndarray:
-            inputs = torch.from_numpy(self.features(self.hold(x.copy(), between), between, clearances))
+            inputs = torch.from_numpy(self.features(follow(x.copy()), between, clearances))
             at = torch.full((count,), level / levels)
             output = self.denoise_guided(inputs, at, condition, guidance_scale).numpy()
-            clean = self.hold(self.objective.clean(x, output, signal[level], noise[level]), between)
+            clean = follow(self.objective.clean(x, output, signal[level], noise[level]))
             if guide is not None and level in guided:
                 clean = self.to_rows(guide(self.joints(clean, between), level / levels), between)
             return clean
 
         with torch.inference_mode(), one_thread():
-            sampler = SAMPLERS[self.config.sampler]
-            x = sampler(predict, self.schedule, lambda: self.draw_noise(count, rng), steps, eta)
+            x = SAMPLERS[sampler](predict, self.schedule, draw_noise, steps, eta)
         q = self.joints(x, between).astype(np.float64)
         np.clip(q, self.config.lower, self.config.upper, out=q)
-        q[:, 0], q[:, -1] = start, goal
+        q[:, : len(prefix)], q[:, len(q[0]) - len(suffix) :] = prefix, suffix
         return q
+
+
+def known_frames(
+    name: str, frames: Float[ndarray, "k dof"] | None, end: Float[ndarray, "dof"], at: int
+) -> Float[ndarray, "k dof"]:
+    """Known frames, or the end alone for None. Raises InputError unless frame `at` of them is the end."""
+    if frames is None:
+        return end[None]
+    if not len(frames) or not np.array_equal(frames[at], end):
+        raise InputError(
+            f"{name} must have the {'start' if at == 0 else 'goal'} as frame {at}, {end.tolist()}"
+        )
+    return frames
 
 
 @contextmanager

@@ -3,7 +3,8 @@
 A trajectory is rows x of a parametrization (frames or spline control points), in units of the training data's
 standard deviation, relative to a base: the straight line from start to goal (target `residual`), or the mean
 of the data (target `absolute`, the paper's). The first and the last row are start and goal and are held: the
-paper's noise interpolation, which writes them over the ends at every step.
+paper's noise interpolation, which writes them over the ends at every step. More frames at either end may be
+held, its prefix and suffix frames.
 """
 
 from typing import NamedTuple
@@ -14,7 +15,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor, nn
 
-from robotdiffuse.errors import unknown_name
+from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.learning.diffusion import noise_factor
 from robotdiffuse.learning.normalizer import JointNormalizer
 from robotdiffuse.learning.parametrization import Parametrization
@@ -27,8 +28,10 @@ class Between(NamedTuple):
 
     base: Float[ndarray, "*batch rows dof"]
     """Normalised joint values that x, times its scale, is added to."""
-    ends: Float[ndarray, "*batch 2 dof"]
-    """The first and the last row of x."""
+    prefix: Float[ndarray, "*batch k dof"]
+    """The first rows of x, which are held: one, the start, unless more is known."""
+    suffix: Float[ndarray, "*batch m dof"]
+    """The last rows of x."""
 
 
 class TrajectoryRows(nn.Module):
@@ -72,10 +75,35 @@ class TrajectoryRows(nn.Module):
         a, b = (self.normalizer.to_unit(np.asarray(q, np.float32))[..., None, :] for q in (start, goal))
         if self.target == "residual":
             base = self.parametrization.to_rows(a + (b - a) * self._share)
-            return Between(base, np.zeros((*base.shape[:-2], 2, self.dof), np.float32))
+            zero = np.zeros((*base.shape[:-2], 1, self.dof), np.float32)
+            return Between(base, zero, zero)
         mean = self.residual_mean.numpy()
         base = np.broadcast_to(mean, (*a.shape[:-2], self.rows, self.dof))
-        return Between(base, (np.concatenate([a, b], axis=-2) - mean) / self._scale)
+        return Between(base, (a - mean) / self._scale, (b - mean) / self._scale)
+
+    def around(self, prefix: Float[ndarray, "k dof"], suffix: Float[ndarray, "m dof"]) -> Between:
+        """Base and held rows, a batch of one, of trajectories whose first and last frames are known [rad].
+
+        Raises InputError where more than start and goal are known but rows are not frames, or none is left.
+        """
+        k, m = len(prefix), len(suffix)
+        if k + m > 2 and not self.parametrization.themselves:
+            raise InputError(
+                f"prefix and suffix have {k} and {m} frames; control points can hold 1 and 1 only"
+            )
+        if k + m >= self.rows:
+            raise InputError(
+                f"prefix and suffix have {k} and {m} frames; they must leave some of {self.rows} unknown"
+            )
+        ends = self.between(prefix[None, 0], suffix[None, -1])
+        first, last = (self.normalizer.to_unit(q[None].astype(np.float32)) for q in (prefix[1:], suffix[:-1]))
+        first = (first - ends.base[:, 1:k]) / self._scale
+        last = (last - ends.base[:, self.rows - m : -1]) / self._scale
+        return Between(
+            ends.base,
+            np.concatenate([ends.prefix, first], axis=1),
+            np.concatenate([last, ends.suffix], axis=1),
+        )
 
     def to_rows(
         self, q: Float[ndarray, "*batch frames dof"], between: Between
@@ -99,10 +127,25 @@ class TrajectoryRows(nn.Module):
     def hold(
         self, x: Float[ndarray, "*batch rows dof"], between: Between
     ) -> Float[ndarray, "*batch rows dof"]:
-        """Write start and goal over the ends (noise interpolation), in place."""
-        x[..., 0, :] = between.ends[..., 0, :]
-        x[..., -1, :] = between.ends[..., 1, :]
+        """Write the known rows, start and goal, over the ends (noise interpolation), in place."""
+        x[..., : between.prefix.shape[-2], :] = between.prefix
+        x[..., self.rows - between.suffix.shape[-2] :, :] = between.suffix
         return x
+
+    def regression(self, between: Between) -> Float[ndarray, "rows rows"] | None:
+        """G by which known rows move the expectation of all: x + G (known - x); None for the ends alone.
+
+        It is cov(x, known) cov(known)^-1 for the covariance of the noise. Where that is smooth, the data's,
+        x changes as trajectories do that pass through the known rows; white noise moves no other row.
+        """
+        known = np.r_[1 : between.prefix.shape[-2], self.rows - between.suffix.shape[-2] : self.rows - 1]
+        if not len(known):
+            return None
+        factor = self.noise_factor.numpy().astype(np.float64)
+        covariance = factor @ factor.T
+        matrix = np.zeros((self.rows, self.rows))
+        matrix[:, known] = np.linalg.solve(covariance[np.ix_(known, known)], covariance[known]).T
+        return matrix.astype(np.float32)
 
     def draw_noise(self, count: int, rng: np.random.Generator) -> Float[ndarray, "count rows dof"]:
         """Standard noise of the forward process; zero at both ends."""

@@ -14,10 +14,11 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.learning.checkpoint import BUNDLED, load_model
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.validation import link_clearances
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.base import Call, usable_goals
@@ -37,7 +38,14 @@ class RobotDiffuseSettings:
     sampling_steps: int = 6
     """Calls of the denoiser per batch."""
     guidance_steps: int = 4
-    """Gradient steps at each guided denoising step, the later half of them."""
+    """Gradient steps at each guided denoising step."""
+    guided_share: float = 0.5
+    """Share of the denoising steps that are guided, the last ones: 0 none, 1 all."""
+    guidance_scale: float = 1.0
+    """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further.
+    Other than 1 needs weights that were trained with a condition_drop above 0."""
+    sampler: str | None = None
+    """Name in `learning.samplers.SAMPLERS`; None: the one that the weights name."""
     eta: float = 0.0
     """Fresh noise per denoising step: 0 is DDIM, 1 is ancestral sampling."""
     points: int = 320
@@ -57,6 +65,10 @@ class RobotDiffuseSettings:
         for name in ("samples", "sampling_steps", "points", "shortened"):
             if getattr(self, name) < 1:
                 raise InputError(f"robotdiffuse.{name} is {getattr(self, name)}; it must be at least 1")
+        if self.sampler is not None and self.sampler not in SAMPLERS:
+            raise unknown_name("robotdiffuse.sampler", self.sampler, SAMPLERS)
+        if not 0 <= self.guided_share <= 1:
+            raise InputError(f"robotdiffuse.guided_share is {self.guided_share}; it must be between 0 and 1")
         if not self.resolution > 0:
             raise InputError(f"robotdiffuse.resolution is {self.resolution}; it must be positive")
 
@@ -178,6 +190,9 @@ class RobotDiffuse:
                 settings.sampling_steps,
                 guide if settings.guidance_steps else None,
                 settings.eta,
+                settings.guidance_scale,
+                settings.sampler,
+                settings.guided_share,
             )
             for i, count in zip(order, counts, strict=True)
         ]
