@@ -269,7 +269,7 @@ class Batches:
         trivial_share: float,
         weight_limit: float,
     ) -> None:
-        """clearances: (kinds [n, k], params [n, k, 10], q [n, rows, dof]) to [n, rows, links] [m]."""
+        """clearances: (kinds [n, k], params [n, k, 10], q [n, rows, dof]) to what ClearanceFn gives."""
         self.data, self.model, self.clearances = data, model, clearances
         self.weight_limit = weight_limit
         self.trivial, self.hard = np.flatnonzero(data.trivial), np.flatnonzero(~data.trivial)
