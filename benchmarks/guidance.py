@@ -1,11 +1,12 @@
 """Guidance: success of the network alone against sampling steps, gradient steps and classifier-free scale.
 
-    python benchmarks/guidance.py [--problems 100] [--family rop] [--cases FOLDER] [--weights FOLDER]
+    python benchmarks/guidance.py [--problems 60] [--family rop] [--cases FOLDER] [--weights FOLDER]
 
 Prints the report that is kept in benchmarks/results/guidance.txt and draws guidance.png beside it, or where
 --plot says. Held-out problems that the straight line does not solve and ten seconds of search do; 16 samples
-of each, straight from the sampler, judged as they are. Half as many problems for 50 sampling steps, a fifth
-for 200, which take as long as they take.
+of each, straight from the sampler, judged as they are. Every setting of a table gets the same problems; the
+classifier-free scales get half of them, and 50 and 200 sampling steps, which take long, are tried with no and
+with the usual gradient steps only.
 """
 
 import argparse
@@ -24,15 +25,17 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode
 from robotdiffuse.scenes.families import FAMILIES
 
-STEPS = {1: 1.0, 2: 1.0, 5: 1.0, 10: 1.0, 50: 0.5, 200: 0.2}
-"""Sampling steps, and the share of the problems that they are tried on."""
+STEPS = (1, 2, 5, 10, 50, 200)
+"""Sampling steps."""
+LONG = 50
+"""From so many on, not every number of gradient steps is tried."""
 GRADIENT_STEPS = (0, 2, 4, 8)
 """At each guided sampling step; 0 is without collision guidance."""
 SCALES = (0.0, 1.0, 1.5, 2.0, 4.0)
 """Of classifier-free guidance: 0 knows no condition, 1 is the network itself."""
 SCALED_STEPS = (1, 2, 5, 10)
-"""Sampling steps that the scales are tried with, on half of the problems."""
-COLORS = ("#8a94a3", "#9ec5e8", "#4f8fd0", "#14487f", "#d1495b")
+"""Sampling steps that the scales are tried with."""
+COLORS = ("#8a94a3", "#7fb3e0", "#3f7fc4", "#14487f", "#d1495b")
 
 
 class Share(NamedTuple):
@@ -76,19 +79,17 @@ def success(settings: RobotDiffuseSettings, loaded: RobotDiffuse, cases: list[Ca
     return Share(float(np.mean(single)), half, *wilson(best), len(cases), float(np.median(seconds)))
 
 
-def first(cases: list[Case], share: float) -> list[Case]:
-    return cases[: max(round(share * len(cases)), 1)]
-
-
 def collision_guidance(loaded: RobotDiffuse, cases: list[Case]) -> dict[int, dict[int, Share]]:
     """By gradient steps and sampling steps."""
     found: dict[int, dict[int, Share]] = {}
     for gradient in GRADIENT_STEPS:
         found[gradient] = {}
-        for steps, share in STEPS.items():
+        for steps in STEPS:
+            if steps >= LONG and gradient not in (0, loaded.settings.guidance_steps):
+                continue
             settings = replace(loaded.settings, guidance_steps=gradient, sampling_steps=steps)
             title = f"{gradient} gradient steps, {steps} sampling steps"
-            found[gradient][steps] = success(settings, loaded, first(cases, share), title)
+            found[gradient][steps] = success(settings, loaded, cases, title)
     rows = [
         [f"{gradient}" if gradient else "none", f"{steps}", *share.row]
         for gradient, by_steps in found.items()
@@ -111,7 +112,7 @@ def classifier_free(loaded: RobotDiffuse, cases: list[Case]) -> dict[int, dict[f
                     loaded.settings, guidance_steps=gradient, sampling_steps=steps, guidance_scale=scale
                 )
                 title = f"scale {scale}, {gradient} gradient steps, {steps} sampling steps"
-                by_scale[scale][steps] = success(settings, loaded, first(cases, 0.5), title)
+                by_scale[scale][steps] = success(settings, loaded, cases, title)
     rows = [
         [f"{scale:g}", f"{gradient}" if gradient else "none", f"{steps}", *share.row]
         for gradient, by_scale in found.items()
@@ -123,18 +124,18 @@ def classifier_free(loaded: RobotDiffuse, cases: list[Case]) -> dict[int, dict[f
     return found
 
 
-def line(axes: Axes, by_steps: dict[int, Share], what: str, color: str, label: str) -> None:
-    """Success over sampling steps with its interval."""
+def line(axes: Axes, by_steps: dict[int, Share], what: str, place: int, label: str) -> None:
+    """Success over sampling steps with its interval; lines stand a little apart."""
     shares = list(by_steps.values())
-    at = np.array(list(by_steps))
+    at = np.array(list(by_steps)) * 1.035 ** (place - 2)
     middle = np.array([getattr(share, what) for share in shares])
     if what == "single":
         half = np.array([share.half for share in shares])
-        low, high = middle - half, middle + half
+        low, high = (middle - half).clip(0, 1), (middle + half).clip(0, 1)
     else:
         low, high = (np.array([getattr(share, f"best_{end}") for share in shares]) for end in ("low", "high"))
-    axes.fill_between(at, 100 * low, 100 * high, color=color, alpha=0.12, lw=0)
-    axes.plot(at, 100 * middle, "o-", color=color, label=label, ms=4)
+    error = 100 * np.stack([middle - low, high - middle]).clip(0)
+    axes.errorbar(at, 100 * middle, error, fmt="o-", color=COLORS[place], label=label, ms=4, elinewidth=0.8)
 
 
 def draw(
@@ -144,16 +145,16 @@ def draw(
     file: Path,
 ) -> None:
     rows = 2 if free else 1
-    figure = Figure(figsize=(10, 4 * rows), layout="constrained")
+    figure = Figure(figsize=(11, 4 * rows), layout="constrained")
     panels = figure.subplots(rows, 2, sharey=True, squeeze=False)
     for axes, what, name in zip(panels[0], ("single", "best"), ("single sample", "best of 16"), strict=True):
-        for (gradient, by_steps), color in zip(collision.items(), COLORS, strict=False):
+        for place, (gradient, by_steps) in enumerate(collision.items()):
             label = f"{gradient} gradient steps" if gradient else "no collision guidance"
-            line(axes, by_steps, what, color, label)
+            line(axes, by_steps, what, place, label)
         axes.set_title(f"{name}, {title}")
     for axes, (gradient, by_scale) in zip(panels[-1], free.items() if free else (), strict=False):
-        for (scale, by_steps), color in zip(by_scale.items(), COLORS, strict=True):
-            line(axes, by_steps, "single", color, f"scale {scale:g}")
+        for place, (scale, by_steps) in enumerate(by_scale.items()):
+            line(axes, by_steps, "single", place, f"scale {scale:g}")
         guided = f"{gradient} gradient steps" if gradient else "no collision guidance"
         axes.set_title(f"single sample by classifier-free scale, {guided}")
     for axes in panels.flat:
@@ -171,7 +172,7 @@ def draw(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Success of the network against steps and guidance.")
-    parser.add_argument("--problems", type=int, default=100, help="non-trivial ones (100)")
+    parser.add_argument("--problems", type=int, default=60, help="non-trivial ones (60)")
     parser.add_argument("--family", default="rop", choices=list(FAMILIES), help="of scenes (rop)")
     parser.add_argument("--cases", type=Path, help="folder that keeps what is known of the problems")
     parser.add_argument("--weights", help="folder of a trained model; default: the bundled one")
@@ -188,7 +189,7 @@ def main() -> None:
     collision = collision_guidance(loaded, cases)
     free = {}
     if model.config.null_condition:
-        free = classifier_free(loaded, cases)
+        free = classifier_free(loaded, cases[: max(len(cases) // 2, 1)])
     else:
         print("Classifier-free guidance: left out, these weights were trained without dropping the condition")
     print("95 % intervals over the problems; CPU time of a batch of 16, without encoder and judge, median")
