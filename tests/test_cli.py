@@ -1,21 +1,32 @@
 """The command line, run as a user would: exit status, one line for bad input, files that come out."""
 
 import json
+import multiprocessing
 import runpy
 import subprocess
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from robotdiffuse.cli import main
+from robotdiffuse.cli.background_factory import filled_meanwhile
+from robotdiffuse.generation import GenerationSettings
+from robotdiffuse.generation.factory import manifest_of
+from robotdiffuse.learning.config import PlannerTraining
+from robotdiffuse.learning.configs import CONFIGS
+from robotdiffuse.learning.denoisers import PAPER_SIZE
+from robotdiffuse.learning.shards import check_shard, read_manifest, shard_indices, write_manifest
 from robotdiffuse.paths.export import load_result
 from robotdiffuse.planners import PLANNERS
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted(ROOT.glob("examples/*.yaml")) + sorted(ROOT.glob("src/robotdiffuse/examples/*.yaml"))
 
+TRAIN = ["train", "planner", "--data", "d", "--encoder", "dgcnn", "--out", "o"]
 START = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 GOAL = [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 BALL = {"sphere": {"center": [0.5, 0.0, 0.5], "radius": 0.15}}
@@ -163,6 +174,16 @@ BAD_CALL = {
     "train twice as long": (
         ["train", "encoder", "--out", "e", "--minutes", "1", "--samples", "9"], "not allowed with"
     ),
+    "unknown sampler": ([*TRAIN, "--sampler", "heun"], "known: ddim, ddpm, dpm_solver, euler"),
+    "unknown objective": ([*TRAIN, "--objective", "score"], "known: clean, noise, velocity"),
+    "unknown denoiser": ([*TRAIN, "--denoiser", "net"], "known: decoder_only, encoder_decoder, transformer"),
+    "unknown parametrization": ([*TRAIN, "--parametrization", "spline"], "known: b_spline, frames"),
+    "unknown target": ([*TRAIN, "--target", "line"], "known: absolute, residual"),
+    "rows of frames": ([*TRAIN, "--rows", "20"], "rows is 20"),
+    "too few frames": ([*TRAIN, "--frames", "2"], "frames is 2"),
+    "no condition at all": ([*TRAIN, "--condition-drop", "1"], "condition_drop is 1.0"),
+    "unknown device": ([*TRAIN, "--device", "tpu"], "known: cpu, cuda"),
+    "no factory": ([*TRAIN, "--generate", "0"], "'0' is not an integer of at least 1"),
 }  # fmt: skip
 
 
@@ -175,6 +196,77 @@ def test_bad_call_is_status_2_in_one_line(
     assert run(*argv) == 2
     error = capsys.readouterr().err
     assert "error: " in error and named in error and error.count("\n") == 1
+
+
+def test_unknown_config_lists_them_with_what_they_are(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*TRAIN, "--config", "papre") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("robotdiffuse: error: unknown config 'papre'; known:\n")
+    for name, config in CONFIGS.items():
+        assert f"  {name}: {config.description}\n" in error
+
+
+def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> None:
+    trained: list[PlannerTraining] = []
+
+    def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
+        trained.append(settings)
+        return {}
+
+    monkeypatch.setattr("robotdiffuse.learning.training.train_planner", train_planner)
+    parts = ["--objective", "velocity", "--sampler", "euler", "--target", "residual", "--frames", "64"]
+    spline = ["--parametrization", "b_spline", "--rows", "12", "--condition-drop", "0.2"]
+    assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, *spline, "--device", "cpu") == 0
+    assert run(*TRAIN, "--config", "paper") == 0
+    assert run(*TRAIN, "--config", "table2_unet", "--denoiser", "decoder_only") == 0
+    changed, paper, row = trained
+    assert changed == replace(
+        paper,
+        denoiser="unet",
+        denoiser_settings=PAPER_SIZE["unet"],
+        objective="velocity",
+        sampler="euler",
+        target="residual",
+        frames=64,
+        parametrization="b_spline",
+        rows=12,
+        condition_drop=0.2,
+        device="cpu",
+    )
+    assert row.denoiser == "decoder_only" and row.denoiser_settings is None
+
+
+def test_data_are_made_meanwhile(tmp_path: Path) -> None:
+    """The factory goes on by the manifest while the folder is used; it leaves whole shards and no process."""
+    out = tmp_path / "data"
+    settings = GenerationSettings(trajectories=10_000, shard=2, frames=16)
+    out.mkdir()
+    write_manifest(out, manifest_of(settings))
+    with filled_meanwhile(str(out), 1, "panda"):
+        first = len(shard_indices(out))
+        assert first > 0
+        end = time.monotonic() + 60
+        while len(shard_indices(out)) == first:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert len(multiprocessing.active_children()) == 1
+    assert not multiprocessing.active_children()
+    made = shard_indices(out)
+    assert not list(out.glob(".shard*")) and len(made) < settings.shards
+    for index in made:
+        check_shard(out, index, read_manifest(out))
+
+
+def test_data_that_cannot_be_made_meanwhile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line, before training begins."""
+    out = tmp_path / "data"
+    out.mkdir()
+    manifest = manifest_of(GenerationSettings())
+    write_manifest(out, replace(manifest, versions=manifest.versions | {"numpy": "0"}))
+    assert run(*TRAIN, "--data", out, "--generate", 1) == 2
+    error = capsys.readouterr().err
+    assert "was begun with numpy 0" in error and error.count("\n") == 1
+    assert not multiprocessing.active_children()
 
 
 def test_problem_of_a_jsonl_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

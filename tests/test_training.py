@@ -143,7 +143,7 @@ def start(kind, settings, out, *launcher):
 
 def test_killed_training_ends_the_same(tmp_path, data):
     """By kill -9, at a random moment after the first checkpoint."""
-    settings = planner_settings(data, samples=1600, validation_problems=1)
+    settings = planner_settings(data, samples=480, validation_problems=1)
     train_planner(settings, str(tmp_path / "whole"))
     out = tmp_path / "killed"
     run = start("slow", replace(settings, checkpoint_seconds=0.2), out)

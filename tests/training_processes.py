@@ -18,7 +18,7 @@ from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, setti
 from robotdiffuse.learning.processes import Processes
 from robotdiffuse.learning.training_run import TrainingRun, Validation
 
-STEP_SECONDS = 0.03
+STEP_SECONDS = 0.1
 STOP_AFTER = 3
 
 

@@ -8,9 +8,13 @@ from typing import Any, TypeVar
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings
-from robotdiffuse.learning.diffusion import ScheduleSettings
+from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings
 from robotdiffuse.learning.losses import LossSettings
+from robotdiffuse.learning.objectives import objective_for
+from robotdiffuse.learning.parametrization import parametrization
+from robotdiffuse.learning.representation import TARGETS
+from robotdiffuse.learning.samplers import SAMPLERS
 
 Settings = TypeVar("Settings")
 
@@ -222,6 +226,14 @@ class PlannerTraining:
             raise InputError(f"condition_drop is {self.condition_drop}; it must be at least 0 and below 1")
         check_gradients(self.sees_gradients, self.sees_clearances)
         check_kind("denoiser", self.denoiser, self.denoiser_settings, DENOISERS)
+        if self.sampler not in SAMPLERS:
+            raise unknown_name("sampler", self.sampler, SAMPLERS)
+        if self.target not in TARGETS:
+            raise unknown_name("target", self.target, TARGETS)
+        objective_for(self.objective, NoiseSchedule(self.schedule))
+        if self.frames < 3:
+            raise InputError(f"frames is {self.frames}; it must be at least 3")
+        parametrization(self.parametrization, self.frames, self.rows or self.frames)
         if self.encoder_settings is not None:
             check_kind("encoder", self.encoder, self.encoder_settings, ENCODERS)
 
