@@ -4,7 +4,7 @@
     python benchmarks/curves.py NAME=FOLDER --snapshots [--family rop] [--problems 60] [--cases FOLDER]
 
 FOLDER is that of a training run; its log.csv holds the success of single samples without guidance on held-out
-problems that are not trivial, by covering spheres, at every checkpoint. With --snapshots it holds folders with
+problems that are not trivial, by covering spheres, at every checkpoint. With --snapshots it holds folders of
 models, copies of the run's while it went on, and each is tried here: single samples and best of 16, with and
 without collision guidance, by the judge. Draws benchmarks/results/curves.png and prints where curves end.
 """
