@@ -27,7 +27,16 @@ class Config(NamedTuple):
 
 
 CONFIGS: dict[str, Config] = {
-    "compact": Config("what ships: 48 frames, 1.7 M parameters, sees clearances", {}),
+    "compact": Config(
+        "what ships: 48 frames, 1.7 M parameters, sees clearances and their gradients",
+        {
+            "minutes": None,
+            "samples": 3_200_000,
+            "sees_gradients": True,
+            "condition_drop": 0.1,
+            "losses": JOINT_POINT_COLLISION,
+        },
+    ),
     "paper": Config(
         "the paper's: 254 frames, 8 layers of width 512, T = 200, batch 64, 25,000 iterations",
         {
