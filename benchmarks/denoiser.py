@@ -134,8 +134,8 @@ def waiting(batches: list[Batch], repeats: int) -> None:
     print_table(f"{SAMPLES} samples in {STEPS} steps", columns, rows)
     verdict = "met" if batch_time <= TARGET else "missed"
     print(
-        f"target of {1e3 * TARGET:.0f} ms for the batch with guidance and encoder: {verdict} (CPU time of one "
-        "thread, median, which is the wall time on a core of its own)"
+        f"target of {1e3 * TARGET:.0f} ms for the batch with guidance and encoder: {verdict} by the median CPU "
+        "time of one thread, which is the wall time on a core of its own"
     )
 
 
@@ -191,25 +191,29 @@ def inputs(model: MotionModel) -> Inputs:
 
 
 def operations(model: MotionModel, repeats: int) -> None:
-    """The profiler's top rows of a pass of the denoiser."""
-    given = inputs(model)
+    """The profiler's top rows of a pass of the denoiser: the quickest of some, as its clock is the wall's."""
+    given, best = inputs(model), None
     with torch.inference_mode(), threads(1):
         model.denoise(*given)
-        with profile(activities=[ProfilerActivity.CPU]) as profiler:
-            for _ in range(repeats):
+        for _ in range(repeats):
+            with profile(activities=[ProfilerActivity.CPU]) as profiler:
                 model.denoise(*given)
-    events = sorted(profiler.key_averages(), key=lambda event: -event.self_cpu_time_total)
-    total = sum(event.self_cpu_time_total for event in events)
+            events = profiler.key_averages()
+            total = sum(event.self_cpu_time_total for event in events)
+            if best is None or total < best[0]:
+                best = total, sorted(events, key=lambda event: -event.self_cpu_time_total)
+    assert best is not None
+    total, events = best
     rows = [
         [
             event.key,
-            f"{event.count / repeats:.0f}",
-            f"{event.self_cpu_time_total / repeats / 1e3:.2f}",
+            f"{event.count}",
+            f"{event.self_cpu_time_total / 1e3:.2f}",
             f"{event.self_cpu_time_total / total:.0%}",
         ]
-        for event in events[:10]
+        for event in events[:8]
     ]
-    rows.append(["all, under the profiler", "", f"{total / repeats / 1e3:.2f}", ""])
+    rows.append(["all, under the profiler", "", f"{total / 1e3:.2f}", ""])
     print_table(f"One pass of the denoiser, batch of {SAMPLES}", ["", "calls", "ms", "share"], rows)
 
 
@@ -259,10 +263,8 @@ def bound(model: MotionModel, repeats: int) -> None:
         f"reaches {peak / 1e9:.0f} GFLOP/s, at which a pass would take {1e3 * total / peak:.1f} ms"
     )
     share = products / whole
-    what = (
-        "its linear layers" if share > 0.5 else "what is between the linear layers: attention, norms, copies"
-    )
-    print(f"linear layers are {share:.0%} of a pass: it is bound by {what}")
+    what = "the linear layers" if share > 0.5 else "what is between the linear layers, see the profile"
+    print(f"linear layers, from a warm cache, are {share:.0%} of a pass: it is bound by {what}")
 
 
 def throughput(batch: Batch) -> None:
