@@ -7,6 +7,7 @@ import pytest
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
+from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.planners import robotdiffuse as module
 from robotdiffuse.planners.robotdiffuse import (
     RobotDiffuse,
@@ -60,6 +61,13 @@ def test_same_seed_same_path(planner):
     first, second = (planner.plan(PROBLEM, time_limit=10.0, seed=3).path for _ in range(2))
     assert first is not None and second is not None
     assert np.array_equal(first.positions, second.positions)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_any_sampler_plans(sampler):
+    planner = RobotDiffuse(RobotDiffuseSettings(sampler=sampler, guided_share=1.0, sampling_steps=8))
+    result = planner.plan(PROBLEM, time_limit=10.0)
+    assert result.stage == "network" and result.path is not None and verify(PROBLEM, result.path).valid
 
 
 def test_a_free_straight_line_is_the_answer(planner):
@@ -144,5 +152,11 @@ def test_unlearned_starts_keep_ends_and_limits():
 def test_settings_and_weights_are_checked(tmp_path):
     with pytest.raises(InputError, match=r"robotdiffuse\.samples is 0"):
         RobotDiffuseSettings(samples=0)
+    with pytest.raises(InputError, match=r"robotdiffuse\.guided_share is -0.1"):
+        RobotDiffuseSettings(guided_share=-0.1)
+    with pytest.raises(InputError, match=r"unknown robotdiffuse\.sampler 'heun'; known: ddim, ddpm"):
+        RobotDiffuseSettings(sampler="heun")
+    with pytest.raises(InputError, match=r"guidance_scale is 2\.0; it must be 1"):
+        RobotDiffuse(RobotDiffuseSettings(guidance_scale=2.0)).plan(PROBLEM)
     with pytest.raises(InputError, match="model"):
         RobotDiffuse(RobotDiffuseSettings(weights=str(tmp_path)))

@@ -132,17 +132,20 @@ class TrajectoryRows(nn.Module):
         x[..., self.rows - between.suffix.shape[-2] :, :] = between.suffix
         return x
 
-    def regression(self, between: Between) -> Float[ndarray, "rows rows"] | None:
+    def regression(self, between: Between, reach: float = np.inf) -> Float[ndarray, "rows rows"] | None:
         """G by which known rows move the expectation of all: x + G (known - x); None for the ends alone.
 
         It is cov(x, known) cov(known)^-1 for the covariance of the noise. Where that is smooth, the data's,
-        x changes as trajectories do that pass through the known rows; white noise moves no other row.
+        x changes as trajectories do that pass through the known rows; white noise moves no other row. With a
+        reach, the covariance falls off by exp(-distance / reach) over the rows, so that what is known of some
+        changes little but those that are near.
         """
         known = np.r_[1 : between.prefix.shape[-2], self.rows - between.suffix.shape[-2] : self.rows - 1]
         if not len(known):
             return None
         factor = self.noise_factor.numpy().astype(np.float64)
-        covariance = factor @ factor.T
+        apart = np.abs(np.subtract.outer(np.arange(self.rows), np.arange(self.rows)))
+        covariance = factor @ factor.T * np.exp(-apart / reach)
         matrix = np.zeros((self.rows, self.rows))
         matrix[:, known] = np.linalg.solve(covariance[np.ix_(known, known)], covariance[known]).T
         return matrix.astype(np.float32)
