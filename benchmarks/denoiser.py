@@ -134,8 +134,8 @@ def waiting(batches: list[Batch], repeats: int) -> None:
     print_table(f"{SAMPLES} samples in {STEPS} steps", columns, rows)
     verdict = "met" if batch_time <= TARGET else "missed"
     print(
-        f"target of {1e3 * TARGET:.0f} ms for the batch with guidance and encoder: {verdict} by the median CPU "
-        "time of one thread, which is the wall time on a core of its own"
+        f"target of {1e3 * TARGET:.0f} ms for a batch with guidance and encoder: {verdict} by the median "
+        "CPU time of one thread, which is the wall time on a core of its own"
     )
 
 

@@ -158,12 +158,13 @@ def draw(
         guided = f"{gradient} gradient steps" if gradient else "no collision guidance"
         axes.set_title(f"single sample by classifier-free scale, {guided}")
     for axes in panels.flat:
+        ticks = STEPS if axes in panels[0] else SCALED_STEPS
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis="y", color="#e3e6ea", lw=0.8)
         axes.set(xscale="log", xlabel="sampling steps", ylim=(0, 102))
-        axes.set_xticks(list(STEPS), [str(steps) for steps in STEPS])
+        axes.set_xticks(ticks, [str(steps) for steps in ticks])
         axes.minorticks_off()
-        axes.legend(frameon=False, loc="lower right")
+        axes.legend(frameon=False, loc="best")
     for axes in panels[:, 0]:
         axes.set_ylabel("motions that pass the judge, %")
     file.parent.mkdir(parents=True, exist_ok=True)
