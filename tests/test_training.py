@@ -22,11 +22,12 @@ from robotdiffuse.learning import training
 from robotdiffuse.learning.batches import Batch, Batches, fast_bf16, load_data, random_scenes, resample_evenly
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors, save_encoder
 from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, settings_to_json
-from robotdiffuse.learning.denoisers import TransformerSettings, UNetSettings
+from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.encoder_training import train_encoder
 from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
 from robotdiffuse.learning.losses import LossSettings
+from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.processes import Processes
 from robotdiffuse.learning.shards import shard_path, split_of, write_manifest, write_shard
 from robotdiffuse.learning.training import moving_links, train_planner
@@ -228,6 +229,31 @@ def test_takes_in_data_that_are_still_being_made(tmp_path, data, monkeypatch, ca
     assert f"grown to {len(known[1]):,} trajectories" in capsys.readouterr().err
     about = json.loads((tmp_path / "out" / "model.json").read_text())["training"]
     assert about["trajectories"] == len(known[1]) and about["data"] == known[1].digest
+
+
+@pytest.mark.parametrize("denoiser", DENOISERS)
+def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
+    """On the meta device, which has no numbers, but refuses tensors of other devices as a GPU does."""
+    losses = LossSettings(point=1.0, collision=1.0)
+    settings = planner_settings(
+        data, denoiser=denoiser, denoiser_settings=None, losses=losses, condition_drop=0.5
+    )
+    encoder = load_encoder(data.parent / "encoder")
+    model = MotionModel(training._model_config(settings, arm, encoder))
+    loaded = load_data(str(data), arm, encoder, FRAMES, lambda text: None)
+
+    def far(kinds, params, q):
+        return np.full((*q.shape[:-1], len(model.config.links)), 0.4, np.float32)
+
+    rng = np.random.default_rng(0)
+    batch = Batches(loaded, model, far, 0.1, 5.0).draw(4, rng)
+    elsewhere = Processes("cpu")
+    elsewhere.device = torch.device("meta")
+    model = model.to("meta")
+    loss = training._Loss(model, arm, settings, elsewhere)(batch, 1.0, rng, torch.arange(4) > 1)
+    loss.backward()
+    assert loss.device.type == "meta"
+    assert all(p.grad is not None for p in model.denoiser.parameters())
 
 
 def test_device_is_checked(data, tmp_path, monkeypatch):

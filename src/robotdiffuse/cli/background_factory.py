@@ -106,6 +106,8 @@ def _fill(folder: str, workers: int, robot: str, connection: Connection) -> None
             connection.send("")
 
     try:
+        # a shell's background job ignores it, and its children with it
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         from robotdiffuse.generation import generate
         from robotdiffuse.generation.workers import prepare_worker

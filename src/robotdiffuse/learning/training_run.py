@@ -239,7 +239,8 @@ class TrainingRun:
         if validation is None:
             return
         self._plot()
-        planned = "" if validation.success is None else f"{validation.success:.1%} of samples free, "
+        success = validation.success
+        planned = "" if success is None or math.isnan(success) else f"{success:.1%} of samples free, "
         console.print(
             f"{title}: {self.fraction:.1%}, {self.at.samples:,} samples in {self.at.seconds / 60:.1f} min, "
             f"loss {self.rows[-1]['loss']:.4f}, validation {validation.loss:.4f}, {planned}"
