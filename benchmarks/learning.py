@@ -365,7 +365,7 @@ def from_folder(folder: File, count: int) -> list[Task]:
 
 def partial_views(count: int, folder: File | None) -> list[Task]:
     """What one camera sees; problems whose start or goal touches what is seen are left out."""
-    each = -(-count * 5 // (4 * len(FAMILIES)))  # some are left out
+    each = -(-count // 3)  # of five families, as some are left out
     cases = {family: draw_cases(family, each, folder).hard for family in FAMILIES}
     tasks: list[Task] = []
     queues = {family: iter(hard) for family, hard in cases.items()}
