@@ -5,8 +5,8 @@
 
 Prints the report that is kept in benchmarks/results/many_goals.txt. Scenes of held-out problems; from the
 problem's start to so many goals, drawn as ROP draws them, that RRT-Connect reaches with a few thousand nodes
-and the straight line does not. Every method gives at most one motion to each goal, and none gives another where
-the judge, which is not timed, refuses it.
+and the straight line does not. Every method gives at most one motion to each goal, and no other where the
+judge, which is not timed, refuses it.
 
 - network: 4 samples to each goal in one call, refined where none of the 4 is free, the shortest free one.
 - bumps: its control, the line and 3 random bumps to each goal, refined.
