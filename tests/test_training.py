@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -185,7 +186,8 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
             return draw(self, count, rng)
         parts = [draw(self, count // 2, np.random.default_rng(seed)) for seed in (0, [0, 1])]
         fields = ((name, [getattr(part, name) for part in parts]) for name in vars(parts[0]))
-        return Batch(**{name: None if a is None else np.concatenate([a, b]) for name, (a, b) in fields})
+        joined: dict[str, Any] = {n: None if a is None else np.concatenate([a, b]) for n, (a, b) in fields}
+        return Batch(**joined)
 
     def step(self, loss):
         original(self, loss)

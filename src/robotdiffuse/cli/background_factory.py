@@ -8,8 +8,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from robotdiffuse.errors import InputError
 
@@ -85,7 +86,7 @@ def _message(connection: Connection) -> str | None:
         return None
 
 
-def _end(factory: multiprocessing.process.BaseProcess) -> None:
+def _end(factory: SpawnProcess) -> None:
     if factory.pid is not None and factory.is_alive():
         os.kill(factory.pid, signal.SIGINT)
         factory.join(PATIENCE)
@@ -129,7 +130,8 @@ def _settings(folder: str, robot: str) -> "GenerationSettings":
         return GenerationSettings(robot=robot)
     found = read_manifest(folder).settings
     try:
-        return GenerationSettings(**found | {"search": SharedTreeSettings(**found["search"])})
+        values: dict[str, Any] = found | {"search": SharedTreeSettings(**found["search"])}
+        return GenerationSettings(**values)
     except (KeyError, TypeError) as error:
         raise InputError(
             f"{folder}/{MANIFEST} has settings that are not of this version's data factory: {error}"
