@@ -37,10 +37,10 @@ bench: .venv/dev.stamp
 	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
 
 weights: .venv/dev.stamp
-	$(BIN)/robotdiffuse data generate --out runs/panda/data --trajectories 92000 \
-		--mix rop=0.85,rop_dense=0.15 --trivial-share 0.1 --target pose --goals 1
-	$(BIN)/robotdiffuse train encoder --out runs/panda/encoder --minutes 6
-	$(BIN)/robotdiffuse train planner --out runs/panda/planner --minutes 44 \
+	$(BIN)/robotdiffuse data generate --out runs/panda/data --trajectories 31000 --seed 7 \
+		--mix rop=0.4,rop_dense=0.3,shelf=0.1,crate=0.1,table=0.1 --trivial-share 0.1 --target pose --goals 1
+	$(BIN)/robotdiffuse train encoder --out runs/panda/encoder --samples 160000
+	$(BIN)/robotdiffuse train planner --out runs/panda/planner --config compact \
 		--data runs/panda/data --encoder runs/panda/encoder
 
 clean:
