@@ -19,6 +19,7 @@ from robotdiffuse.generation.factory import manifest_of
 from robotdiffuse.learning.config import PlannerTraining
 from robotdiffuse.learning.configs import CONFIGS
 from robotdiffuse.learning.denoisers import PAPER_SIZE
+from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.shards import check_shard, read_manifest, shard_indices, write_manifest
 from robotdiffuse.paths.export import load_result
 from robotdiffuse.planners import PLANNERS
@@ -175,6 +176,7 @@ BAD_CALL = {
         ["train", "encoder", "--out", "e", "--minutes", "1", "--samples", "9"], "not allowed with"
     ),
     "unknown sampler": ([*TRAIN, "--sampler", "heun"], "known: ddim, ddpm, dpm_solver, euler"),
+    "unknown schedule": ([*TRAIN, "--schedule", "sine"], "known: cosine, linear, flow"),
     "unknown objective": ([*TRAIN, "--objective", "score"], "known: clean, noise, velocity"),
     "unknown denoiser": ([*TRAIN, "--denoiser", "net"], "known: decoder_only, encoder_decoder, transformer"),
     "unknown parametrization": ([*TRAIN, "--parametrization", "spline"], "known: b_spline, frames"),
@@ -214,8 +216,9 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         return {}
 
     monkeypatch.setattr("robotdiffuse.learning.training.train_planner", train_planner)
-    parts = ["--objective", "velocity", "--sampler", "euler", "--target", "residual", "--frames", "64"]
+    parts = ["--objective", "velocity", "--sampler", "euler", "--schedule", "flow", "--frames", "64"]
     spline = ["--parametrization", "b_spline", "--rows", "12", "--condition-drop", "0.2"]
+    spline += ["--target", "residual"]
     assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, *spline, "--device", "cpu") == 0
     assert run(*TRAIN, "--config", "paper") == 0
     assert run(*TRAIN, "--config", "table2_unet", "--denoiser", "decoder_only") == 0
@@ -226,6 +229,7 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         denoiser_settings=PAPER_SIZE["unet"],
         objective="velocity",
         sampler="euler",
+        schedule=ScheduleSettings(kind="flow"),
         target="residual",
         frames=64,
         parametrization="b_spline",

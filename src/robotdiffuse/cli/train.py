@@ -63,6 +63,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--denoiser", metavar="NAME", help="transformer, encoder_decoder, decoder_only or unet"
     )
     parts.add_argument("--objective", metavar="NAME", help="what is predicted: clean, noise or velocity")
+    parts.add_argument("--schedule", metavar="NAME", help="of the noise: cosine, linear or flow")
     parts.add_argument("--sampler", metavar="NAME", help="for planning: ddim, ddpm, dpm_solver or euler")
     parts.add_argument("--parametrization", metavar="NAME", help="of motions: frames or b_spline")
     parts.add_argument("--rows", type=count, metavar="N", help="control points of b_spline")
@@ -110,6 +111,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
     from robotdiffuse.cli.background_factory import filled_meanwhile
     from robotdiffuse.learning.configs import CONFIGS, planner_training
     from robotdiffuse.learning.denoisers import PAPER_SIZE
+    from robotdiffuse.learning.diffusion import ScheduleSettings
     from robotdiffuse.learning.training import train_planner
 
     if arguments.config not in CONFIGS:
@@ -119,6 +121,8 @@ def run_planner(arguments: argparse.Namespace) -> int:
     if "denoiser" in given and CONFIGS[arguments.config].changes.get("denoiser_settings") is not None:
         # the config's are of its own denoiser; those of another of the same size
         given["denoiser_settings"] = PAPER_SIZE.get(arguments.denoiser)
+    if arguments.schedule is not None:
+        given["schedule"] = ScheduleSettings(kind=arguments.schedule)
     settings = planner_training(arguments.config, given)
     meanwhile = nullcontext()
     if arguments.generate is not None:
