@@ -176,7 +176,7 @@ BAD_CALL = {
         ["train", "encoder", "--out", "e", "--minutes", "1", "--samples", "9"], "not allowed with"
     ),
     "unknown sampler": ([*TRAIN, "--sampler", "heun"], "known: ddim, ddpm, dpm_solver, euler"),
-    "unknown schedule": ([*TRAIN, "--schedule", "sine"], "known: cosine, linear, flow"),
+    "unknown schedule": ([*TRAIN, "--schedule", "sine"], "known: cosine, flow, linear"),
     "unknown objective": ([*TRAIN, "--objective", "score"], "known: clean, noise, velocity"),
     "unknown denoiser": ([*TRAIN, "--denoiser", "net"], "known: decoder_only, encoder_decoder, transformer"),
     "unknown parametrization": ([*TRAIN, "--parametrization", "spline"], "known: b_spline, frames"),
