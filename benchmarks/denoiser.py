@@ -28,9 +28,9 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning import motion_model
+from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.learning.validation import link_clearances
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode
 from robotdiffuse.problem import Problem
 

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from report import header, print_table
 
-from robotdiffuse.learning.dataset import RopDataset
-from robotdiffuse.learning.shards import SPLITS, Manifest, write_manifest, write_shard
+from robotdiffuse.learning.data.dataset import RopDataset
+from robotdiffuse.learning.data.shards import SPLITS, Manifest, write_manifest, write_shard
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot

@@ -6,7 +6,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.shards import Manifest, write_manifest, write_shard
+from robotdiffuse.learning.data.shards import Manifest, write_manifest, write_shard
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.rop import pack_scene
 from robotdiffuse.scenes.scene import Scene

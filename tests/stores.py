@@ -7,7 +7,7 @@ import numpy as np
 from numpy import ndarray
 from numpy.random import Generator
 
-from robotdiffuse.learning.shards import Manifest, write_manifest, write_shard
+from robotdiffuse.learning.data.shards import Manifest, write_manifest, write_shard
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import BOX, SPHERE

@@ -10,11 +10,11 @@ from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import ablation
 from robotdiffuse.evaluation.metrics import LinkPathLength, bootstrap_interval
-from robotdiffuse.learning.configs import CONFIGS, planner_training
 from robotdiffuse.learning.denoisers import DENOISERS, Transformer
 from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.learning.training import _model_config
+from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+from robotdiffuse.learning.training.planner import _model_config
 from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")

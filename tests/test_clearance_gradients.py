@@ -13,11 +13,11 @@ from robotdiffuse.collision.packed import packed_clearances_and_gradients, packe
 from robotdiffuse.collision.signed_distance import SignedDistance
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model, save_model
-from robotdiffuse.learning.config import PlannerTraining
+from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
-from robotdiffuse.learning.training import FLOOR, moving_links
-from robotdiffuse.learning.validation import link_clearances
+from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.training.planner import FLOOR, moving_links
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.rop import ROP, ROP_DENSE, pack_scene, sample_scene

@@ -16,11 +16,11 @@ from robotdiffuse.cli import main
 from robotdiffuse.cli.background_factory import filled_meanwhile
 from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.factory import manifest_of
-from robotdiffuse.learning.config import PlannerTraining
-from robotdiffuse.learning.configs import CONFIGS
+from robotdiffuse.learning.data.shards import check_shard, read_manifest, shard_indices, write_manifest
 from robotdiffuse.learning.denoisers import PAPER_SIZE
 from robotdiffuse.learning.diffusion import ScheduleSettings
-from robotdiffuse.learning.shards import check_shard, read_manifest, shard_indices, write_manifest
+from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.training.configs import CONFIGS
 from robotdiffuse.paths.export import load_result
 from robotdiffuse.planners import PLANNERS
 
@@ -215,7 +215,7 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         trained.append(settings)
         return {}
 
-    monkeypatch.setattr("robotdiffuse.learning.training.train_planner", train_planner)
+    monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
     parts = ["--objective", "velocity", "--sampler", "euler", "--schedule", "flow", "--frames", "64"]
     spline = ["--parametrization", "b_spline", "--rows", "12", "--condition-drop", "0.2"]
     spline += ["--target", "residual"]

@@ -12,7 +12,7 @@ from motion_stores import line, random_motions, record, write_motions
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.data_check import KINDS, check_data
 from robotdiffuse.evaluation.data_rows import motion_of, pick_rows, problem_of, scene_of
-from robotdiffuse.learning.shards import read_shard, shard_path, write_shard
+from robotdiffuse.learning.data.shards import read_shard, shard_path, write_shard
 from robotdiffuse.problem import JointGoal
 from robotdiffuse.scenes.rop import RopSettings, floor_box
 from robotdiffuse.scenes.scene import Scene

@@ -11,9 +11,9 @@ from torch.utils.data import DataLoader
 import robotdiffuse as rd
 from box_arm import box_arm
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.dataset import RopBatch, RopDataset
-from robotdiffuse.learning.export import export_npz
-from robotdiffuse.learning.shards import (
+from robotdiffuse.learning.data.dataset import RopBatch, RopDataset
+from robotdiffuse.learning.data.export import export_npz
+from robotdiffuse.learning.data.shards import (
     SPLITS,
     read_shard,
     shard_path,

@@ -9,7 +9,6 @@ import torch
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model, save_model
-from robotdiffuse.learning.config import PlannerTraining, settings_from_json, settings_to_json
 from robotdiffuse.learning.denoisers import (
     DENOISERS,
     PAPER_SIZE,
@@ -21,6 +20,8 @@ from robotdiffuse.learning.denoisers import (
 )
 from robotdiffuse.learning.denoisers.layers import DENSE_TOKENS, Linear, attend
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.settings import settings_from_json, settings_to_json
+from robotdiffuse.learning.training.config import PlannerTraining
 from test_learning import small_model
 
 DOF, FEATURES, CODE = 3, 9, 8

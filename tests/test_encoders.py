@@ -12,17 +12,10 @@ from hypothesis import strategies as st
 from box_arm import box_arm
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning import encoder_training, training
-from robotdiffuse.learning.batches import Batches, load_data, random_scenes, scene_clouds
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
-from robotdiffuse.learning.config import (
-    EncoderTraining,
-    PlannerTraining,
-    settings_from_json,
-    settings_to_json,
-)
+from robotdiffuse.learning.data.batches import Batches, load_data, random_scenes, scene_clouds
+from robotdiffuse.learning.data.shards import write_manifest, write_shard
 from robotdiffuse.learning.denoisers import TransformerSettings
-from robotdiffuse.learning.encoder_training import linear_readout, scene_distances, train_encoder
 from robotdiffuse.learning.encoders import (
     ENCODERS,
     PAPER_SIZE,
@@ -37,8 +30,12 @@ from robotdiffuse.learning.encoders import (
 from robotdiffuse.learning.encoders.base import Autoencoder
 from robotdiffuse.learning.encoders.dgcnn import EdgeConvolution, neighbours
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
-from robotdiffuse.learning.shards import write_manifest, write_shard
-from robotdiffuse.learning.training import train_planner
+from robotdiffuse.learning.settings import settings_from_json, settings_to_json
+from robotdiffuse.learning.training import encoder as encoder_training
+from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.training.encoder import linear_readout, scene_distances, train_encoder
+from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.scenes.sampling import BOX, SPHERE
 from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.scenes.surface_clouds import surface_clouds

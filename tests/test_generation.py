@@ -21,7 +21,7 @@ from robotdiffuse.evaluation.data_rows import path_of, problem_of
 from robotdiffuse.generation import GenerationSettings, factory, generate, problems
 from robotdiffuse.generation.problems import draw_problem
 from robotdiffuse.generation.shard_maker import NUMBERS, make_shard, resample
-from robotdiffuse.learning.shards import check_shard, read_manifest, read_shard
+from robotdiffuse.learning.data.shards import check_shard, read_manifest, read_shard
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose

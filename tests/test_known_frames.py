@@ -10,12 +10,12 @@ from numpy import ndarray
 from box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
+from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.encoders import PointAutoencoderSettings
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.validation import link_clearances
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, bundled_model, encode
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene

@@ -16,7 +16,6 @@ from robotdiffuse.learning.checkpoint import (
     save_encoder,
     save_model,
 )
-from robotdiffuse.learning.config import EncoderTraining, settings_from_json, settings_to_json
 from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
 from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
@@ -24,6 +23,8 @@ from robotdiffuse.learning.encoders.point_autoencoder import chamfer, nearest
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.normalizer import JointNormalizer
 from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.learning.settings import settings_from_json, settings_to_json
+from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.scenes.sampling import PANDA_REGION
 
 SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)

@@ -6,7 +6,7 @@ import torch
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.losses import ArmDistance, LossSettings, SurfacePoints, hinge
+from robotdiffuse.learning.training.losses import ArmDistance, LossSettings, SurfacePoints, hinge
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics, link_pose
 from robotdiffuse.scenes.rop import ROP, ROP_DENSE, floor_box, pack_scene, sample_scene

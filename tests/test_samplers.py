@@ -9,10 +9,10 @@ import torch
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
-from robotdiffuse.learning.config import settings_from_json
 from robotdiffuse.learning.diffusion import SCHEDULES, NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.objectives import OBJECTIVES, objective_for
 from robotdiffuse.learning.samplers import SAMPLERS, ddim, ddpm, euler
+from robotdiffuse.learning.settings import settings_from_json
 
 ORDERS = {"ddim": 1, "euler": 1, "dpm_solver": 2}
 """Of the deterministic samplers."""

@@ -16,8 +16,8 @@ from zarr.codecs import ZstdCodec
 
 from box_arm import box_arm
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning import shards
-from robotdiffuse.learning.shards import (
+from robotdiffuse.learning.data import shards
+from robotdiffuse.learning.data.shards import (
     ARRAYS,
     SPLITS,
     check_shard,
@@ -143,7 +143,7 @@ sys.path.insert(0, {str(Path(__file__).parent)!r})
 import numpy as np, zarr
 from box_arm import box_arm
 from stores import random_arrays
-from robotdiffuse.learning.shards import write_shard
+from robotdiffuse.learning.data.shards import write_shard
 create = zarr.Group.create_array
 def die(self, name, **how):
     create(self, name, **how)

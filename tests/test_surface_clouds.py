@@ -5,7 +5,7 @@ import pytest
 import torch
 from numpy import ndarray
 
-from robotdiffuse.learning.batches import random_scenes
+from robotdiffuse.learning.data.batches import random_scenes
 from robotdiffuse.scenes import surface_clouds as module
 from robotdiffuse.scenes.sampling import BOX, PANDA_REGION, SPHERE, sample_surfaces_batch
 from robotdiffuse.scenes.surface_clouds import surface_clouds

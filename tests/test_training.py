@@ -19,20 +19,28 @@ import torch
 from box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning import training
-from robotdiffuse.learning.batches import Batch, Batches, fast_bf16, load_data, random_scenes, resample_evenly
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors, save_encoder
-from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, settings_to_json
+from robotdiffuse.learning.data.batches import (
+    Batch,
+    Batches,
+    fast_bf16,
+    load_data,
+    random_scenes,
+    resample_evenly,
+)
+from robotdiffuse.learning.data.shards import shard_path, split_of, write_manifest, write_shard
 from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
-from robotdiffuse.learning.encoder_training import train_encoder
 from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
-from robotdiffuse.learning.losses import LossSettings
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.learning.processes import Processes
-from robotdiffuse.learning.shards import shard_path, split_of, write_manifest, write_shard
-from robotdiffuse.learning.training import moving_links, train_planner
-from robotdiffuse.learning.training_run import TrainingRun, Validation
+from robotdiffuse.learning.settings import settings_to_json
+from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.training.encoder import train_encoder
+from robotdiffuse.learning.training.losses import LossSettings
+from robotdiffuse.learning.training.planner import moving_links, train_planner
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.run import TrainingRun, Validation
 from robotdiffuse.scenes.sampling import BOX, SPHERE, sample_surfaces_batch
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere

@@ -5,7 +5,7 @@ import pytest
 
 from example_robots import example_robot
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.turns import turned, turns_about_vertical
+from robotdiffuse.learning.data.turns import turned, turns_about_vertical
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.rop import ROP_DENSE, pack_scene, sample_scene, unpack_scene
 from robotdiffuse.scenes.scene import Scene
@@ -16,7 +16,8 @@ def test_turned_motions_have_the_same_clearances():
     scenes = [sample_scene(ROP_DENSE, rng) for _ in range(6)]
     packed = [pack_scene(Scene(scene.shapes[1:]), ROP_DENSE.slots) for scene in scenes]
     params = np.stack([params for _, params in packed])
-    q = np.linspace(*rng.uniform(robot.lower, robot.upper, (2, 6, robot.dof)), 20, axis=1).astype(np.float32)
+    start, goal = rng.uniform(robot.lower, robot.upper, (2, 6, robot.dof))
+    q = np.linspace(start, goal, 20, axis=1).astype(np.float32)
     q_turned, params_turned, clear = turned(robot, q, params, rng)
     np.testing.assert_array_equal(q_turned[..., 1:], q[..., 1:])
     assert (q_turned >= robot.lower.astype(np.float32)).all() and (

@@ -12,11 +12,12 @@ from pathlib import Path
 import torch
 
 from box_arm import box_arm
-from robotdiffuse.learning import training
 from robotdiffuse.learning.checkpoint import write_tensors
-from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, settings_from_json
-from robotdiffuse.learning.processes import Processes
-from robotdiffuse.learning.training_run import TrainingRun, Validation
+from robotdiffuse.learning.settings import settings_from_json
+from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.run import TrainingRun, Validation
 
 STEP_SECONDS = 0.1
 STOP_AFTER = 3

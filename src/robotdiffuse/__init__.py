@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from robotdiffuse.errors import InputError as InputError
-    from robotdiffuse.learning.dataset import RopDataset as RopDataset
+    from robotdiffuse.learning.data.dataset import RopDataset as RopDataset
     from robotdiffuse.paths.export import load_result as load_result
     from robotdiffuse.planners import load_planner as load_planner
     from robotdiffuse.planners import plan as plan
@@ -33,7 +33,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "InputError": "robotdiffuse.errors",
-    "RopDataset": "robotdiffuse.learning.dataset",
+    "RopDataset": "robotdiffuse.learning.data.dataset",
     "load_result": "robotdiffuse.paths.export",
     "load_planner": "robotdiffuse.planners",
     "plan": "robotdiffuse.planners",

@@ -96,8 +96,8 @@ def _given(arguments: argparse.Namespace, names: tuple[str, ...]) -> dict[str, o
 
 
 def run_encoder(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.learning.config import EncoderTraining
-    from robotdiffuse.learning.encoder_training import train_encoder
+    from robotdiffuse.learning.training.config import EncoderTraining
+    from robotdiffuse.learning.training.encoder import train_encoder
 
     given = _given(arguments, ("name", *SHARED))
     if "samples" in given:
@@ -109,10 +109,10 @@ def run_encoder(arguments: argparse.Namespace) -> int:
 
 def run_planner(arguments: argparse.Namespace) -> int:
     from robotdiffuse.cli.background_factory import filled_meanwhile
-    from robotdiffuse.learning.configs import CONFIGS, planner_training
     from robotdiffuse.learning.denoisers import PAPER_SIZE
     from robotdiffuse.learning.diffusion import ScheduleSettings
-    from robotdiffuse.learning.training import train_planner
+    from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+    from robotdiffuse.learning.training.planner import train_planner
 
     if arguments.config not in CONFIGS:
         known = "".join(f"\n  {name}: {config.description}" for name, config in CONFIGS.items())

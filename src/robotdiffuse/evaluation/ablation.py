@@ -21,12 +21,12 @@ from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.evaluation.metrics import LinkPathLength
 from robotdiffuse.generation.workers import prepare_worker, stop_pool
 from robotdiffuse.learning.checkpoint import load_model
-from robotdiffuse.learning.config import EncoderTraining
-from robotdiffuse.learning.configs import CONFIGS, planner_training
-from robotdiffuse.learning.encoder_training import train_encoder
+from robotdiffuse.learning.data.shards import read_manifest
 from robotdiffuse.learning.guidance import CollisionGuidance
-from robotdiffuse.learning.shards import read_manifest
-from robotdiffuse.learning.training import train_planner
+from robotdiffuse.learning.training.config import EncoderTraining
+from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+from robotdiffuse.learning.training.encoder import train_encoder
+from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode, unlearned_starts
 from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problem import JointGoal, Problem
@@ -51,7 +51,7 @@ PATIENCE = 20.0
 
 class Row(NamedTuple):
     config: str
-    """By its name in `learning.configs`."""
+    """By its name in `learning.training.configs`."""
     guided: bool
     """Whether collision guidance is used in sampling."""
     paper: tuple[float, float, float, float]

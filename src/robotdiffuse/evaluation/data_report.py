@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.data_rows import family_names
-from robotdiffuse.learning.shards import (
+from robotdiffuse.learning.data.shards import (
     SPLITS,
     Manifest,
     read_manifest,

@@ -9,7 +9,7 @@ from jaxtyping import Int
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.shards import Manifest, Shard, read_shard, shard_indices
+from robotdiffuse.learning.data.shards import Manifest, Shard, read_shard, shard_indices
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.furniture import FLOOR, FURNITURE

@@ -14,7 +14,7 @@ from typing import Any
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.workers import CLUSTERS, on_this_machine, versions
-from robotdiffuse.learning.shards import (
+from robotdiffuse.learning.data.shards import (
     MANIFEST,
     Manifest,
     read_manifest,

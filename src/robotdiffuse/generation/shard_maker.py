@@ -34,7 +34,7 @@ Counts = dict[str, int]
 
 
 def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts]:
-    """Arrays and counts of a shard, as `learning.shards` keeps them.
+    """Arrays and counts of a shard, as `learning.data.shards` keeps them.
 
     Counts: `tried` problems; of those `solved` ones are in the shard, `thinned` ones are trivial and left
     out, of `unsolved` ones the search found no path, and `refused` ones did not pass the judge. Raises

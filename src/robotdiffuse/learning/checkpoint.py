@@ -13,9 +13,9 @@ from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.files import write_atomically
-from robotdiffuse.learning.config import settings_from_json, settings_to_json
 from robotdiffuse.learning.encoders import ENCODERS, Encoder, encoder_name, make_encoder
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
+from robotdiffuse.learning.settings import settings_from_json, settings_to_json
 from robotdiffuse.robots.robot import Robot
 
 FORMAT = 1

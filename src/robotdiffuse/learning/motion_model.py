@@ -12,7 +12,6 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.config import check_gradients, check_kind, of_kind
 from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
 from robotdiffuse.learning.denoisers.layers import Linear
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
@@ -22,6 +21,7 @@ from robotdiffuse.learning.objectives import objective_for
 from robotdiffuse.learning.parametrization import parametrization
 from robotdiffuse.learning.representation import Between, TrajectoryRows
 from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.learning.settings import check_kind, of_kind
 from robotdiffuse.robots.robot import Robot
 
 MAX_POINTS = 2048
@@ -37,6 +37,12 @@ ClearanceFn = Callable[[ndarray], ndarray]
 that sees gradients, to [count, rows, links + dof], see `CollisionChecker.clearances_and_gradients`."""
 GuideFn = Callable[[ndarray, float], ndarray]
 """Predicted joint values [count, frames, dof] (float32), noise level in (0, 1]; to improved joint values."""
+
+
+def check_gradients(sees_gradients: bool, sees_clearances: bool) -> None:
+    """Raises InputError if gradients of clearances are to be seen without clearances."""
+    if sees_gradients and not sees_clearances:
+        raise InputError("sees_gradients is True and sees_clearances is False; gradients need clearances too")
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,10 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.learning.checkpoint import BUNDLED, load_model
+from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.validation import link_clearances
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.base import Call, usable_goals
 from robotdiffuse.planners.rrt_connect import Ends, RRTConnect, RRTConnectSettings, random_state, search_space

@@ -16,8 +16,7 @@ from torch import Tensor
 from torch.utils.data import Dataset, get_worker_info
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.normalizer import JointNormalizer
-from robotdiffuse.learning.shards import (
+from robotdiffuse.learning.data.shards import (
     SPLITS,
     check_shapes,
     read_manifest,
@@ -25,6 +24,7 @@ from robotdiffuse.learning.shards import (
     shard_indices,
     split_of,
 )
+from robotdiffuse.learning.normalizer import JointNormalizer
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import VisibleRegion
 from robotdiffuse.scenes.surface_clouds import surface_clouds

@@ -8,19 +8,20 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from robotdiffuse.collision.arrays import compile_robot, robot_groups
-from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
-from robotdiffuse.learning.batches import Batch, Batches, TrajectoryData, load_data
+from robotdiffuse.collision.arrays import robot_groups
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_model
-from robotdiffuse.learning.config import PlannerTraining, settings_to_json
+from robotdiffuse.learning.clearances import packed_clearances
+from robotdiffuse.learning.data.batches import Batch, Batches, TrajectoryData, load_data
+from robotdiffuse.learning.data.growing_data import GrowingData
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import Encoder, encoder_name, make_encoder
-from robotdiffuse.learning.growing_data import GrowingData
-from robotdiffuse.learning.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
-from robotdiffuse.learning.processes import Processes, on_cpu
-from robotdiffuse.learning.training_run import TrainingRun, Validation
-from robotdiffuse.learning.validation import planning_success
+from robotdiffuse.learning.settings import settings_to_json
+from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
+from robotdiffuse.learning.training.processes import Processes, on_cpu
+from robotdiffuse.learning.training.run import TrainingRun, Validation
+from robotdiffuse.learning.training.validation import planning_success
 from robotdiffuse.learning.versions import versions
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics
@@ -83,14 +84,7 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     # batches are made, and validations planned, on the CPU
     here = on_cpu(model)
 
-    arrays = compile_robot(robot)
-
-    def clearances(kinds: np.ndarray, params: np.ndarray, q: np.ndarray) -> np.ndarray:
-        given, config = (arrays, kinds, params, q, FLOOR, model.config.clearance_high), model.config
-        if config.sees_gradients:
-            told = packed_clearances_and_gradients(*given, config.gradient_margin)
-            return np.concatenate(told, axis=-1)
-        return packed_link_clearances(*given)
+    clearances = packed_clearances(robot, model.config, FLOOR)
 
     def batches_of(rows: TrajectoryData) -> Batches:
         return Batches(rows, here, clearances, settings.trivial_share, settings.weight_limit)

@@ -5,8 +5,9 @@ from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.batches import TrajectoryData, encode_scenes
-from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel, MotionModelConfig
+from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.data.batches import TrajectoryData, encode_scenes
+from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.rop import unpack_scene
 from robotdiffuse.scenes.scene import Scene
@@ -56,17 +57,3 @@ def _sampled_free(
     dense = sampled[:, :-1, None] + share * np.diff(sampled, axis=1)[:, :, None]
     free = checker.free(dense.reshape(-1, robot.dof)).reshape(candidates, -1)
     return np.all(free, axis=1, keepdims=True)[:, 0]
-
-
-def link_clearances(checker: CollisionChecker, config: MotionModelConfig) -> ClearanceFn:
-    """What a model of this config is told of the obstacles."""
-    limit = config.clearance_high
-
-    def clearances(q: ndarray) -> ndarray:
-        rows = q.reshape(-1, q.shape[-1])
-        if config.sees_gradients:
-            told = checker.clearances_and_gradients(rows, limit, config.gradient_margin)
-            return np.concatenate(told, axis=-1).reshape(*q.shape[:2], -1)
-        return checker.link_clearances(rows, limit).reshape(*q.shape[:2], -1)
-
-    return clearances

@@ -24,8 +24,9 @@ from torch import Tensor, nn
 from robotdiffuse.errors import InputError
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
-from robotdiffuse.learning.config import EncoderTraining, PlannerTraining, settings_to_json
-from robotdiffuse.learning.processes import Processes
+from robotdiffuse.learning.settings import settings_to_json
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.training.processes import Processes
 
 FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder", "device")
 """Settings that may differ between the parts of one run."""

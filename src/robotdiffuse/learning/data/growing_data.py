@@ -3,9 +3,9 @@
 import sys
 from collections.abc import Callable
 
-from robotdiffuse.learning.batches import TrajectoryData
-from robotdiffuse.learning.processes import Processes
-from robotdiffuse.learning.shards import read_manifest, shard_indices
+from robotdiffuse.learning.data.batches import TrajectoryData
+from robotdiffuse.learning.data.shards import read_manifest, shard_indices
+from robotdiffuse.learning.training.processes import Processes
 
 GROWTH = 1.25
 """A folder is read again when it has so many times the shards that are known, or all: then all readings

@@ -38,8 +38,8 @@ def turned(
     angle = rng.uniform(np.minimum(low, 0.0), np.maximum(high, 0.0)).astype(np.float32)
     q = q.copy()
     q[:, :, 0] = np.clip(first + angle[:, None], robot.lower[0], robot.upper[0])
-    free = CollisionChecker(robot, Scene([])).free(q.reshape(-1, q.shape[-1]))
-    return q, _turned_scenes(params, angle), free.reshape(len(q), -1).all(axis=1)
+    free = CollisionChecker(robot, Scene([])).free(q.reshape(-1, q.shape[-1])).reshape(len(q), -1)
+    return q, _turned_scenes(params, angle), free.min(axis=1)
 
 
 def _turned_scenes(

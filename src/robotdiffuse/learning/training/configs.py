@@ -8,9 +8,9 @@ Their networks see no clearances, as the paper's: these would make up for what a
 from typing import Any, NamedTuple
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.config import PlannerTraining
 from robotdiffuse.learning.denoisers import PAPER_SIZE
-from robotdiffuse.learning.losses import LossSettings
+from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.training.losses import LossSettings
 
 JOINT = LossSettings()
 JOINT_POINT = LossSettings(point=0.3, frames=4)

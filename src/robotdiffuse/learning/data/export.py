@@ -6,7 +6,7 @@ from pathlib import Path as FilePath
 import numpy as np
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.shards import check_shapes, read_manifest, read_shard, shard_indices
+from robotdiffuse.learning.data.shards import check_shapes, read_manifest, read_shard, shard_indices
 from robotdiffuse.scenes.sampling import SPHERE
 
 FRAMES, DOF = 254, 7

@@ -15,10 +15,10 @@ from torch import Tensor
 from robotdiffuse.errors import InputError
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.checkpoint import fingerprint
+from robotdiffuse.learning.data.shards import SPLITS, check_shard, read_manifest, shard_indices, split_of
+from robotdiffuse.learning.data.turns import turned, turns_about_vertical
 from robotdiffuse.learning.encoders import Encoder
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.learning.shards import SPLITS, check_shard, read_manifest, shard_indices, split_of
-from robotdiffuse.learning.turns import turned, turns_about_vertical
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import BOX, SPHERE
 from robotdiffuse.scenes.surface_clouds import surface_clouds
@@ -97,8 +97,8 @@ def load_data(
 ) -> TrajectoryData:
     """The rows for training and validation of a data set, at `frames` frames, with the codes of their scenes.
 
-    turns: copies of each row for training that are turned by random angles, see `learning.turns`; none if the
-        robot's first joint is not vertical.
+    turns: copies of each row for training that are turned by random angles, see `learning.data.turns`; none
+        if the robot's first joint is not vertical.
 
     Codes are kept beside the shards, in files named by shard and encoder; where the folder cannot be written
     they are made each time. Without an encoder there are none. `report` is told what is being done. Raises

@@ -1,0 +1,45 @@
+"""What a model is told of the obstacles along a noisy trajectory: in planning, and in training."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.arrays import compile_robot
+from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
+from robotdiffuse.learning.motion_model import ClearanceFn, MotionModelConfig
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+
+PackedClearanceFn = Callable[[ndarray, ndarray, ndarray], ndarray]
+"""Packed scenes, kinds [n, k] and params [n, k, 10], and joint values [n, rows, dof] to what `ClearanceFn`
+gives."""
+
+
+def link_clearances(checker: CollisionChecker, config: MotionModelConfig) -> ClearanceFn:
+    """What a model of this config is told of the obstacles."""
+    limit = config.clearance_high
+
+    def clearances(q: ndarray) -> ndarray:
+        rows = q.reshape(-1, q.shape[-1])
+        if config.sees_gradients:
+            told = checker.clearances_and_gradients(rows, limit, config.gradient_margin)
+            return np.concatenate(told, axis=-1).reshape(*q.shape[:2], -1)
+        return checker.link_clearances(rows, limit).reshape(*q.shape[:2], -1)
+
+    return clearances
+
+
+def packed_clearances(robot: Robot, config: MotionModelConfig, fixed: Scene) -> PackedClearanceFn:
+    """The same for training, each trajectory in a scene of its own; `fixed` is part of every scene."""
+    arrays = compile_robot(robot)
+
+    def clearances(kinds: ndarray, params: ndarray, q: ndarray) -> ndarray:
+        given = arrays, kinds, params, q, fixed, config.clearance_high
+        if config.sees_gradients:
+            told = packed_clearances_and_gradients(*given, config.gradient_margin)
+            return np.concatenate(told, axis=-1)
+        return packed_link_clearances(*given)
+
+    return clearances
