@@ -4,6 +4,7 @@ Collision guidance alone, without a network, solves many problems. So what a row
 by trying it without guidance, and by a control: guidance of trajectories that no network made.
 """
 
+import json
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator
@@ -13,12 +14,12 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.evaluation.metrics import LinkPathLength
+from robotdiffuse.evaluation.trials import SEED, Tried, goal_of, held_out_problems, judged
 from robotdiffuse.generation.workers import prepare_worker, stop_pool
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.data.shards import read_manifest
@@ -28,18 +29,9 @@ from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode, unlearned_starts
-from robotdiffuse.planners.rrt_connect import RRTConnect
-from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.rop_problems import sample_problem
-from robotdiffuse.scenes.rop import ROP
-from robotdiffuse.types import Path
-from robotdiffuse.verify import Verifier, VerifySettings
 
-SEED = 20261121
-"""Of the held-out problems; data are drawn from other seed sequences."""
-SEARCH_TIME = 10.0
-"""Problems that this much search does not solve are left out [s]."""
 ENCODER = "compression_autoencoder"
 CONTROL = "no network"
 """The line and random bumps in place of a network's samples."""
@@ -93,22 +85,6 @@ class AblationSettings:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1")
 
 
-@dataclass(frozen=True, eq=False)
-class Tried:
-    """Figures of a network, one value for each problem."""
-
-    single: Float[ndarray, "n"]
-    """Share of the sampled trajectories that passed the judge."""
-    best: Float[ndarray, "n"]
-    """1 where any of them did."""
-    collided: Float[ndarray, "n"]
-    """Share of the sampled trajectories in collision."""
-    length: Float[ndarray, "m"]
-    """Link path length of the shortest that passed, of the problems that have one [m]."""
-    seconds: Float[ndarray, "n"]
-    """Wall time of encoding and sampling."""
-
-
 class RowResult(NamedTuple):
     name: str
     alone: Tried
@@ -119,25 +95,6 @@ class RowResult(NamedTuple):
     @property
     def as_in_paper(self) -> Tried:
         return self.guided if self.name not in ROWS or ROWS[self.name].guided else self.alone
-
-
-def held_out_problems(count: int) -> list[Problem]:
-    """ROP problems that the straight line does not solve and search does."""
-    robot, found, index = load_robot("panda"), [], 0
-    while len(found) < count:
-        problem = sample_problem(robot, ROP, np.random.default_rng([SEED, index]))
-        index += 1
-        line = Path(robot.joint_names, np.stack([problem.start, goal_of(problem)]))
-        if Verifier(problem, VerifySettings()).path(line).valid:
-            continue
-        if RRTConnect().plan(problem, SEARCH_TIME, seed=1).solved:
-            found.append(problem)
-    return found
-
-
-def goal_of(problem: Problem) -> Float[ndarray, "dof"]:
-    assert isinstance(problem.goal, JointGoal)
-    return problem.goal.positions[0]
 
 
 def run_ablation(
@@ -170,7 +127,7 @@ def run_ablation(
     try:
         for config in _done(pool, _train, [(settings, config) for config in configs]):
             report(f"trained {config}")
-        problems = held_out_problems(settings.problems)
+        problems = held_out_problems(settings.problems, FilePath(settings.out) / "problems.json")
         trials = [
             (settings, config, guided, problems) for config in (*configs, None) for guided in (False, True)
         ]
@@ -205,22 +162,31 @@ def _try(
     settings: AblationSettings, config: str | None, guided: bool, problems: list[Problem]
 ) -> tuple[str | None, bool, Tried]:
     robot = load_robot("panda")
+    folder = FilePath(settings.out) / (config or CONTROL.replace(" ", "_"))
+    file = folder / ("tried_guided.json" if guided else "tried.json")
+    weights = None if config is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
+    key = {"problems": len(problems), "candidates": settings.candidates, "weights": weights}
+    known = Tried.load(file, key)
+    if known is not None:
+        return config, guided, known
     measure = LinkPathLength(robot)
     draw = _unlearned(settings.candidates, guided) if config is None else _learned(settings, config, guided)
     single, collided, lengths, seconds = [], [], [], []
     for i, problem in enumerate(problems):
         rng, checker = np.random.default_rng([SEED, 1, i]), CollisionChecker(robot, problem.scene)
-        began = time.perf_counter()
+        began = time.process_time()
         q = draw(checker, problem, rng)
-        seconds.append(time.perf_counter() - began)
-        passed, hit = _judged(problem, q)
+        seconds.append(time.process_time() - began)
+        passed, hit = judged(problem, q)
         single.append(passed.mean())
         collided.append(hit.mean())
         if passed.any():
             lengths.append(measure(q[passed]).min())
     shares = np.array(single)
     arrays = (shares, (shares > 0) * 1.0, np.array(collided), np.array(lengths), np.array(seconds))
-    return config, guided, Tried(*arrays)
+    result = Tried(*arrays)
+    result.save(file, key)
+    return config, guided, result
 
 
 Draw = Callable[[CollisionChecker, Problem, np.random.Generator], ndarray]
@@ -257,19 +223,6 @@ def _unlearned(candidates: int, guided: bool) -> Draw:
         return CollisionGuidance(checker)(q, steps)[0] if guided else q
 
     return draw
-
-
-def _judged(
-    problem: Problem, q: Float[ndarray, "n frames dof"]
-) -> tuple[Bool[ndarray, "n"], Bool[ndarray, "n"]]:
-    """Which trajectories pass the judge, and which are in collision."""
-    judge, passed, hit = Verifier(problem, VerifySettings()), [], []
-    for frames in q.astype(np.float64):
-        frames[0], frames[-1] = problem.start, goal_of(problem)
-        violation = judge.path(Path(problem.robot.joint_names, frames)).violation
-        passed.append(violation is None)
-        hit.append(violation is not None and violation.kind.endswith("collision"))
-    return np.array(passed), np.array(hit)
 
 
 def settings_line(settings: AblationSettings) -> str:
