@@ -159,6 +159,10 @@ BAD_CALL = {
     "no command": ([], "COMMAND"),
     "unknown command": (["plann"], "plann"),
     "missing file": (["plan", "missing.yaml"], "missing.yaml"),
+    "weights of a planner without": (
+        ["plan", "problem.json", "--planner", "rrt_connect", "--weights", "w"], "planner rrt_connect has none"
+    ),
+    "weights that are none": (["plan", "problem.json", "--weights", "."], "model.json"),
     "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: robotdiffuse, rrt_connect"),
     "no time": (["plan", "problem.json", "--time-limit", "0"], "'0' is not a positive number"),
     "endless time": (["plan", "problem.json", "--time-limit", "inf"], "'inf' is not a positive number"),

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from robotdiffuse.cli.arguments import natural, positive
 from robotdiffuse.cli.console import print_result
 from robotdiffuse.cli.draw import ENDINGS, draw, show
+from robotdiffuse.errors import InputError
 
 if TYPE_CHECKING:
     from robotdiffuse.problem import Problem
@@ -32,6 +33,11 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
     )
     parser.add_argument(
         "--planner", metavar="NAME", help="see `robotdiffuse planners` (default: robotdiffuse)"
+    )
+    parser.add_argument(
+        "--weights",
+        metavar="FOLDER",
+        help="of `train planner`, for the planner robotdiffuse (default: bundled)",
     )
     parser.add_argument(
         "--time-limit", type=positive, default=1.0, metavar="S", help="wall time for planning (default: 1 s)"
@@ -67,8 +73,17 @@ def run_plan(arguments: argparse.Namespace) -> int:
     outputs = [check_output(file, (".json", ".csv", *ENDINGS)) for file in arguments.out]
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
+    settings = None
+    if arguments.weights is not None:
+        from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
+
+        if name != RobotDiffuse.name:
+            raise InputError(
+                f"--weights are for the planner {RobotDiffuse.name}; the planner {name} has none"
+            )
+        settings = RobotDiffuseSettings(weights=arguments.weights)
     problem = load_problem(arguments.problem, arguments.index)
-    result = solve(problem, name, arguments.time_limit, arguments.seed)
+    result = solve(problem, name, arguments.time_limit, arguments.seed, settings)
     print_result(result)
     for file in outputs:
         if file.suffix.lower() == ".json":
@@ -103,8 +118,10 @@ def run_demo(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def solve(problem: "Problem", planner: str, time_limit: float, seed: int) -> "PlanResult":
-    """Load the planner and plan, behind a spinner.
+def solve(
+    problem: "Problem", planner: str, time_limit: float, seed: int, settings: object | None = None
+) -> "PlanResult":
+    """Load the planner, with its settings or default ones, and plan, behind a spinner.
 
     A first call, whose result is dropped, loads the compiled code, or compiles it on a new machine, which
     would otherwise use up the time limit.
@@ -115,7 +132,7 @@ def solve(problem: "Problem", planner: str, time_limit: float, seed: int) -> "Pl
 
     console = Console(stderr=True)
     with console.status("loading compiled code (a new machine compiles it first, for about a minute)"):
-        loaded = load_planner(planner)
+        loaded = load_planner(planner, settings)
         loaded.plan(problem, time_limit=WARM_UP, seed=seed)
     with console.status(f"planning with {planner}"):
         return loaded.plan(problem, time_limit=time_limit, seed=seed)
