@@ -33,8 +33,11 @@ lint: .venv/dev.stamp
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+# not benchmarks but parts of them, and curves of runs that are to be named
+BENCHMARKS := $(filter-out %/report.py %/problems.py %/curves.py,$(wildcard benchmarks/*.py))
+
 bench: .venv/dev.stamp
-	set -e; for file in benchmarks/*.py; do echo "== $$file"; $(BIN)/python "$$file"; done
+	set -e; for file in $(BENCHMARKS); do echo "== $$file"; $(BIN)/python "$$file"; done
 
 weights: .venv/dev.stamp
 	$(BIN)/robotdiffuse data generate --out runs/panda/data --trajectories 31000 --seed 7 \
