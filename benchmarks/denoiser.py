@@ -36,6 +36,7 @@ from robotdiffuse.problem import Problem
 
 SAMPLES = 16
 STEPS = 5
+"""The planner's default is RobotDiffuseSettings.sampling_steps."""
 TARGET = 0.06
 """Time of a batch that we want to stay below on two cores [s]."""
 BATCHES = (16, 64, 256, 1024)
@@ -172,7 +173,8 @@ def split(batches: list[Batch], repeats: int) -> None:
     ms = {name: 1e3 * seconds / calls for name, seconds in meter.spent.items()}
     ms["the rest: sampler, features, ends"] = 2 * ms["all"] - sum(ms.values()) + ms["encoder, once a problem"]
     order = ["denoiser", "clearances", "guidance", "the rest: sampler, features, ends"]
-    rows = [[name, f"{ms[name]:.1f}", f"{ms[name] / ms['all']:.0%}"] for name in [*order, "all"]]
+    parts = {name: ms.get(name, 0.0) for name in [*order, "all"]}  # weights may see no clearances
+    rows = [[name, f"{part:.1f}", f"{part / ms['all']:.0%}"] for name, part in parts.items()]
     rows.append(["encoder, once a problem", f"{ms['encoder, once a problem']:.1f}", ""])
     print_table("CPU time of a guided batch, one thread, mean", ["", "ms", "share"], rows)
 

@@ -9,14 +9,18 @@ called solved passed the judge; motions of the whole planner are confirmed by Py
 
 import argparse
 import time
+from collections.abc import Callable
+from math import ceil
 from pathlib import Path as File
 from typing import NamedTuple
 
 import numpy as np
-from problems import RUNS, SEARCH_TIME, SEED, Case, Drawn, draw_cases, families_of, goal_of, judged
+from numpy import ndarray
+from problems import PANDA, RUNS, SEARCH_TIME, SEED, Case, Drawn, draw_cases, families_of, goal_of, judged
 from report import header, print_table, progress, share
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.robotdiffuse import (
     Candidates,
@@ -40,17 +44,44 @@ class Outcome(NamedTuple):
     """CPU time."""
 
 
-def network_alone(planner: RobotDiffuse, cases: list[Case], title: str) -> list[str]:
-    """One batch of sixteen per problem, straight from the sampler: no refinement, no search, no shortcuts."""
-    single, best, lengths, seconds = [], [], [], []
-    model = planner.model(cases[0].problem.robot)
+Draw = Callable[[CollisionChecker, Problem, np.random.Generator], ndarray]
+"""Sixteen trajectories for a problem."""
+
+
+def sampled(planner: RobotDiffuse) -> Draw:
+    """The network alone: straight from the sampler, no refinement, no search, no shortcuts."""
+    model = planner.model(PANDA)
     assert model is not None
+
+    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
+        code = encode(model, checker, planner.settings.points, rng)
+        return planner.sample(model, checker, code, problem.start, goal_of(problem)[None], rng).q
+
+    return draw
+
+
+def guided_bumps(planner: RobotDiffuse) -> Draw:
+    """The control of guidance: as many gradient steps, from the line and random bumps."""
+    settings, model = planner.settings, planner.model(PANDA)
+    assert model is not None
+    steps = settings.guidance_steps * ceil(settings.guided_share * settings.sampling_steps)
+
+    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
+        ends = problem.start, goal_of(problem)
+        q = unlearned_starts(*ends, settings.samples, model.config.frames, problem.robot, rng)
+        return CollisionGuidance(checker, settings.guidance)(q, steps)[0]
+
+    return draw
+
+
+def tried(draw: Draw, cases: list[Case], title: str) -> list[str]:
+    """One batch of trajectories per problem, as they are."""
+    single, best, lengths, seconds = [], [], [], []
     for i, case in enumerate(progress(cases, title)):
         rng = np.random.default_rng([SEED, 1, i])
         checker = CollisionChecker(case.problem.robot, case.problem.scene)
         began = time.process_time()
-        code = encode(model, checker, planner.settings.points, rng)
-        q = planner.sample(model, checker, code, case.problem.start, goal_of(case.problem)[None], rng).q
+        q = draw(checker, case.problem, rng)
         seconds.append(time.process_time() - began)
         passed = judged(case.problem, q)
         single.append(passed.mean())
@@ -130,9 +161,13 @@ def report(family: str, drawn: Drawn, weights: str | None) -> None:
     )
     planner = RobotDiffuse(RobotDiffuseSettings(weights=weights))
     unguided = RobotDiffuse(RobotDiffuseSettings(weights=weights, guidance_steps=0))
-    rows = [network_alone(planner, hard, "guided"), network_alone(unguided, hard, "without guidance")]
+    rows = [
+        tried(sampled(planner), hard, "guided"),
+        tried(sampled(unguided), hard, "without guidance"),
+        tried(guided_bumps(planner), hard, "control: guidance of line and bumps"),
+    ]
     if trivial:
-        rows.append(network_alone(planner, drawn.cases, "guided, trivial ones too"))
+        rows.append(tried(sampled(planner), drawn.cases, "guided, trivial ones too"))
     print_table(
         "", ["(a) network alone, 16 samples", "single", "best of 16", "length*", "CPU ms median / p95"], rows
     )

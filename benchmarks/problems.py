@@ -8,6 +8,7 @@ is read by the benchmarks; drawing stops and goes on at any line.
 """
 
 import argparse
+import itertools
 import json
 import time
 from collections.abc import Iterator
@@ -22,6 +23,8 @@ from rich.progress import Progress
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation import trials
+from robotdiffuse.evaluation.trials import SEARCH_TIME, SEED, goal_of
 from robotdiffuse.generation.problems import draw_problem
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.planners import rrt_connect_kernel as kernel
@@ -34,12 +37,8 @@ from robotdiffuse.scenes.rop import RopSettings
 from robotdiffuse.types import Path
 from robotdiffuse.verify import VerifySettings, verifier
 
-SEED = 20261121
-"""Training data are drawn from other seed sequences."""
 RUNS = 16
 """RRT-Connect runs after the one that decides; the shortest path of all is the reference length."""
-SEARCH_TIME = 10.0
-"""Problems that RRT-Connect does not solve within this wall time are left out [s]."""
 PANDA = load_robot("panda")
 
 
@@ -62,12 +61,6 @@ class Drawn(NamedTuple):
         return [case for case in self.cases if not case.trivial]
 
 
-def goal_of(problem: Problem) -> Float[ndarray, "dof"]:
-    """The first goal configuration."""
-    assert isinstance(problem.goal, JointGoal)
-    return problem.goal.positions[0]
-
-
 def draw(family: str, index: int) -> Problem:
     """Problem number so and so of a family.
 
@@ -75,11 +68,11 @@ def draw(family: str, index: int) -> Problem:
     Furniture: both are poses with the fingers in two regions of it; the first solution of inverse kinematics.
     """
     settings = FAMILIES[family]
-    if isinstance(settings, RopSettings):
-        # the ones of rop keep the numbers that they had before there were other families
-        seed = [SEED, index] if family == "rop" else [SEED, 10 + list(FAMILIES).index(family), index]
-        return sample_problem(PANDA, settings, np.random.default_rng(seed))
+    if family == "rop":
+        return trials.problem_number(index)
     rng = np.random.default_rng([SEED, 10 + list(FAMILIES).index(family), index])
+    if isinstance(settings, RopSettings):
+        return sample_problem(PANDA, settings, rng)
     drawn = draw_problem(GenerationSettings(mix={family: 1.0}, target="pose", goals=1), PANDA, rng)
     return Problem(PANDA, drawn.scene, drawn.start, JointGoal(drawn.goals[:1]))
 
@@ -108,18 +101,16 @@ def _judged(family: str, folder: File | None, search_time: float) -> Iterator[tu
     """Number, reference length (None: not solved in time) and whether it is trivial: known ones, then new."""
     file = folder / f"{family}_{search_time:g}s.jsonl" if folder else None
     lines = file.read_text().splitlines() if file and file.exists() else []
-    for line in lines:
-        known = json.loads(line)
-        yield known["index"], known["reference"], known["trivial"]
-    index = len(lines)
-    while True:
-        reference, trivial = _reference(draw(family, index), search_time)
-        if file:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with file.open("a") as stream:
-                stream.write(json.dumps({"index": index, "reference": reference, "trivial": trivial}) + "\n")
-        yield index, reference, trivial
-        index += 1
+    known = {case["index"]: case for case in map(json.loads, lines)}
+    for index in itertools.count():
+        if index not in known:
+            reference, trivial = _reference(draw(family, index), search_time)
+            known[index] = {"index": index, "reference": reference, "trivial": trivial}
+            if file:
+                file.parent.mkdir(parents=True, exist_ok=True)
+                with file.open("a") as stream:
+                    stream.write(json.dumps(known[index]) + "\n")
+        yield index, known[index]["reference"], known[index]["trivial"]
 
 
 def _reference(problem: Problem, search_time: float) -> tuple[float | None, bool]:
@@ -147,12 +138,7 @@ def shortest_of_runs(problem: Problem, search_time: float) -> float:
 
 def judged(problem: Problem, q: Float[ndarray, "count frames dof"]) -> Bool[ndarray, "count"]:
     """Which trajectories, taken frame by frame as they are, pass the judge."""
-    judge, start, goal = verifier(problem, VerifySettings()), problem.start, goal_of(problem)
-    verdicts = []
-    for frames in q.astype(np.float64):
-        frames[0], frames[-1] = start, goal
-        verdicts.append(judge.path(Path(problem.robot.joint_names, frames)).valid)
-    return np.array(verdicts, bool)
+    return trials.judged(problem, q)[0]
 
 
 def families_of(text: str) -> list[str]:

@@ -41,6 +41,12 @@ def _share(values: "ndarray") -> tuple[str, str]:
     return f"{100 * values.mean():.1f}", f"{low:.1f} to {high:.1f}"
 
 
+def _mean(values: "ndarray", form: str) -> str:
+    """Of those that are not nan."""
+    known = values[values == values]
+    return form.format(known.mean()) if len(known) else "-"
+
+
 def run_ablation(arguments: argparse.Namespace) -> int:
     import sys
 
@@ -60,33 +66,29 @@ def run_ablation(arguments: argparse.Namespace) -> int:
     title = f"Table 2: {ablation.settings_line(settings)}"
     table = Table(title=title, title_justify="left", box=None, padding=(0, 1))
     table.add_column("row")
-    columns = (
-        "guided",
-        "single %",
-        "95 %",
-        "best %",
-        "collision %",
-        "95 %",
-        "length m",
-        "ms",
-        "unguided %",
-        "95 %",
-    )
-    for column in (*columns, "paper: suc", "col", "len", "s"):
+    columns = "guided", "single %", "95 %", "best %", "collision %", "95 %", "length m", "to first", "CPU ms"
+    for column in (*columns, "unguided %", "95 %", "paper: suc", "col", "len", "s"):
         table.add_column(column, justify="right")
+    first = results[0].as_in_paper
     for result in results:
-        tried = result.as_in_paper
-        row = ablation.ROWS.get(result.name)
+        tried, row = result.as_in_paper, ablation.ROWS.get(result.name)
         table.add_row(
             result.name,
             "yes" if tried is result.guided else "no",
             *_share(tried.single),
             f"{100 * tried.best.mean():.1f}",
             *_share(tried.collided),
-            f"{tried.length.mean():.3f}" if len(tried.length) else "-",
+            _mean(tried.length, "{:.3f}"),
+            _mean(tried.length / first.length, "{:.3f}"),
             f"{1e3 * np.median(tried.seconds):.0f}",
             *_share(result.alone.single),
             *("-" if row is None else f"{value:g}" for value in (row.paper if row else (0,) * 4)),
         )
     Console(width=None if sys.stdout.isatty() else 170).print(table)
+    print(
+        "single: share of samples that pass the judge; best: of problems with at least one such sample.\n"
+        "length: of the shortest such sample, over the problems that have one; to first: the mean ratio to\n"
+        "that of the first row, over the problems that both solve. Intervals are over problems, of one\n"
+        "training each: another seed may move a row by more."
+    )
     return 0

@@ -10,8 +10,9 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
+from math import ceil
 from pathlib import Path as FilePath
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -20,6 +21,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.evaluation.metrics import LinkPathLength
 from robotdiffuse.evaluation.trials import SEED, Tried, goal_of, held_out_problems, judged
+from robotdiffuse.files import alone_in
 from robotdiffuse.generation.workers import prepare_worker, stop_pool
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.data.shards import read_manifest
@@ -113,12 +115,20 @@ def run_ablation(
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
     read_manifest(settings.data).check_robot(load_robot("panda"))
+    with alone_in(FilePath(settings.out)):
+        return _run(settings, rows, workers, report)
+
+
+def _run(
+    settings: AblationSettings, rows: list[str], workers: int, report: Callable[[str], None]
+) -> list[RowResult]:
     encoder = FilePath(settings.out) / ENCODER
     if not (encoder / "encoder.json").exists():
         report(f"training {ENCODER}: {settings.encoder_samples:,} clouds")
         train_encoder(
             EncoderTraining(name=ENCODER, minutes=None, samples=settings.encoder_samples), str(encoder)
         )
+    _check_budget(encoder / "encoder.json", "encoder_samples", settings.encoder_samples)
     configs = list(dict.fromkeys(ROWS[name].config for name in rows))
     tried: dict[tuple[str | None, bool], Tried] = {}
     # fresh interpreters: forked ones could inherit locks of running threads
@@ -126,7 +136,9 @@ def run_ablation(
     pool = ProcessPoolExecutor(workers, context, initializer=prepare_worker)
     try:
         for config in _done(pool, _train, [(settings, config) for config in configs]):
+            _check_budget(FilePath(settings.out) / config / "model.json", "samples", settings.samples)
             report(f"trained {config}")
+        _check_same_data(settings, configs)
         problems = held_out_problems(settings.problems, FilePath(settings.out) / "problems.json")
         trials = [
             (settings, config, guided, problems) for config in (*configs, None) for guided in (False, True)
@@ -141,6 +153,28 @@ def run_ablation(
         RowResult(name, *(tried[ROWS[name].config, guided] for guided in (False, True))) for name in rows
     ]
     return [*results, RowResult(CONTROL, tried[None, False], tried[None, True])]
+
+
+def _training(file: FilePath) -> dict[str, Any]:
+    return json.loads(file.read_text())["training"]
+
+
+def _check_budget(file: FilePath, name: str, wanted: int) -> None:
+    """Raises InputError if a network was trained longer or shorter."""
+    found = _training(file)["settings"]["samples"]
+    if found != wanted:
+        raise InputError(
+            f"{file.parent} was trained with {name} {found}, now it is {wanted}; use another folder, "
+            "or the same budget"
+        )
+
+
+def _check_same_data(settings: AblationSettings, configs: list[str]) -> None:
+    """Raises InputError unless all networks saw the same data."""
+    seen = {config: _training(FilePath(settings.out) / config / "model.json")["data"] for config in configs}
+    if len(set(seen.values())) > 1:
+        found = ", ".join(f"{config} {digest}" for config, digest in seen.items())
+        raise InputError(f"{settings.out} holds networks of different data: {found}; use another folder")
 
 
 def _done(pool: ProcessPoolExecutor, work: Callable, arguments: list[tuple]) -> Iterator:
@@ -165,12 +199,14 @@ def _try(
     folder = FilePath(settings.out) / (config or CONTROL.replace(" ", "_"))
     file = folder / ("tried_guided.json" if guided else "tried.json")
     weights = None if config is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
-    key = {"problems": len(problems), "candidates": settings.candidates, "weights": weights}
+    planner = _planner_settings(settings, config, guided)
+    sampling = json.loads(json.dumps(asdict(planner) | {"weights": weights}))
+    key = {"problems": len(problems), "planner": sampling}
     known = Tried.load(file, key)
     if known is not None:
         return config, guided, known
     measure = LinkPathLength(robot)
-    draw = _unlearned(settings.candidates, guided) if config is None else _learned(settings, config, guided)
+    draw = _unlearned(planner, guided) if config is None else _learned(planner)
     single, collided, lengths, seconds = [], [], [], []
     for i, problem in enumerate(problems):
         rng, checker = np.random.default_rng([SEED, 1, i]), CollisionChecker(robot, problem.scene)
@@ -180,8 +216,7 @@ def _try(
         passed, hit = judged(problem, q)
         single.append(passed.mean())
         collided.append(hit.mean())
-        if passed.any():
-            lengths.append(measure(q[passed]).min())
+        lengths.append(measure(q[passed]).min() if passed.any() else np.nan)
     shares = np.array(single)
     arrays = (shares, (shares > 0) * 1.0, np.array(collided), np.array(lengths), np.array(seconds))
     result = Tried(*arrays)
@@ -193,15 +228,19 @@ Draw = Callable[[CollisionChecker, Problem, np.random.Generator], ndarray]
 """Candidates for a problem [candidates, frames, dof]."""
 
 
-def _learned(settings: AblationSettings, config: str, guided: bool) -> Draw:
-    weights, robot = str(FilePath(settings.out) / config), load_robot("panda")
+def _planner_settings(settings: AblationSettings, config: str | None, guided: bool) -> RobotDiffuseSettings:
     steps = RobotDiffuseSettings().guidance_steps if guided else 0
-    points = load_model(weights, robot).config.encoder_settings.cloud
-    planner = RobotDiffuse(
-        RobotDiffuseSettings(
-            weights=weights, samples=settings.candidates, guidance_steps=steps, points=points
-        )
+    if config is None:
+        return RobotDiffuseSettings(samples=settings.candidates, guidance_steps=steps)
+    weights = str(FilePath(settings.out) / config)
+    points = load_model(weights, load_robot("panda")).config.encoder_settings.cloud
+    return RobotDiffuseSettings(
+        weights=weights, samples=settings.candidates, guidance_steps=steps, points=points
     )
+
+
+def _learned(settings: RobotDiffuseSettings) -> Draw:
+    planner, robot, points = RobotDiffuse(settings), load_robot("panda"), settings.points
     model = planner.model(robot)
     assert model is not None
 
@@ -212,10 +251,10 @@ def _learned(settings: AblationSettings, config: str, guided: bool) -> Draw:
     return draw
 
 
-def _unlearned(candidates: int, guided: bool) -> Draw:
+def _unlearned(settings: RobotDiffuseSettings, guided: bool) -> Draw:
     """The control takes as many gradient steps as a network's samples do, all of them one after the other."""
-    defaults = RobotDiffuseSettings()
-    steps = defaults.guidance_steps * (defaults.sampling_steps - defaults.sampling_steps // 2)
+    steps = settings.guidance_steps * ceil(settings.guided_share * settings.sampling_steps)
+    candidates = settings.samples
 
     def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
         robot = problem.robot

@@ -34,8 +34,8 @@ class Tried:
     """1 where any of them did."""
     collided: Float[ndarray, "n"]
     """Share of the sampled trajectories in collision."""
-    length: Float[ndarray, "m"]
-    """Link path length of the shortest that passed, of the problems that have one [m]."""
+    length: Float[ndarray, "n"]
+    """Link path length of the shortest that passed [m]; nan where none did."""
     seconds: Float[ndarray, "n"]
     """CPU time of encoding and sampling, on one thread."""
 

@@ -1,8 +1,6 @@
 """From settings to a folder of shards: what is there is kept, what is missing is made, here or on Ray."""
 
-import fcntl
 import json
-import os
 import signal
 import threading
 from collections.abc import Callable, Iterator
@@ -12,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.files import alone_in
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.workers import CLUSTERS, on_this_machine, versions
 from robotdiffuse.learning.data.shards import (
@@ -49,7 +48,7 @@ def generate(
     if cluster is not None and cluster not in CLUSTERS:
         raise unknown_name("cluster", cluster, CLUSTERS)
     wanted = manifest_of(settings)
-    with _alone_in(out):
+    with alone_in(out):
         try:
             remove_leftovers(out)
             _claim(wanted, out)
@@ -103,27 +102,6 @@ def _interrupts_afterwards() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if caught:
         signal.raise_signal(signal.SIGINT)
-
-
-@contextmanager
-def _alone_in(out: Path) -> Iterator[None]:
-    """Make the folder and lock it; the lock ends with this process, however that ends."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        folder = os.open(out, os.O_RDONLY | os.O_DIRECTORY)
-    except OSError as error:
-        why = "it is a file" if isinstance(error, FileExistsError) else error.strerror
-        raise InputError(f"cannot use the folder {out}: {why}") from None
-    try:
-        try:
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"another process is filling {out}; wait for it") from None
-        except OSError:
-            pass  # a file system without locks
-        yield
-    finally:
-        os.close(folder)
 
 
 def manifest_of(settings: GenerationSettings) -> Manifest:

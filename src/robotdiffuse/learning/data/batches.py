@@ -129,10 +129,12 @@ def load_data(
         train = split == SPLITS.index("train")
         for turn in range(1, turns + 1):
             rng = np.random.default_rng([int(shard.fingerprint, 16), turn])
-            q_turned, params_turned, clear = turned(robot, q, params, rng)
+            # the stored frames: codes are kept for scenes turned by these angles, for any number of frames
+            q_turned, params_turned, clear = turned(robot, shard["trajectories"][:], params, rng)
             codes = _codes(FilePath(folder), kinds, params_turned, encoder, f"{key}-turn{turn}")
             of = train & clear
-            parts["train"].append((q_turned[of], kinds[of], params_turned[of], trivial[of], codes[of]))
+            q_turned = resample_evenly(q_turned[of], frames)
+            parts["train"].append((q_turned, kinds[of], params_turned[of], trivial[of], codes[of]))
             rows += int(of.sum())
         report(f"data: {i + 1} of {len(indices)} shards, {rows:,} trajectories")
     ordered = parts["train"] + parts["validation"]
@@ -250,6 +252,8 @@ class Batch:
     """What the network is to output, by the model's objective."""
     weight: Float[ndarray, "n"]
     """Of the squared error of the output, by level."""
+    clean_weight: Float[ndarray, "n"]
+    """The same of errors of the clean trajectory that the output stands for."""
     base: Float[ndarray, "n rows dof"]
     """What rows are relative to, see `Between`."""
     signal: Float[ndarray, "n 1 1"]
@@ -310,6 +314,7 @@ class Batches:
         noisy = signal * clean + noise_level * noise
         target = model.objective.target(clean, noise, signal, noise_level)
         weight = model.objective.weight(schedule, levels, self.weight_limit)
+        per_output = model.objective.clean_per_output(schedule.signal[levels], schedule.noise[levels])
         held = model.hold(noisy.copy(), between)
         return Batch(
             features=model.features(held, between, lambda at: self.clearances(kinds, params, at)),
@@ -320,6 +325,7 @@ class Batches:
             noisy=noisy,
             target=target,
             weight=weight.astype(np.float32),
+            clean_weight=(weight / per_output**2).astype(np.float32),
             base=between.base,
             signal=signal,
             noise_level=noise_level,

@@ -31,7 +31,7 @@ CONFIGS: dict[str, Config] = {
         "what ships: 48 frames, 1.7 M parameters, sees clearances and their gradients",
         {
             "minutes": None,
-            "samples": 3_200_000,
+            "samples": 2_400_000,
             "sees_gradients": True,
             "condition_drop": 0.1,
             "losses": JOINT_POINT_COLLISION,
@@ -45,6 +45,7 @@ CONFIGS: dict[str, Config] = {
             "batch": 64,
             "learning_rate": 3e-4,
             "frames": 254,
+            "turns": 0,
             "target": "absolute",
             "smooth_noise": False,
             "sampler": "ddpm",

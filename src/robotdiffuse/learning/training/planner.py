@@ -197,11 +197,12 @@ class _Loss:
                 condition = torch.cat([z, condition[:, z.shape[1] :]], 1)
             hidden = None if dropped is None else dropped.to(device)
             output = model.denoise(features, level, condition, hidden)
-        error = losses.joint * (output - target)[:, 1:-1].square().mean((1, 2))
+        error = weight * losses.joint * (output - target)[:, 1:-1].square().mean((1, 2))
         collision_weight = losses.collision_weight(fraction)
         if self.points is not None or collision_weight > 0:
-            error = error + self._in_space(batch, output, collision_weight, rng)
-        return (weight * error).mean()
+            clean_weight = torch.from_numpy(batch.clean_weight).to(self.processes.device)
+            error = error + clean_weight * self._in_space(batch, output, collision_weight, rng)
+        return error.mean()
 
     def _in_space(
         self,

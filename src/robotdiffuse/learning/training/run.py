@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
@@ -22,7 +22,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.files import write_atomically
+from robotdiffuse.files import alone_in, write_atomically
 from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
 from robotdiffuse.learning.settings import settings_to_json
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
@@ -124,12 +124,13 @@ class TrainingRun:
     ) -> None:
         """Train to the end. Ctrl-C stores a checkpoint first, then raises KeyboardInterrupt.
 
-        `after_checkpoint` is called after all checkpoints but the last.
+        `after_checkpoint` is called after all checkpoints but the last. Raises InputError if another training
+        uses the folder.
         """
         threads = torch.get_num_threads()
         torch.set_num_threads(self.settings.threads)
         try:
-            with _stop_requested() as stop, _progress(shown=self.processes.first) as progress:
+            with self._alone(), _stop_requested() as stop, _progress(self.processes.first) as progress:
                 task = progress.add_task(title, total=1.0, rate="", loss="")
                 last = saved = time.monotonic()
                 stopped: float | bool = False
@@ -154,6 +155,9 @@ class TrainingRun:
                     raise KeyboardInterrupt
         finally:
             torch.set_num_threads(threads)
+
+    def _alone(self) -> AbstractContextManager[None]:
+        return alone_in(self.out) if self.processes.first else nullcontext()
 
     def step(self, loss: LossFn) -> None:
         """One step of the optimiser; a loss or gradient that is not finite changes no weight."""
