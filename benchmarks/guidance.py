@@ -165,7 +165,7 @@ def draw(
         axes.set(xscale="log", xlabel="sampling steps", ylim=(0, 102))
         axes.set_xticks(ticks, [str(steps) for steps in ticks])
         axes.minorticks_off()
-        axes.legend(frameon=False, loc="best")
+        axes.legend(frameon=False, loc="lower left")
     for axes in panels[:, 0]:
         axes.set_ylabel("motions that pass the judge, %")
     file.parent.mkdir(parents=True, exist_ok=True)
