@@ -32,8 +32,8 @@ LONG = 50
 GRADIENT_STEPS = (0, 2, 4, 8)
 """At each guided sampling step; 0 is without collision guidance."""
 SCALES = (0.0, 1.0, 1.5, 2.0, 4.0)
-"""Of classifier-free guidance: 1 is the network itself; at 0 its condition is hidden, and what it is told of the
-ends and clearances along the motion is left."""
+"""Of classifier-free guidance: 1 is the network itself; at 0 its condition is hidden, and what it is told of
+the ends and of clearances along the motion is left."""
 SCALED_STEPS = (1, 2, 5, 10)
 """Sampling steps that the scales are tried with."""
 COLORS = ("#8a94a3", "#7fb3e0", "#3f7fc4", "#14487f", "#d1495b")
