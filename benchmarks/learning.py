@@ -120,23 +120,20 @@ Method = Callable[[Arena], Iterator[ndarray | None]]
 """Yields paths as it finds them; None where it only wants to be asked whether there is time left."""
 
 
-def network(arena: Arena) -> Iterator[ndarray | None]:
+def one_batch(arena: Arena) -> Candidates:
+    """Samples of the network, refined if none is free."""
     planner, checker = arena.planner, arena.checker
     code = encode(arena.model, checker, planner.settings.points, arena.rng)
     found = planner.sample(arena.model, checker, code, arena.start, arena.goals, arena.rng)
-    yield None
-    if not found.free.any():
-        found = planner.refine(checker, found.q)
-    yield from arena.shortened(found)
+    return found if found.free.any() else planner.refine(checker, found.q)
+
+
+def network(arena: Arena) -> Iterator[ndarray | None]:
+    yield from arena.shortened(one_batch(arena))
 
 
 def as_sampled(arena: Arena) -> Iterator[ndarray | None]:
-    planner, checker = arena.planner, arena.checker
-    code = encode(arena.model, checker, planner.settings.points, arena.rng)
-    found = planner.sample(arena.model, checker, code, arena.start, arena.goals, arena.rng)
-    yield None
-    if not found.free.any():
-        found = planner.refine(checker, found.q)
+    found = one_batch(arena)
     yield from found.q[found.free]
 
 

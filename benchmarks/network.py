@@ -9,18 +9,15 @@ called solved passed the judge; motions of the whole planner are confirmed by Py
 
 import argparse
 import time
-from collections.abc import Callable
-from math import ceil
 from pathlib import Path as File
 from typing import NamedTuple
 
 import numpy as np
-from numpy import ndarray
 from problems import PANDA, RUNS, SEARCH_TIME, SEED, Case, Drawn, draw_cases, families_of, goal_of, judged
 from report import header, print_table, progress, share
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.guidance import CollisionGuidance
+from robotdiffuse.evaluation.trials import Draw, from_network, without_network
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.robotdiffuse import (
     Candidates,
@@ -42,36 +39,6 @@ class Outcome(NamedTuple):
     """[rad]"""
     seconds: float
     """CPU time."""
-
-
-Draw = Callable[[CollisionChecker, Problem, np.random.Generator], ndarray]
-"""Sixteen trajectories for a problem."""
-
-
-def sampled(planner: RobotDiffuse) -> Draw:
-    """The network alone: straight from the sampler, no refinement, no search, no shortcuts."""
-    model = planner.model(PANDA)
-    assert model is not None
-
-    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
-        code = encode(model, checker, planner.settings.points, rng)
-        return planner.sample(model, checker, code, problem.start, goal_of(problem)[None], rng).q
-
-    return draw
-
-
-def guided_bumps(planner: RobotDiffuse) -> Draw:
-    """The control of guidance: as many gradient steps, from the line and random bumps."""
-    settings, model = planner.settings, planner.model(PANDA)
-    assert model is not None
-    steps = settings.guidance_steps * ceil(settings.guided_share * settings.sampling_steps)
-
-    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
-        ends = problem.start, goal_of(problem)
-        q = unlearned_starts(*ends, settings.samples, model.config.frames, problem.robot, rng)
-        return CollisionGuidance(checker, settings.guidance)(q, steps)[0]
-
-    return draw
 
 
 def tried(draw: Draw, cases: list[Case], title: str) -> list[str]:
@@ -161,13 +128,16 @@ def report(family: str, drawn: Drawn, weights: str | None) -> None:
     )
     planner = RobotDiffuse(RobotDiffuseSettings(weights=weights))
     unguided = RobotDiffuse(RobotDiffuseSettings(weights=weights, guidance_steps=0))
+    model = planner.model(PANDA)
+    assert model is not None
+    frames = model.config.frames
     rows = [
-        tried(sampled(planner), hard, "guided"),
-        tried(sampled(unguided), hard, "without guidance"),
-        tried(guided_bumps(planner), hard, "control: guidance of line and bumps"),
+        tried(from_network(planner.settings), hard, "guided"),
+        tried(from_network(unguided.settings), hard, "without guidance"),
+        tried(without_network(planner.settings, frames), hard, "control: guidance of line and bumps"),
     ]
     if trivial:
-        rows.append(tried(sampled(planner), drawn.cases, "guided, trivial ones too"))
+        rows.append(tried(from_network(planner.settings), drawn.cases, "guided, trivial ones too"))
     print_table(
         "", ["(a) network alone, 16 samples", "single", "best of 16", "length*", "CPU ms median / p95"], rows
     )

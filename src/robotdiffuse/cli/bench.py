@@ -82,7 +82,7 @@ def run_ablation(arguments: argparse.Namespace) -> int:
             _mean(tried.length / first.length, "{:.3f}"),
             f"{1e3 * np.median(tried.seconds):.0f}",
             *_share(result.alone.single),
-            *("-" if row is None else f"{value:g}" for value in (row.paper if row else (0,) * 4)),
+            *(["-"] * 4 if row is None else (f"{value:g}" for value in row.paper)),
         )
     Console(width=None if sys.stdout.isatty() else 170).print(table)
     print(

@@ -10,27 +10,31 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass
-from math import ceil
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.evaluation.metrics import LinkPathLength
-from robotdiffuse.evaluation.trials import SEED, Tried, goal_of, held_out_problems, judged
+from robotdiffuse.evaluation.trials import (
+    SEED,
+    Tried,
+    from_network,
+    held_out_problems,
+    judged,
+    without_network,
+)
 from robotdiffuse.files import alone_in
 from robotdiffuse.generation.workers import prepare_worker, stop_pool
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.data.shards import read_manifest
-from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode, unlearned_starts
+from robotdiffuse.planners.robotdiffuse import RobotDiffuseSettings
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots import load_robot
 
@@ -206,7 +210,7 @@ def _try(
     if known is not None:
         return config, guided, known
     measure = LinkPathLength(robot)
-    draw = _unlearned(planner, guided) if config is None else _learned(planner)
+    draw = without_network(planner, CONTROL_FRAMES) if config is None else from_network(planner)
     single, collided, lengths, seconds = [], [], [], []
     for i, problem in enumerate(problems):
         rng, checker = np.random.default_rng([SEED, 1, i]), CollisionChecker(robot, problem.scene)
@@ -224,10 +228,6 @@ def _try(
     return config, guided, result
 
 
-Draw = Callable[[CollisionChecker, Problem, np.random.Generator], ndarray]
-"""Candidates for a problem [candidates, frames, dof]."""
-
-
 def _planner_settings(settings: AblationSettings, config: str | None, guided: bool) -> RobotDiffuseSettings:
     steps = RobotDiffuseSettings().guidance_steps if guided else 0
     if config is None:
@@ -237,31 +237,6 @@ def _planner_settings(settings: AblationSettings, config: str | None, guided: bo
     return RobotDiffuseSettings(
         weights=weights, samples=settings.candidates, guidance_steps=steps, points=points
     )
-
-
-def _learned(settings: RobotDiffuseSettings) -> Draw:
-    planner, robot, points = RobotDiffuse(settings), load_robot("panda"), settings.points
-    model = planner.model(robot)
-    assert model is not None
-
-    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
-        code = encode(model, checker, points, rng)
-        return planner.sample(model, checker, code, problem.start, goal_of(problem)[None], rng).q
-
-    return draw
-
-
-def _unlearned(settings: RobotDiffuseSettings, guided: bool) -> Draw:
-    """The control takes as many gradient steps as a network's samples do, all of them one after the other."""
-    steps = settings.guidance_steps * ceil(settings.guided_share * settings.sampling_steps)
-    candidates = settings.samples
-
-    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
-        robot = problem.robot
-        q = unlearned_starts(problem.start, goal_of(problem), candidates, CONTROL_FRAMES, robot, rng)
-        return CollisionGuidance(checker)(q, steps)[0] if guided else q
-
-    return draw
 
 
 def settings_line(settings: AblationSettings) -> str:

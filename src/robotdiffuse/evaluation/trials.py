@@ -1,7 +1,9 @@
 """Held-out ROP problems, and what a network's samples are worth on them; both kept in files."""
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from math import ceil
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -9,7 +11,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.files import write_atomically
+from robotdiffuse.learning.guidance import CollisionGuidance
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode, unlearned_starts
 from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -91,3 +96,33 @@ def judged(
         passed.append(violation is None)
         hit.append(violation is not None and violation.kind.endswith("collision"))
     return np.array(passed), np.array(hit)
+
+
+Draw = Callable[[CollisionChecker, Problem, np.random.Generator], ndarray]
+"""Candidates for a problem [candidates, frames, dof]."""
+
+
+def from_network(settings: RobotDiffuseSettings) -> Draw:
+    """Straight from the sampler: no refinement, no search, no shortcuts."""
+    planner = RobotDiffuse(settings)
+    model = planner.model(load_robot("panda"))
+    assert model is not None
+
+    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
+        code = encode(model, checker, settings.points, rng)
+        return planner.sample(model, checker, code, problem.start, goal_of(problem)[None], rng).q
+
+    return draw
+
+
+def without_network(settings: RobotDiffuseSettings, frames: int) -> Draw:
+    """The control: the line and random bumps, and as many gradient steps as a network's samples take, all of
+    them one after the other."""
+    steps = settings.guidance_steps * ceil(settings.guided_share * settings.sampling_steps)
+
+    def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:
+        ends = problem.start, goal_of(problem)
+        q = unlearned_starts(*ends, settings.samples, frames, problem.robot, rng)
+        return CollisionGuidance(checker, settings.guidance)(q, steps)[0] if steps else q
+
+    return draw

@@ -12,12 +12,12 @@ from robotdiffuse.collision.arrays import robot_groups
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_model
 from robotdiffuse.learning.clearances import packed_clearances
 from robotdiffuse.learning.data.batches import Batch, Batches, TrajectoryData, load_data
-from robotdiffuse.learning.data.growing_data import GrowingData
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import Encoder, encoder_name, make_encoder
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.settings import settings_to_json
 from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.training.growing_data import GrowingData
 from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.run import TrainingRun, Validation
@@ -200,7 +200,7 @@ class _Loss:
         error = weight * losses.joint * (output - target)[:, 1:-1].square().mean((1, 2))
         collision_weight = losses.collision_weight(fraction)
         if self.points is not None or collision_weight > 0:
-            clean_weight = torch.from_numpy(batch.clean_weight).to(self.processes.device)
+            clean_weight = torch.from_numpy(batch.clean_weight).to(device)
             error = error + clean_weight * self._in_space(batch, output, collision_weight, rng)
         return error.mean()
 
