@@ -120,9 +120,12 @@ def problem_record(
     }
 
 
-def problem_from_record(record: object) -> Problem:
-    """The problem of `problem_record`; InputError as in `load_problem`."""
-    return _problem("problem", record, Path(), {})
+def problem_from_record(record: object, robots: Robots | None = None) -> Problem:
+    """The problem of `problem_record`; InputError as in `load_problem`.
+
+    `robots`: those that were read before; what is read now is added.
+    """
+    return _problem("problem", record, Path(), {} if robots is None else robots)
 
 
 def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -> None:

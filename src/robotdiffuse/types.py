@@ -79,6 +79,11 @@ class PlanResult:
     """A lower bound of all distances to obstacles and between links along the motion [m]."""
     notes: tuple[str, ...] = field(default=())
     """What was changed or ignored in the input, e.g. a start clamped to a limit."""
+    progress: tuple[tuple[float, float], ...] = ()
+    """When each shorter path was found [s since the call], and its joint-space length [rad]; the last pair is
+    the returned path's."""
+    refused: str = ""
+    """What was wrong with the last path that the judge refused, a `verify.Violation.kind`; "" if none was."""
 
     @property
     def solved(self) -> bool:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from robotdiffuse.cli.arguments import natural, positive
 from robotdiffuse.cli.console import print_result
 from robotdiffuse.cli.draw import ENDINGS, draw, show
-from robotdiffuse.errors import InputError
 
 if TYPE_CHECKING:
     from robotdiffuse.problem import Problem
@@ -73,17 +72,8 @@ def run_plan(arguments: argparse.Namespace) -> int:
     outputs = [check_output(file, (".json", ".csv", *ENDINGS)) for file in arguments.out]
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
-    settings = None
-    if arguments.weights is not None:
-        from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
-
-        if name != RobotDiffuse.name:
-            raise InputError(
-                f"--weights are for the planner {RobotDiffuse.name}; the planner {name} has none"
-            )
-        settings = RobotDiffuseSettings(weights=arguments.weights)
     problem = load_problem(arguments.problem, arguments.index)
-    result = solve(problem, name, arguments.time_limit, arguments.seed, settings)
+    result = solve(problem, name, arguments.time_limit, arguments.seed, arguments.weights)
     print_result(result)
     for file in outputs:
         if file.suffix.lower() == ".json":
@@ -119,9 +109,9 @@ def run_demo(arguments: argparse.Namespace) -> int:
 
 
 def solve(
-    problem: "Problem", planner: str, time_limit: float, seed: int, settings: object | None = None
+    problem: "Problem", planner: str, time_limit: float, seed: int, weights: str | None = None
 ) -> "PlanResult":
-    """Load the planner, with its settings or default ones, and plan, behind a spinner.
+    """Load the planner, with weights of its own if it is a learned one, and plan, behind a spinner.
 
     A first call, whose result is dropped, loads the compiled code, or compiles it on a new machine, which
     would otherwise use up the time limit.
@@ -132,7 +122,7 @@ def solve(
 
     console = Console(stderr=True)
     with console.status("loading compiled code (a new machine compiles it first, for about a minute)"):
-        loaded = load_planner(planner, settings)
+        loaded = load_planner(planner, weights=weights)
         loaded.plan(problem, time_limit=WARM_UP, seed=seed)
     with console.status(f"planning with {planner}"):
         return loaded.plan(problem, time_limit=time_limit, seed=seed)

@@ -1,4 +1,4 @@
-"""robotdiffuse train encoder, robotdiffuse train planner"""
+"""robotdiffuse train encoder, train planner, train baseline"""
 
 import argparse
 import os
@@ -7,7 +7,7 @@ from contextlib import nullcontext
 from robotdiffuse.cli.arguments import count, natural, positive, share
 from robotdiffuse.errors import InputError
 
-SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads", "device")
+SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
 PARTS = ("denoiser", "objective", "sampler", "parametrization", "rows", "target", "condition_drop", "frames")
 """Of the planner's config."""
 
@@ -15,7 +15,7 @@ PARTS = ("denoiser", "objective", "sampler", "parametrization", "rows", "target"
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "train",
-        help="train the encoder or the planner's network",
+        help="train the encoder, the planner's network or a baseline",
         description="Train a network. Ctrl-C stops after a checkpoint; the same command continues. Several "
         "processes, each with a GPU of its own if there are as many: "
         "torchrun --nproc-per-node N -m robotdiffuse train ...",
@@ -29,6 +29,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     encoder.add_argument("--encoder", dest="name", metavar="NAME", help="which one (point_autoencoder)")
     _add_shared(encoder)
+    _add_device(encoder)
     encoder.set_defaults(run=run_encoder)
 
     planner = kinds.add_parser(
@@ -58,6 +59,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "takes in the others",
     )
     _add_shared(planner)
+    _add_device(planner)
     parts = planner.add_argument_group("parts of the model, instead of the config's")
     parts.add_argument(
         "--denoiser", metavar="NAME", help="transformer, encoder_decoder, decoder_only or unet"
@@ -74,6 +76,17 @@ def add(commands: argparse._SubParsersAction) -> None:
     parts.add_argument("--frames", type=count, metavar="N", help="frames of a motion")
     planner.set_defaults(run=run_planner)
 
+    baseline = kinds.add_parser(
+        "baseline",
+        help="the network of a learned baseline: mpnet, mpinets, trajectory_prior",
+        description="Train the network of a learned baseline on planned trajectories.",
+    )
+    baseline.add_argument("name", metavar="NAME", help="mpnet, mpinets or trajectory_prior (MPD and EDMP)")
+    baseline.add_argument("--data", required=True, metavar="FOLDER", help="data set of `data generate`")
+    baseline.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the data's robot")
+    _add_shared(baseline)
+    baseline.set_defaults(run=run_baseline)
+
 
 def _add_shared(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
@@ -86,6 +99,9 @@ def _add_shared(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch", type=count, metavar="N", help="samples per step")
     parser.add_argument("--learning-rate", type=positive, metavar="X", help="highest learning rate")
     parser.add_argument("--threads", type=count, metavar="N", help="threads of PyTorch")
+
+
+def _add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", metavar="NAME", help="cpu or cuda (default: cuda if there is one)")
 
 
@@ -99,7 +115,7 @@ def run_encoder(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.config import EncoderTraining
     from robotdiffuse.learning.training.encoder import train_encoder
 
-    given = _given(arguments, ("name", *SHARED))
+    given = _given(arguments, ("name", "device", *SHARED))
     if "samples" in given:
         given["minutes"] = None
     settings = EncoderTraining(**given)  # type: ignore[arg-type]
@@ -117,7 +133,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
     if arguments.config not in CONFIGS:
         known = "".join(f"\n  {name}: {config.description}" for name, config in CONFIGS.items())
         raise InputError(f"unknown config {arguments.config!r}; known:{known}")
-    given = _given(arguments, ("data", "encoder", "robot", *SHARED, *PARTS))
+    given = _given(arguments, ("data", "encoder", "robot", "device", *SHARED, *PARTS))
     if "denoiser" in given and CONFIGS[arguments.config].changes.get("denoiser_settings") is not None:
         # the config's are of its own denoiser; those of another of the same size
         given["denoiser_settings"] = PAPER_SIZE.get(arguments.denoiser)
@@ -130,6 +146,15 @@ def run_planner(arguments: argparse.Namespace) -> int:
     with meanwhile:
         report = train_planner(settings, arguments.out)
     _report(report, arguments.out)
+    return 0
+
+
+def run_baseline(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.learning.baselines.training import baseline_training, train_baseline
+
+    given = _given(arguments, ("data", "robot", *SHARED))
+    settings = baseline_training(arguments.name, given)
+    _report(train_baseline(settings, arguments.out), arguments.out)
     return 0
 
 

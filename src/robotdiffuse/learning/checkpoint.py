@@ -57,13 +57,15 @@ def _pack(module: nn.Module) -> dict[str, Tensor]:
     return {name: t.half() if name in half else t for name, t in module.state_dict().items()}
 
 
-def _save(module: nn.Module, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
+def save_module(module: nn.Module, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
+    """Write STEM.safetensors and, with the SHA-256 of it, STEM.json."""
     digest = write_tensors(folder / f"{stem}.safetensors", _pack(module), {})
     about = {"format": FORMAT, **about, "weights_sha256": digest}
     write_atomically(folder / f"{stem}.json", json.dumps(about, indent=1) + "\n", make_folder=True)
 
 
-def _load(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_tensors(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights and description of `save_module`. Raises InputError if they are missing or damaged."""
     file = folder / f"{stem}.json"
     try:
         about = json.loads(file.read_text(encoding="utf-8"))
@@ -83,7 +85,8 @@ def _load(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any
     return read_tensors(weights)[0], about
 
 
-def _fill(module: nn.Module, tensors: dict[str, Tensor], file: FilePath) -> None:
+def fill(module: nn.Module, tensors: dict[str, Tensor], file: FilePath) -> None:
+    """Give a module its weights. Raises InputError, naming the file, if they are another's."""
     try:
         module.load_state_dict(tensors)
     except RuntimeError as error:
@@ -98,12 +101,12 @@ def save_encoder(encoder: Encoder, folder: str | FilePath, training: dict[str, A
         "settings": settings_to_json(encoder.settings),
         "training": training,
     }
-    _save(encoder, FilePath(folder), "encoder", about)
+    save_module(encoder, FilePath(folder), "encoder", about)
 
 
 def load_encoder(folder: str | FilePath) -> Encoder:
     """The trained encoder of a folder, frozen. Raises InputError if it is missing or damaged."""
-    tensors, about = _load(FilePath(folder), "encoder")
+    tensors, about = load_tensors(FilePath(folder), "encoder")
     where = str(FilePath(folder) / "encoder.json")
     if about.get("encoder") not in ENCODERS:
         raise unknown_name(f"encoder in {where}:", about.get("encoder"), ENCODERS)
@@ -111,7 +114,7 @@ def load_encoder(folder: str | FilePath) -> Encoder:
     encoder = make_encoder(
         about["encoder"], settings_from_json(settings, about.get("settings"), f"{where}: settings")
     )
-    _fill(encoder, tensors, FilePath(folder) / "encoder.safetensors")
+    fill(encoder, tensors, FilePath(folder) / "encoder.safetensors")
     return encoder.requires_grad_(False).eval()
 
 
@@ -121,7 +124,7 @@ def save_model(model: MotionModel, folder: str | FilePath, training: dict[str, A
     `training`: the data's fingerprint, the number of samples and so on, for the reader.
     """
     about = {"model": settings_to_json(model.config), "training": training}
-    _save(model, FilePath(folder), "model", about)
+    save_module(model, FilePath(folder), "model", about)
 
 
 def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionModel:
@@ -132,11 +135,11 @@ def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionMode
     folder = FilePath(folder)
     if not folder.is_dir() and (BUNDLED / folder.name).is_dir():
         folder = BUNDLED / folder.name
-    tensors, about = _load(folder, "model")
+    tensors, about = load_tensors(folder, "model")
     where = f"{folder / 'model.json'}: model"
     config = settings_from_json(MotionModelConfig, about.get("model"), where)
     if robot is not None:
         config.check_robot(robot, str(folder / "model.json"))
     model = MotionModel(config)
-    _fill(model, tensors, folder / "model.safetensors")
+    fill(model, tensors, folder / "model.safetensors")
     return model.for_inference()

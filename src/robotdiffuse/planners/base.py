@@ -1,7 +1,7 @@
 """What all planners share: the protocol, the ends of a problem, and the way from waypoints to a result."""
 
 import time
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -20,6 +20,7 @@ GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""
 
 
+@runtime_checkable
 class Planner(Protocol):
     def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
         """Plan a motion within `time_limit` [s] of wall time, less what verifying and timing it take.
@@ -43,6 +44,13 @@ class Call:
         self.planner, self.problem, self.time_limit, self.seed = planner, problem, time_limit, seed
         self.notes = list(problem.notes)
         """What the result will say was changed or ignored; planners may add to it."""
+        self._progress: list[tuple[float, float]] = []
+        self._refused = ""
+
+    def improved(self, length: float) -> None:
+        """Note that a path of this joint-space length [rad] was just found; longer ones are passed over."""
+        if not self._progress or length < self._progress[-1][1]:
+            self._progress.append((self.elapsed, length))
 
     @property
     def elapsed(self) -> float:
@@ -64,6 +72,7 @@ class Call:
             planning_time=self.elapsed,
             seed=self.seed,
             notes=tuple(self.notes),
+            refused=self._refused,
         )
 
     def timeout(self, reason: str = "") -> PlanResult:
@@ -82,14 +91,18 @@ class Call:
         path = Path(problem.robot.joint_names, np.asarray(waypoints, dtype=np.float64))
         judge = verifier(problem, VerifySettings())
         report = judge.path(path)
-        if not report.valid or report.min_clearance is None:
-            return None
+        if report.violation is not None or report.min_clearance is None:
+            return self._refuse(report)
         planning_time = self.elapsed
         motion = _TimedMotion(judge)
         trajectory = time_parameterize(problem.robot, path, motion.valid, judge.collision_free)
         timed = motion.report(trajectory)
-        if not timed.valid or timed.min_clearance is None:
-            return None
+        if timed.violation is not None or timed.min_clearance is None:
+            return self._refuse(timed)
+        # found when the search had it, if it noted that; what it had shorter was refused
+        same = path.length * 1e-3
+        longer = [(at, length) for at, length in self._progress if length > path.length + same]
+        found = [at for at, length in self._progress if abs(length - path.length) <= same]
         return PlanResult(
             status=Status.SOLVED,
             reason=reason or f"solved by {stage}",
@@ -102,7 +115,13 @@ class Call:
             trajectory=trajectory,
             min_clearance=min(report.min_clearance, timed.min_clearance),
             notes=tuple(self.notes),
+            progress=(*longer, (found[0] if found else planning_time, path.length)),
+            refused=self._refused,
         )
+
+    def _refuse(self, report: Report) -> None:
+        assert report.violation is not None  # by Report
+        self._refused = report.violation.kind
 
 
 class _TimedMotion:

@@ -35,9 +35,10 @@ class RobotDiffuseSettings:
     """Folder of a trained model; None: the one that comes with the package for the robot."""
     samples: int = 16
     """Trajectories per batch."""
-    sampling_steps: int = 6
-    """Calls of the denoiser per batch."""
-    guidance_steps: int = 4
+    sampling_steps: int = 2
+    """Calls of the denoiser per batch. With guidance, more bring no more solved problems, see
+    benchmarks/results/guidance.txt."""
+    guidance_steps: int = 8
     """Gradient steps at each guided denoising step."""
     guided_share: float = 0.5
     """Share of the denoising steps that are guided, the last ones: 0 none, 1 all."""

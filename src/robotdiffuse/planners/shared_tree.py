@@ -246,7 +246,13 @@ class SharedTreeRRTStar:
         settings, attempt = self.settings, 0
         while attempt == 0 or call.remaining > 0:
             search = SharedTreeSearch(checker, *ends.rows(), settings, random_state(seed, attempt))
-            search.run(lambda: call.remaining <= 0)
+
+            def out_of_time(search: SharedTreeSearch = search) -> bool:
+                if search.cost < np.inf:
+                    call.improved(search.cost)
+                return call.remaining <= 0
+
+            search.run(out_of_time)
             path = search.path()
             if path is None:
                 break

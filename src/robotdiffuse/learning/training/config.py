@@ -15,7 +15,8 @@ from robotdiffuse.learning.settings import check_kind, of_kind
 from robotdiffuse.learning.training.losses import LossSettings
 
 
-def _length(samples: int | None, minutes: float | None) -> None:
+def check_length(samples: int | None, minutes: float | None) -> None:
+    """Raises InputError unless exactly one of them is given, and positive."""
     if (samples is None) == (minutes is None):
         raise InputError(f"samples is {samples} and minutes is {minutes}; give exactly one of them")
     if (samples or minutes or 0) <= 0:
@@ -54,7 +55,7 @@ class EncoderTraining:
     """None: the defaults of that encoder."""
 
     def __post_init__(self) -> None:
-        _length(self.samples, self.minutes)
+        check_length(self.samples, self.minutes)
         alone = [name for name, (network, _) in ENCODERS.items() if network.trained == "alone"]
         if self.name in ENCODERS and self.name not in alone:
             raise InputError(
@@ -137,7 +138,7 @@ class PlannerTraining:
     """Whether it is told too which way each frame's joints would take the arm too close to obstacles."""
 
     def __post_init__(self) -> None:
-        _length(self.samples, self.minutes)
+        check_length(self.samples, self.minutes)
         if self.turns < 0:
             raise InputError(f"turns is {self.turns}; it must be at least 0")
         if not 0.0 <= self.trivial_share <= 1.0:

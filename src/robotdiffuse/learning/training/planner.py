@@ -21,20 +21,16 @@ from robotdiffuse.learning.training.growing_data import GrowingData
 from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.run import TrainingRun, Validation
-from robotdiffuse.learning.training.validation import planning_success
+from robotdiffuse.learning.training.validation import FLOOR, planning_success
 from robotdiffuse.learning.versions import versions
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box
 
 VALIDATION_SAMPLES = 4
 """Trajectories sampled for each problem of a validation."""
 HELD_OUT = 2000
 """Most trajectories of the split for validation that are looked at."""
-FLOOR = Scene([Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")])
-"""Part of every scene of the data, as in ROP."""
 
 
 def moving_links(robot: Robot) -> tuple[str, ...]:
@@ -108,7 +104,7 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
         with torch.no_grad():
             parts = [loss_of(source.draw(settings.batch, rng), run.fraction, rng).item() for _ in range(8)]
         count = settings.validation_problems
-        success = planning_success(here, robot, held_out, FLOOR, count, VALIDATION_SAMPLES, rng)
+        success = planning_success(here, robot, held_out, count, VALIDATION_SAMPLES, rng)
         return Validation(float(np.mean(parts)), success)
 
     def loss(rng: np.random.Generator) -> Float[Tensor, ""]:

@@ -6,6 +6,7 @@ that every process takes the same decisions. The networks are small: to send gra
 being computed, as PyTorch's DistributedDataParallel does, would gain little.
 """
 
+import atexit
 import copy
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
@@ -53,6 +54,9 @@ class Processes:
         self.device: torch.device = self._accelerator.device
         self.count: int = self._accelerator.num_processes
         self.index: int = self._accelerator.process_index
+        if self.count > 1:
+            # else threads of the process group may still run when the interpreter is gone, which aborts it
+            atexit.register(_leave_group)
 
     @property
     def first(self) -> bool:
@@ -107,6 +111,11 @@ class Processes:
     def first_goes_first(self) -> AbstractContextManager[None]:
         """Within, the first process of each machine comes before the others: they read what it writes."""
         return self._accelerator.local_main_process_first()
+
+
+def _leave_group() -> None:
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 def on_cpu(module: Module) -> Module:

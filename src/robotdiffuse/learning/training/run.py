@@ -1,4 +1,4 @@
-"""What both training runs share: optimiser, schedule, checkpoints, log, bad steps, interruption."""
+"""What all training runs share: optimiser, schedule, checkpoints, log, bad steps, interruption."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -25,7 +25,6 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.files import alone_in, write_atomically
 from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
 from robotdiffuse.learning.settings import settings_to_json
-from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.processes import Processes
 
 FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder", "device")
@@ -41,6 +40,28 @@ class Validation(NamedTuple):
     """On data that are kept aside."""
     success: float | None = None
     """Share of sampled motions that are free, of a planner's network."""
+
+
+@runtime_checkable
+class RunSettings(Protocol):
+    """What a run reads of the settings, a dataclass; see `EncoderTraining` for what they mean."""
+
+    @property
+    def samples(self) -> int | None: ...
+    @property
+    def minutes(self) -> float | None: ...
+    @property
+    def seed(self) -> int: ...
+    @property
+    def batch(self) -> int: ...
+    @property
+    def learning_rate(self) -> float: ...
+    @property
+    def warmup_steps(self) -> int: ...
+    @property
+    def threads(self) -> int: ...
+    @property
+    def checkpoint_seconds(self) -> float: ...
 
 
 LossFn = Callable[[np.random.Generator], Float[Tensor, ""]]
@@ -73,7 +94,7 @@ class TrainingRun:
         self,
         module: nn.Module,
         out: str,
-        settings: EncoderTraining | PlannerTraining,
+        settings: RunSettings,
         *,
         average: float,
         weight_decay: float,

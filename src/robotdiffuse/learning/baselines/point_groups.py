@@ -1,0 +1,103 @@
+"""Compiled grouping of point clouds for PointNet++: furthest point sampling and ball query in one pass.
+
+Both are of C. Qi et al., "PointNet++", NeurIPS 2017. The distances from a new centre to all points, which
+the sampling needs, are those that its ball query needs.
+"""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def group_points(points, count, neighbours, radius):
+    """Centres [n, count] and the points around each [n, count, neighbours], as indices into points [n, m, 3].
+
+    Centres: first the point furthest from the mean, then always the one furthest from those that are chosen.
+    Around a centre: the nearest points within the radius, the nearest first, which is the centre itself;
+    where there are fewer, the centre repeats. So the order of the points makes no difference.
+    """
+    n, m = points.shape[:2]
+    centres = np.empty((n, count), np.int64)
+    around = np.empty((n, count, neighbours), np.int64)
+    x, y, z = np.empty(m, np.float32), np.empty(m, np.float32), np.empty(m, np.float32)
+    squared, least = np.empty(m, np.float32), np.empty(m, np.float32)
+    near = np.empty(neighbours, np.float32)
+    reach = np.float32(radius) * np.float32(radius)
+    for i in range(n):
+        a, b, c = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+        for j in range(m):
+            x[j], y[j], z[j] = points[i, j, 0], points[i, j, 1], points[i, j, 2]
+            a += x[j]
+            b += y[j]
+            c += z[j]
+        share = np.float32(1.0) / np.float32(m)
+        a, b, c = a * share, b * share, c * share
+        for j in range(m):
+            least[j] = (x[j] - a) ** 2 + (y[j] - b) ** 2 + (z[j] - c) ** 2
+        chosen = np.argmax(least)
+        for s in range(count):
+            centres[i, s] = chosen
+            a, b, c = x[chosen], y[chosen], z[chosen]
+            for j in range(m):
+                squared[j] = (x[j] - a) ** 2 + (y[j] - b) ** 2 + (z[j] - c) ** 2
+            if s == 0:
+                least[:] = squared
+            else:
+                for j in range(m):
+                    least[j] = min(least[j], squared[j])
+            around[i, s, :] = chosen
+            near[:] = reach
+            near[0] = np.float32(0.0)
+            for j in range(m):
+                distance = squared[j]
+                if distance < near[neighbours - 1] and j != chosen:
+                    place = neighbours - 1
+                    while place > 1 and near[place - 1] > distance:
+                        near[place], around[i, s, place] = near[place - 1], around[i, s, place - 1]
+                        place -= 1
+                    near[place], around[i, s, place] = distance, j
+            furthest, most = 0, least[0]
+            for j in range(1, m):
+                if least[j] > most:
+                    furthest, most = j, least[j]
+            chosen = furthest
+    return centres, around
+
+
+@njit(cache=True, nogil=True)
+def greatest(values, best, which):
+    """The greatest of each group's rows: values [groups, rows, width] to best and which [groups, width].
+
+    `values` are the bits of floating-point numbers as signed integers of the same size, int16 of bfloat16 or
+    int32 of float32, and so is `best`; `which` is int16. Of equal ones the first counts.
+    """
+    groups, rows, width = values.shape
+    sign = values.dtype.type(8 * values.itemsize - 1)
+    magnitude = np.iinfo(values.dtype).max
+    keys = np.empty(width, values.dtype)
+    for i in range(groups):
+        for c in range(width):
+            v = values[i, 0, c]
+            keys[c] = v ^ ((v >> sign) & magnitude)
+            which[i, c] = 0
+        for r in range(1, rows):
+            for c in range(width):
+                v = values[i, r, c]
+                key = v ^ ((v >> sign) & magnitude)
+                more = key > keys[c]
+                keys[c] = key if more else keys[c]
+                which[i, c] = r if more else which[i, c]
+        for c in range(width):
+            key = keys[c]
+            best[i, c] = key ^ ((key >> sign) & magnitude)
+
+
+@njit(cache=True, nogil=True)
+def put_back(gradients, which, out):
+    """The gradient of `greatest`: out [groups, rows, width] is `gradients` [groups, width] where the greatest
+    were and 0 elsewhere, as bits too."""
+    groups, rows, width = out.shape
+    for i in range(groups):
+        for r in range(rows):
+            for c in range(width):
+                out[i, r, c] = gradients[i, c] if which[i, c] == r else 0

@@ -1,0 +1,171 @@
+"""What MPD and EDMP share: batches of guided samples of the trajectory prior, until one passes the judge."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.learning.baselines.checkpoint import check_weights, load_baseline
+from robotdiffuse.learning.baselines.trajectory_prior import TrajectoryPrior
+from robotdiffuse.planners import rrt_connect_kernel as kernel
+from robotdiffuse.planners.base import Call, usable_goals
+from robotdiffuse.planners.rrt_connect import Ends, search_space
+from robotdiffuse.problem import Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.types import PlanResult
+
+RESOLUTION = 0.02
+"""No point of the arm moves further than this between two checks of a sample [m]."""
+SAMPLES_PER_GOAL = 4
+"""So many samples are drawn at least for each goal that has a share of a batch."""
+
+
+class Attempt(NamedTuple):
+    """A sample that collides."""
+
+    segments: int
+    """How many of the motions from frame to frame are not free."""
+    length: float
+    """[rad]"""
+    path: Float[ndarray, "frames dof"]
+
+
+class GuidedPrior(ABC):
+    """A planner that samples batches from the prior under guidance.
+
+    The free samples of a batch go to the judge, the shortest first; where none passes, the next batch is
+    drawn from new noise, until time runs out. There is no search, and no sample is shortened or repaired.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, weights: str | None, samples: int) -> None:
+        """weights: folder of a trained prior, or None; samples: trajectories per batch.
+
+        Raises InputError if the folder holds no weights.
+        """
+        check_weights("trajectory_prior", weights)
+        self.weights, self.samples = weights, samples
+
+    @abstractmethod
+    def draw(
+        self,
+        prior: TrajectoryPrior,
+        checker: CollisionChecker,
+        starts: Float[ndarray, "count dof"],
+        goals: Float[ndarray, "count dof"],
+        rng: np.random.Generator,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Float[ndarray, "count frames dof"] | None:
+        """A batch of guided samples, float32; None if `stop` says so before they are done."""
+
+    def prior(self, robot: Robot) -> TrajectoryPrior:
+        """The trained network. Raises InputError if there is none for the robot."""
+        prior = load_baseline("trajectory_prior", self.weights, robot)
+        assert isinstance(prior, TrajectoryPrior)
+        return prior.for_inference()
+
+    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+        """See `planners.base.Planner`. Raises InputError if there are no weights for the robot."""
+        prior = self.prior(problem.robot)
+        call = Call(self.name, problem, time_limit, seed)
+        checker, rng = CollisionChecker(problem.robot, problem.scene), np.random.default_rng(seed)
+        goals = usable_goals(call, checker, rng)
+        if isinstance(goals, PlanResult):
+            return goals
+        ends = Ends(checker, problem.start, goals)
+        if not ends.reachable:
+            return call.timeout("the start or every goal touches an obstacle too closely to plan from")
+        return self._batches(call, checker, ends, prior, rng)
+
+    def _batches(
+        self,
+        call: Call,
+        checker: CollisionChecker,
+        ends: Ends,
+        prior: TrajectoryPrior,
+        rng: np.random.Generator,
+    ) -> PlanResult:
+        start, goals = shared_out(*ends.rows(), self.samples)
+        space = search_space(checker, RESOLUTION)
+        closest: Attempt | None = None
+        batches = 0
+        while call.remaining > 0:
+            drawn = self.draw(prior, checker, start, goals, rng, lambda: call.remaining <= 0)
+            if drawn is None:
+                break
+            batches += 1
+            attempts = [_attempt(space, path) for path in np.ascontiguousarray(drawn, np.float32)]
+            for attempt in sorted(attempts, key=lambda attempt: attempt[:2]):
+                if attempt.segments:
+                    if closest is None or attempt[:2] < closest[:2]:
+                        closest = attempt
+                    break
+                result = call.finish(ends.complete(attempt.path), self.name)
+                if result is not None:
+                    return result
+        if closest is not None:
+            # so that the result says what is wrong with it; the exact meshes may even call it free
+            result = call.finish(ends.complete(closest.path), self.name)
+            if result is not None:
+                return result
+        return call.timeout(
+            f"none of {batches * self.samples} samples of the network is free of collision"
+            if batches
+            else f"time ran out before the first {self.samples} samples were done; it takes a longer limit"
+        )
+
+
+def _attempt(space: kernel.Space, path: Float[ndarray, "frames dof"]) -> Attempt:
+    return Attempt(int((~kernel.motions_free(space, path)).sum()), float(kernel.path_length(path)), path)
+
+
+def shared_out(
+    start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], samples: int
+) -> tuple[Float[ndarray, "samples dof"], Float[ndarray, "samples dof"]]:
+    """Start and goal of each sample: the nearest goals take turns."""
+    nearest = np.argsort(np.linalg.norm(goals - start, axis=1))[: max(samples // SAMPLES_PER_GOAL, 1)]
+    return np.repeat(start[None], samples, 0), goals[nearest[np.arange(samples) % len(nearest)]]
+
+
+def collision_gradient(
+    checker: CollisionChecker,
+    q: Float[ndarray, "count frames dof"],
+    margin: float,
+    self_margin: float,
+    between: int,
+) -> tuple[Float[ndarray, "count"], Float[ndarray, "count frames dof"]]:
+    """Collision cost of trajectories [m] and its gradient by their frames [m/rad], of the ends too.
+
+    The cost of a configuration is the root of the sum of h² over the covering spheres and pairs of links,
+    with the hinges h of their signed distances (see `learning.guidance`): how far the arm is within margins.
+    That of a trajectory is its sum over the frames and over `between` places in each step from frame to
+    frame, the places of a step counting together as one more frame.
+    """
+    count, frames, dof = q.shape
+    shares = np.arange(1, between + 1, dtype=np.float32) / (between + 1)
+    step = np.diff(q, axis=1)[:, :, None]
+    inner = q[:, :-1, None] + shares[:, None] * step
+    every = np.concatenate([q.reshape(-1, dof), inner.reshape(-1, dof)])
+    squares, gradients = checker.cost_gradients(every, margin, self_margin)
+    depth = np.sqrt(2 * squares)
+    gradients = gradients / np.maximum(depth, np.float32(1e-6))[:, None]
+    at_frames = count * frames
+    costs, by_frame = depth[:at_frames].reshape(q.shape[:2]).sum(1), gradients[:at_frames].reshape(q.shape)
+    if between:
+        weight = np.float32(1 / between)
+        costs = costs + weight * depth[at_frames:].reshape(count, -1).sum(1)
+        by_place = weight * gradients[at_frames:].reshape(inner.shape)
+        by_frame[:, :-1] += ((1 - shares)[:, None] * by_place).sum(2)
+        by_frame[:, 1:] += (shares[:, None] * by_place).sum(2)
+    return costs, by_frame
+
+
+def limited(moves: Float[ndarray, "count frames dof"], most: float) -> Float[ndarray, "count frames dof"]:
+    """Moves of frames, none longer than `most` [rad, joint-space L2]."""
+    lengths = np.linalg.norm(moves, axis=2, keepdims=True)
+    return moves * np.minimum(1.0, most / np.maximum(lengths, 1e-9)).astype(moves.dtype)

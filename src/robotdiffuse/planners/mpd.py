@@ -1,0 +1,203 @@
+"""MPD: Motion Planning Diffusion (Carvalho et al., IROS 2023), a diffusion prior guided by cost gradients.
+
+The prior is unconditional (`learning.baselines.trajectory_prior`); planning draws from the posterior given
+the costs: in the last part of the denoising steps the mean of each step goes some gradient steps down
+
+    collision (scene and links) + joint limits + Gaussian process prior of constant velocity,
+
+and the shortest free sample of the batch is the plan (algorithm 1 there).
+
+Settings and the paper's or its code's values:
+
+| setting | here | there |
+|---|---|---|
+| trajectories per batch | 16 | 100 (50 in the code), on a GPU |
+| denoising steps | 25 | 25 |
+| steps without noise after them | 5 | 5 |
+| share of them that is guided, the last | 0.25 | 0.25 |
+| gradient steps per denoising step | 5 | 5 |
+| factor of the noise of a step | 0.5 | 0.5 |
+| places checked per frame by the collision cost | 2 | 1.5 |
+| weights of the costs | below | for other units and distances |
+
+Other differences: signed distances of covering spheres by our compiled kernel in place of their grid; the
+Gaussian process is that of the positions, its velocities integrated out, and its step is implicit, so that a
+long step is stable; batches are repeated with new noise while there is time.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from math import ceil
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.baselines.trajectory_prior import TrajectoryPrior, exponential_levels
+from robotdiffuse.planners.guided_prior import GuidedPrior, collision_gradient, limited
+
+
+@dataclass(frozen=True)
+class MPDSettings:
+    weights: str | None = None
+    """Folder of a trained trajectory_prior; None: the one that comes with the package for the robot."""
+    samples: int = 16
+    """Trajectories per batch."""
+    sampling_steps: int = 25
+    """Denoising steps, at levels as far apart as those of MPD's exponential schedule."""
+    quiet_steps: int = 5
+    """Steps without noise after them."""
+    guided_share: float = 0.25
+    """Share of the denoising steps that are guided, the last ones; the quiet steps always are."""
+    guide_steps: int = 5
+    """Gradient steps at each guided denoising step."""
+    noise_scale: float = 0.5
+    """Factor of the standard deviation that a denoising step adds."""
+    margin: float = 0.04
+    """Distance to obstacles below which the collision cost arises [m]."""
+    self_margin: float = 0.01
+    """The same between links [m]."""
+    limit_margin: float = 0.02
+    """The same of joint values to their limits [rad]."""
+    collision_weight: float = 0.1
+    """Of the collision cost [rad²/m]: a frame that is too close moves by about this times 0.5 m/rad."""
+    prior_weight: float = 2.0
+    """Of the Gaussian process' cost, with frames one unit of time apart and a power spectrum of 1 rad²."""
+    between: int = 1
+    """Places between two frames that the collision cost looks at."""
+    push: float = 0.1
+    """Longest move of a frame in one gradient step [rad]."""
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "guide_steps"):
+            if getattr(self, name) < 1:
+                raise InputError(f"mpd.{name} is {getattr(self, name)}; it must be at least 1")
+        if self.sampling_steps < 2:
+            raise InputError(f"mpd.sampling_steps is {self.sampling_steps}; it must be at least 2")
+        if not 0 <= self.guided_share <= 1:
+            raise InputError(f"mpd.guided_share is {self.guided_share}; it must be between 0 and 1")
+        for name in ("quiet_steps", "noise_scale", "margin", "self_margin", "limit_margin",
+                     "collision_weight", "prior_weight", "between"):  # fmt: skip
+            if not getattr(self, name) >= 0:
+                raise InputError(f"mpd.{name} is {getattr(self, name)}; it must be at least 0")
+        if not self.push > 0:
+            raise InputError(f"mpd.push is {self.push}; it must be positive")
+
+
+class MPD(GuidedPrior):
+    """The prior's samples under MPD's guidance; see the head of this file."""
+
+    name = "mpd"
+
+    def __init__(self, settings: MPDSettings | None = None) -> None:
+        self.settings = settings or MPDSettings()
+        super().__init__(self.settings.weights, self.settings.samples)
+
+    def draw(
+        self,
+        prior: TrajectoryPrior,
+        checker: CollisionChecker,
+        starts: Float[ndarray, "count dof"],
+        goals: Float[ndarray, "count dof"],
+        rng: np.random.Generator,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> Float[ndarray, "count frames dof"] | None:
+        """See `GuidedPrior.draw`."""
+        settings = self.settings
+        guided = ceil(settings.guided_share * settings.sampling_steps)
+
+        def guide(q: ndarray, left: int) -> ndarray:
+            return self.guided(checker, q) if left < guided else q
+
+        levels = exponential_levels(prior.schedule, settings.sampling_steps)
+        return prior.sample(
+            starts, goals, levels, rng, guide, settings.noise_scale, settings.quiet_steps, stop
+        )
+
+    def guided(
+        self, checker: CollisionChecker, q: Float[ndarray, "count frames dof"]
+    ) -> Float[ndarray, "count frames dof"]:
+        """Trajectories after the gradient steps of one denoising step; their ends stay."""
+        settings, robot = self.settings, checker.robot
+        gaussian = gaussian_process(q.shape[1])
+        for _ in range(settings.guide_steps):
+            _, gradient = collision_gradient(
+                checker, q, settings.margin, settings.self_margin, settings.between
+            )
+            near = np.minimum(settings.limit_margin, (robot.upper - robot.lower) / 2)
+            inside = np.clip(q, robot.lower + near, robot.upper - near)
+            moves = limited(-settings.collision_weight * gradient, settings.push) + (inside - q)
+            moves[:, [0, -1]] = 0.0
+            q = gaussian.step((q + moves).astype(np.float32), settings.prior_weight)
+        return q
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianProcess:
+    """The prior of constant velocity over trajectories (M. Mukadam et al., IJRR 2018, section 3).
+
+    Its states (position, velocity) follow white noise on acceleration: between frames one unit of time apart,
+
+        state' = F state + noise,  F = [[1, 1], [0, 1]],  covariance Q = [[1/3, 1/2], [1/2, 1]],
+
+    for every joint alike, so the precision of all states is block tri-diagonal. Samples of the prior have no
+    velocities; integrated out, they leave the precision of the positions, which is that Schur complement.
+    The cost q P q / 2 is the least integral of squared accelerations through the frames over 2, so that of
+    natural cubic splines; straight lines cost nothing.
+    """
+
+    precision: Float[ndarray, "frames frames"]
+    """P, of the positions of one joint."""
+
+    def costs(self, q: Float[ndarray, "count frames dof"]) -> Float[ndarray, "count"]:
+        """The sum over the joints of q P q / 2 [rad²]."""
+        return 0.5 * (q * self.gradient(q)).sum((1, 2))
+
+    def gradient(self, q: Float[ndarray, "count frames dof"]) -> Float[ndarray, "count frames dof"]:
+        """P q."""
+        return self.precision.astype(q.dtype) @ q
+
+    def step(
+        self, q: Float[ndarray, "count frames dof"], weight: float
+    ) -> Float[ndarray, "count frames dof"]:
+        """One implicit gradient step down weight q P q / 2 on all frames but the ends.
+
+        It solves x = q - weight P x, the minimum of |x - q|² / 2 + weight x P x / 2 its ends held.
+        """
+        inner, ends = _implicit(q.shape[1], weight)
+        moved = q.copy()
+        moved[:, 1:-1] = inner.astype(q.dtype) @ q[:, 1:-1] + ends.astype(q.dtype) @ q[:, [0, -1]]
+        return moved
+
+
+def state_precision(frames: int) -> Float[ndarray, "states states"]:
+    """Of the states of one joint, (position, velocity) of each frame in turn: block tri-diagonal."""
+    transition = np.array([[1.0, 1.0], [0.0, 1.0]])
+    inverse = np.linalg.inv(np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]))
+    precision = np.zeros((2 * frames, 2 * frames))
+    error = np.hstack([-transition, np.eye(2)])
+    for i in range(frames - 1):
+        precision[2 * i : 2 * i + 4, 2 * i : 2 * i + 4] += error.T @ inverse @ error
+    return precision
+
+
+@cache
+def gaussian_process(frames: int) -> GaussianProcess:
+    """The prior over so many frames."""
+    every = state_precision(frames)
+    position, velocity = slice(0, None, 2), slice(1, None, 2)
+    mixed = every[position, velocity]
+    return GaussianProcess(
+        every[position, position] - mixed @ np.linalg.solve(every[velocity, velocity], mixed.T)
+    )
+
+
+@cache
+def _implicit(frames: int, weight: float) -> tuple[Float[ndarray, "inner inner"], Float[ndarray, "inner 2"]]:
+    """What `GaussianProcess.step` multiplies inner frames and ends with."""
+    precision = gaussian_process(frames).precision
+    inverse = np.linalg.inv(np.eye(frames - 2) + weight * precision[1:-1, 1:-1])
+    return inverse, -weight * inverse @ precision[1:-1][:, [0, -1]]

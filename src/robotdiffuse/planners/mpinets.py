@@ -1,0 +1,195 @@
+"""MPiNets: motions that a policy makes step by step (A. Fishman et al., "Motion Policy Networks", CoRL 2022).
+
+The policy (`learning.baselines.mpinets`) sees points of the scene, of the arm and of the goal, and is rolled
+out from the start, at most 150 steps, the paper's number. The first roll-out is the paper's planner: one
+cloud, no noise, nothing repeated. While there is time, others follow with new clouds and noise.
+
+Differences from the paper, besides those of the network:
+
+- The paper ends a roll-out within 1 cm and 15 degrees of the target pose. A goal here is a configuration to
+  be met to 1e-4 rad: near it, a straight edge leads there if the compiled check calls it free; else the
+  policy goes on. For a pose the goals are configurations by inverse kinematics.
+- The paper has one roll-out. The repetitions, which cost its success nothing, use the time that all planners
+  have. They are spread over the goals, the nearest first, and end where the arm collides.
+- Nothing is repaired or shortened. A motion that the judge refuses is not a result; where nothing better was
+  found, the first one is handed to it, so that the result says what was wrong.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from numpy import ndarray
+from torch import Tensor
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.baselines.checkpoint import check_weights, load_baseline
+from robotdiffuse.learning.baselines.mpinets import MPiNetsNetwork, RollOuts
+from robotdiffuse.planners import rrt_connect_kernel as kernel
+from robotdiffuse.planners.base import Call, usable_goals
+from robotdiffuse.planners.rrt_connect import Ends, search_space
+from robotdiffuse.problem import Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.types import PlanResult
+
+STILL = 1e-4
+"""The policy stands still where no joint moves further in a step [rad]; it would for ever."""
+
+
+@dataclass(frozen=True)
+class MPiNetsSettings:
+    weights: str | None = None
+    """Folder of a trained network; None: the one that comes with the package for the robot."""
+    steps: int = 150
+    """Most steps of a roll-out (the paper's)."""
+    near: float = 0.3
+    """Largest distance of a joint at which a straight edge to the goal is tried [rad]."""
+    batch: int = 8
+    """Roll-outs at once, after the first, which is alone."""
+    noise: float = 0.015
+    """Standard deviation of the noise on where the policy sees the arm, as in training [rad]; none in the
+    first roll-out."""
+    resolution: float = 0.02
+    """No point of the arm moves further than this between two checks [m]."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch"):
+            if getattr(self, name) < 1:
+                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be at least 1")
+        for name in ("near", "noise"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must not be negative")
+        if not self.resolution > 0:
+            raise InputError(f"mpinets.resolution is {self.resolution}; it must be positive")
+
+
+class MPiNets:
+    """The policy's roll-outs as a planner; see the head of this file."""
+
+    name = "mpinets"
+
+    def __init__(self, settings: MPiNetsSettings | None = None) -> None:
+        """Raises InputError if the folder that the settings name holds no weights."""
+        self.settings = settings or MPiNetsSettings()
+        check_weights("mpinets", self.settings.weights)
+
+    def network(self, robot: Robot) -> MPiNetsNetwork:
+        """The policy for a robot. Raises InputError, naming the command that trains it, if there is none."""
+        network = load_baseline("mpinets", self.settings.weights, robot)
+        assert isinstance(network, MPiNetsNetwork)
+        return network
+
+    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+        """See `planners.base.Planner`. Raises InputError if there are no weights for the robot."""
+        network = self.network(problem.robot)
+        call = Call(self.name, problem, time_limit, seed)
+        checker, rng = CollisionChecker(problem.robot, problem.scene), np.random.default_rng(seed)
+        goals = usable_goals(call, checker, rng)
+        if isinstance(goals, PlanResult):
+            return goals
+        ends = Ends(checker, problem.start, goals)
+        if not ends.reachable:
+            return call.timeout("the start or every goal touches an obstacle too closely to move from it")
+        best: _Motion | None = None
+        tried = 0
+        while best is None or call.remaining > 0:
+            count = self.settings.batch if tried else 1
+            for motion in self._roll_outs(call, network, checker, ends, tried, count, rng):
+                if motion.free:
+                    result = call.finish(motion.path(ends), "policy")
+                    if result is not None:
+                        return result
+                if best is None or motion.arrived > best.arrived:
+                    best = motion
+            tried += count
+        # the judge looks at the meshes, which the covering spheres stick out of: it may be good after all
+        result = call.finish(best.path(ends), "policy")
+        if result is not None:
+            return result
+        what = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
+        return call.timeout(f"{tried} roll-outs of the policy, the best of which {what}")
+
+    def _roll_outs(
+        self,
+        call: Call,
+        network: MPiNetsNetwork,
+        checker: CollisionChecker,
+        ends: Ends,
+        tried: int,
+        count: int,
+        rng: np.random.Generator,
+    ) -> "list[_Motion]":
+        """So many roll-outs, or what there is of them when one is free all the way or time runs out.
+
+        `tried` were tried before; the very first goes on even if it collides.
+        """
+        settings, first = self.settings, tried == 0
+        space = search_space(checker, settings.resolution)
+        start, goals = ends.rows()
+        order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")
+        goal = goals[order[np.arange(tried, tried + count) % len(order)]]
+        clouds = scene_clouds(network, checker, count, rng)
+        roll_outs = RollOuts(network, clouds, np.repeat(start[None], count, 0), goal)
+        motions = [_Motion(start, end) for end in goal]
+        for step in range(settings.steps + 1):
+            near = roll_outs.running & (roll_outs.distances() < settings.near)
+            for i in np.flatnonzero(near).tolist():
+                motions[i].try_to_arrive(space)
+            if any(motion.free for motion in motions):
+                break
+            roll_outs.stop(
+                np.array([motion.arrived or (motion.collided and not first) for motion in motions])
+            )
+            if step == settings.steps or not roll_outs.running.any() or call.remaining <= 0:
+                break
+            noise = settings.noise * rng.standard_normal(goal.shape, dtype=np.float32)
+            roll_outs.advance(None if first else noise)
+            for i in np.flatnonzero(roll_outs.running).tolist():
+                motions[i].go(space, roll_outs.frames[-1][i])
+            roll_outs.stop(np.abs(roll_outs.frames[-1] - roll_outs.frames[-2]).max(1) < STILL)
+        return motions
+
+
+class _Motion:
+    """What a roll-out has made so far."""
+
+    def __init__(self, start: Float32[ndarray, "dof"], goal: Float32[ndarray, "dof"]) -> None:
+        self.frames, self.goal = [start], goal
+        self.collided = self.arrived = False
+
+    @property
+    def free(self) -> bool:
+        """Whether it reaches the goal free of collision by the compiled check."""
+        return self.arrived and not self.collided
+
+    def go(self, space: kernel.Space, q: Float32[ndarray, "dof"]) -> None:
+        self.collided |= not kernel.motions_free(space, np.stack([self.frames[-1], q]))[0]
+        self.frames.append(q)
+
+    def try_to_arrive(self, space: kernel.Space) -> None:
+        """Go straight to the goal if that is free."""
+        if kernel.motions_free(space, np.stack([self.frames[-1], self.goal]))[0]:
+            self.frames.append(self.goal)
+            self.arrived = True
+
+    def path(self, ends: Ends) -> Float[ndarray, "n dof"]:
+        """Its waypoints, with the exact ends of the problem as far as it has reached them."""
+        if self.arrived:
+            return ends.complete(np.stack(self.frames))
+        return np.concatenate([ends.start[None], np.stack(self.frames[1:] or self.frames).astype(np.float64)])
+
+
+def scene_clouds(
+    network: MPiNetsNetwork, checker: CollisionChecker, count: int, rng: np.random.Generator
+) -> Float32[Tensor, "count points 3"]:
+    """Random clouds of the scene as the network wants them [m]; zeros where nothing is in reach."""
+    points, region = network.settings.scene_points, network.settings.region
+    clouds = np.zeros((count, points, 3), np.float32)
+    for cloud in clouds:
+        found = sample_surface(checker.scene, points, rng, region)
+        if len(found):
+            cloud[:] = found
+    return torch.from_numpy(clouds)
