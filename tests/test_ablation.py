@@ -9,7 +9,8 @@ from example_robots import planar_arm
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import ablation
-from robotdiffuse.evaluation.metrics import LinkPathLength, bootstrap_interval
+from robotdiffuse.evaluation.metrics import LinkPathLength
+from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.trials import Tried, goal_of, held_out_problems
 from robotdiffuse.learning.denoisers import DENOISERS, Transformer
 from robotdiffuse.learning.encoders import ENCODERS

@@ -17,7 +17,8 @@ from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.training.config import PlannerTraining
-from robotdiffuse.learning.training.planner import FLOOR, moving_links
+from robotdiffuse.learning.training.planner import moving_links
+from robotdiffuse.learning.training.validation import FLOOR
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.rop import ROP, ROP_DENSE, pack_scene, sample_scene

@@ -160,10 +160,11 @@ BAD_CALL = {
     "unknown command": (["plann"], "plann"),
     "missing file": (["plan", "missing.yaml"], "missing.yaml"),
     "weights of a planner without": (
-        ["plan", "problem.json", "--planner", "rrt_connect", "--weights", "w"], "planner rrt_connect has none"
+        ["plan", "problem.json", "--planner", "rrt_connect", "--weights", "w"],
+        "planner rrt_connect has no weights",
     ),
     "weights that are none": (["plan", "problem.json", "--weights", "."], "model.json"),
-    "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: robotdiffuse, rrt_connect"),
+    "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: a_star, d_star_lite"),
     "no time": (["plan", "problem.json", "--time-limit", "0"], "'0' is not a positive number"),
     "endless time": (["plan", "problem.json", "--time-limit", "inf"], "'inf' is not a positive number"),
     "negative seed": (["plan", "problem.json", "--seed", "-1"], "-1"),

@@ -80,8 +80,10 @@ def test_view_shows_samples_in_one_page(folder, capsys, monkeypatch):
     assert len(titles) == 2 and all(
         re.fullmatch(r"rop(_dense)? · shard \d, row \d", title) for title in titles
     )
-    replays = json.loads(page.split('id="replays">')[1].split("</script>")[0])
+    stored = json.loads(page.split('id="replays">')[1].split("</script>")[0])
+    replays = ["".join(stored["parts"][i] for i in parts) for parts in stored["pages"]]
     assert len(replays) == 2
+    assert len(set(stored["parts"])) == len(stored["parts"])  # what replays share is kept once
     for replay, title in zip(replays, titles, strict=True):
         assert replay.startswith("<!doctype html>") and f"<h1>{title}</h1>" in replay
 

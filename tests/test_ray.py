@@ -1,9 +1,10 @@
-"""The data factory on Ray: nodes come and go, the data stay the same."""
+"""The data factory and the bench on Ray: nodes come and go, the data stay the same."""
 
 import os
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,8 @@ import pytest
 
 from factory_runs import contents, in_this_process
 from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.records import read_records
+from robotdiffuse.evaluation.runner import BenchSettings, run_bench
 from robotdiffuse.generation import GenerationSettings, factory, generate, workers
 
 # read when ray is imported: no telemetry, and no pages of logs when a node is lost
@@ -91,3 +94,15 @@ def test_a_cluster_that_nobody_listens_at_is_refused_at_once(
         monkeypatch.setenv("RAY_ADDRESS", address)
         with pytest.raises(InputError, match=f"no Ray cluster at {address}, where RAY_ADDRESS says"):
             generate(SETTINGS, tmp_path, cluster="ray")
+
+
+def test_bench_on_a_cluster_is_as_on_this_machine(cluster: Any, tmp_path: Path) -> None:
+    def quiet(*_: object) -> None: ...
+
+    asked = BenchSettings(("rrt_connect",), ("rop",), tmp_path, time_limit=5.0, count=2, cluster="ray")
+    assert run_bench(asked, quiet, quiet) == 2
+    assert run_bench(replace(asked, cluster=None), quiet, quiet) == 0
+    there = read_records(tmp_path / "records" / "rrt_connect.jsonl")
+    assert run_bench(replace(asked, cluster=None, out=tmp_path / "here"), quiet, quiet) == 2
+    here = read_records(tmp_path / "here" / "records" / "rrt_connect.jsonl")
+    assert [record.positions for record in sorted(there, key=lambda r: r.name)] == [r.positions for r in here]

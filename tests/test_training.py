@@ -43,6 +43,7 @@ from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.training.planner import moving_links, train_planner
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.run import TrainingRun, Validation
+from robotdiffuse.learning.training.validation import FLOOR
 from robotdiffuse.scenes.sampling import BOX, SPHERE, sample_surfaces_batch
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
@@ -382,7 +383,7 @@ def test_planner_learns_which_side(tmp_path, data, arm):
         kinds, params = np.array([[SPHERE]], np.int8), np.zeros((1, 1, 10), np.float32)
         params[0, 0, :4] = 0.0, 0.5 * side, 1.0, 0.2
         z = model.encode(sample_surfaces_batch(kinds, params, 256, rng)[0])
-        checker = CollisionChecker(arm, Scene([training.FLOOR.shapes[0], Sphere(params[0, 0, :3], 0.2)]))
+        checker = CollisionChecker(arm, Scene([FLOOR.shapes[0], Sphere(params[0, 0, :3], 0.2)]))
 
         def clearances(q, checker=checker):
             return checker.link_clearances(q.reshape(-1, 3)).reshape(*q.shape[:2], 3)

@@ -1,18 +1,74 @@
-"""robotdiffuse bench ablation"""
+"""robotdiffuse bench run, bench report, bench confirm, bench ablation"""
 
 import argparse
 import os
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import count
+from robotdiffuse.cli.arguments import count, positive
+from robotdiffuse.errors import InputError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy import ndarray
+
+    from robotdiffuse.evaluation.bench_figures import Bench, Section
 
 
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser("bench", help="measure", description="Measure planners and networks.")
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+    run = actions.add_parser(
+        "run",
+        help="planners on problems, every call a record that is kept",
+        description="Call planners on the same problems, each planner in a process of its own. Results are "
+        "lines of JSON in the folder; Ctrl-C or a crash loses at most the calls in hand, the same command "
+        "goes on. A call that a shorter time limit has answered for good is not made again.",
+    )
+    run.add_argument(
+        "--planners",
+        required=True,
+        metavar="NAME,...",
+        help="see `robotdiffuse planners`, or all; a learned one with weights of its own: NAME@FOLDER",
+    )
+    run.add_argument(
+        "--problems",
+        required=True,
+        metavar="SET,...",
+        help="rop, rop_dense, shelf, crate, table, each also with _nontrivial; files or folders of problems",
+    )
+    run.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems and results")
+    run.add_argument("--time-limit", type=positive, default=1.0, metavar="S", help="of a call [s] (1)")
+    run.add_argument("--seeds", type=count, default=1, metavar="N", help="calls on each problem (1)")
+    run.add_argument("--count", type=count, metavar="N", help="problems of each set (100; all of a folder)")
+    run.add_argument(
+        "--workers", type=count, metavar="N", help="planners that run at once (default: half of the cores)"
+    )
+    run.add_argument("--cluster", metavar="NAME", help="ray: on the cluster that RAY_ADDRESS names")
+    run.set_defaults(run=run_run)
+    report = actions.add_parser(
+        "report",
+        help="tables, plots and replays of what `bench run` found",
+        description="Write report.md, report.tex, index.html (plots and tables) and replays.html (motions in "
+        "3D), and print the table of each problem set.",
+    )
+    report.add_argument("folder", metavar="FOLDER", help="folder of `robotdiffuse bench run`")
+    report.add_argument(
+        "--limits", metavar="S,...", help="time limits [s] (those of the run, and 0.1, 1, 10, 60 below them)"
+    )
+    report.add_argument("--planners", metavar="NAME,...", help="some of the planners (all)")
+    report.add_argument("--out", metavar="OUT", help="folder to write to (FOLDER)")
+    report.add_argument("--no-replays", action="store_true", help="write no replays.html")
+    report.set_defaults(run=run_report)
+    confirm = actions.add_parser(
+        "confirm",
+        help="the returned motions before a second judge, PyBullet",
+        description="Look at every motion that `bench run` kept as solved by PyBullet, on the meshes. The "
+        "exit status is 1 if it finds one in collision.",
+    )
+    confirm.add_argument("folder", metavar="FOLDER", help="folder of `bench run`")
+    confirm.add_argument("--count", type=count, metavar="N", help="first problems of each set (default: all)")
+    confirm.set_defaults(run=run_confirm)
     ablation = actions.add_parser(
         "ablation",
         help="the rows of the paper's Table 2, trained and tried at equal budget",
@@ -33,9 +89,154 @@ def add(commands: argparse._SubParsersAction) -> None:
     ablation.set_defaults(run=run_ablation)
 
 
+def run_run(arguments: argparse.Namespace) -> int:
+    import sys
+    from pathlib import Path
+
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from robotdiffuse.evaluation.runner import BenchSettings, run_bench
+
+    if arguments.cluster is not None and arguments.workers is not None:
+        raise InputError("--workers is for this machine's processes; --cluster uses all cores that it has")
+    settings = BenchSettings(
+        planners=tuple(arguments.planners.split(",")),
+        problems=tuple(arguments.problems.split(",")),
+        out=Path(arguments.out),
+        time_limit=arguments.time_limit,
+        seeds=arguments.seeds,
+        count=arguments.count,
+        workers=arguments.workers or max(1, (os.cpu_count() or 1) // 2),
+        cluster=arguments.cluster,
+    )
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+        bars = {name: bar.add_task(name, total=None, start=False) for name in settings.contestants}
+
+        def done(planner: str, calls: int, all_calls: int) -> None:
+            bar.start_task(bars[planner])
+            bar.update(bars[planner], completed=calls, total=all_calls)
+
+        made = run_bench(settings, lambda text: print(text, file=sys.stderr, flush=True), done)
+    print(f"{made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}")
+    return 0
+
+
+def run_report(arguments: argparse.Namespace) -> int:
+    from pathlib import Path
+
+    from robotdiffuse.evaluation import bench_report
+    from robotdiffuse.evaluation.bench_figures import read_bench, sections
+    from robotdiffuse.evaluation.bench_page import write_page
+    from robotdiffuse.files import write_atomically
+
+    planners = None if arguments.planners is None else arguments.planners.split(",")
+    limits = None if arguments.limits is None else _limits(arguments.limits)
+    bench = read_bench(Path(arguments.folder), planners)
+    parts = sections(bench, limits)
+    out = Path(arguments.out or arguments.folder)
+    print_bench(bench, parts)
+    write_atomically(out / "report.md", bench_report.markdown(bench, parts), make_folder=True)
+    write_atomically(out / "report.tex", bench_report.latex(bench, parts))
+    replays = None if arguments.no_replays else _write_replays(bench, parts, out / "replays.html")
+    write_page(bench, parts, out / "index.html", replays)
+    files = ["index.html", *([replays] if replays else []), "report.md", "report.tex"]
+    print(f"wrote {', '.join(str(out / name) for name in files)}")
+    return 0
+
+
+def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
+    """The name of the file; None if there is nothing to replay."""
+    from robotdiffuse.evaluation.bench_page import worth_showing
+    from robotdiffuse.problem_files import Robots
+    from robotdiffuse.types import Path as Waypoints
+    from robotdiffuse.viewer.gallery import Exhibit, write_gallery
+
+    robots: Robots = {}
+    shown = [(motion, motion.case.load(robots)) for motion in worth_showing(bench, parts)]
+    if not shown:
+        return None
+    robot = shown[0][1].robot
+    exhibits = [
+        Exhibit(motion.title, motion.caption, problem.scene, Waypoints(robot.joint_names, motion.positions))
+        for motion, problem in shown
+        if problem.robot.name == robot.name
+    ]
+    write_gallery(robot, exhibits, file, "Motions")
+    return file.name
+
+
+def _limits(text: str) -> list[float]:
+    try:
+        return [positive(part) for part in text.split(",")]
+    except (argparse.ArgumentTypeError, ValueError):
+        raise InputError(f"limits are {text!r}; they must be positive times [s], as 0.1,1,10") from None
+
+
+def print_bench(bench: "Bench", parts: "list[Section]") -> None:
+    """For each problem set the table of the limit that most planners were run for."""
+    import sys
+
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from robotdiffuse.evaluation.bench_report import main_table, missing_line
+
+    console = Console(width=None if sys.stdout.isatty() else 150)
+    for section in parts:
+        found = main_table(section, section.main, bench.reference)
+        table = Table(title=escape(found.title), title_justify="left", box=None, padding=(0, 1))
+        for i, column in enumerate(found.columns):
+            table.add_column(escape(column), justify="left" if i == 0 else "right")
+        for row in found.rows:
+            table.add_row(*(escape(cell) for cell in row))
+        console.print(table)
+        if section.main.missing:
+            console.print(escape(missing_line(section.main)))
+        console.print()
+
+
+def run_confirm(arguments: argparse.Namespace) -> int:
+    from pathlib import Path
+
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
+
+    try:
+        from robotdiffuse.evaluation.confirm import confirm
+    except ImportError:
+        raise InputError('PyBullet is not installed: pip install "robotdiffuse[sim]"') from None
+
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("problems")
+        found = confirm(
+            Path(arguments.folder),
+            arguments.count,
+            lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    table = Table("planner", box=None, pad_edge=False)
+    table.add_column("motions", justify="right")
+    table.add_column("in collision by PyBullet", justify="right")
+    for planner, confirmation in found.items():
+        table.add_row(planner, f"{confirmation.checked:,}", str(len(confirmation.refuted)))
+    Console().print(table)
+    refuted = [each for confirmation in found.values() for each in confirmation.refuted]
+    for record, contact in refuted:
+        print(
+            f"{record.planner}, {record.problem_set} {record.name}, seed {record.seed}: {contact.link} and "
+            f"{contact.other}, {-1000 * contact.distance:.1f} mm deep"
+        )
+    return 1 if refuted else 0
+
+
 def _share(values: "ndarray") -> tuple[str, str]:
     """Mean of shares and its interval, in per cent."""
-    from robotdiffuse.evaluation.metrics import bootstrap_interval
+    from robotdiffuse.evaluation.statistics import bootstrap_interval
 
     low, high = (100 * x for x in bootstrap_interval(values))
     return f"{100 * values.mean():.1f}", f"{low:.1f} to {high:.1f}"

@@ -9,7 +9,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -19,6 +19,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.evaluation.metrics import LinkPathLength
 from robotdiffuse.evaluation.trials import (
+    NETWORK_ALONE,
     SEED,
     Tried,
     from_network,
@@ -229,14 +230,13 @@ def _try(
 
 
 def _planner_settings(settings: AblationSettings, config: str | None, guided: bool) -> RobotDiffuseSettings:
-    steps = RobotDiffuseSettings().guidance_steps if guided else 0
+    steps = NETWORK_ALONE.guidance_steps if guided else 0
+    alone = replace(NETWORK_ALONE, samples=settings.candidates, guidance_steps=steps)
     if config is None:
-        return RobotDiffuseSettings(samples=settings.candidates, guidance_steps=steps)
+        return alone
     weights = str(FilePath(settings.out) / config)
     points = load_model(weights, load_robot("panda")).config.encoder_settings.cloud
-    return RobotDiffuseSettings(
-        weights=weights, samples=settings.candidates, guidance_steps=steps, points=points
-    )
+    return replace(alone, weights=weights, points=points)
 
 
 def settings_line(settings: AblationSettings) -> str:

@@ -86,13 +86,15 @@ def style() -> Iterator[None]:
         yield
 
 
-def _figure(width: int, height: float) -> "Figure":
+def make_figure(width: int, height: float) -> "Figure":
+    """As wide as so many columns of the page, and so high [inch]."""
     from matplotlib.figure import Figure
 
     return Figure((WIDTHS[width], height))
 
 
-def _svg(figure: "Figure") -> str:
+def as_svg(figure: "Figure") -> str:
+    """The text of an element."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True, dpi=220, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
@@ -101,7 +103,7 @@ def _svg(figure: "Figure") -> str:
 
 def outcomes(summary: DataSummary) -> str:
     """Bars of what became of the problems."""
-    figure = _figure(4, 2.3)
+    figure = make_figure(4, 2.3)
     axes = figure.subplots()
     tried = max(1, summary.counts.get("tried", 0))
     values = [summary.counts.get(name, 0) for name in REASONS]
@@ -113,22 +115,22 @@ def outcomes(summary: DataSummary) -> str:
     axes.spines[["bottom"]].set_visible(False)
     axes.set_xticks([])
     axes.tick_params(axis="y", labelsize=8.5, labelcolor=INK)
-    return _svg(figure)
+    return as_svg(figure)
 
 
 def lengths(columns: DataColumns) -> str:
     """Histogram of the path lengths by family."""
-    figure = _figure(4, 2.3)
+    figure = make_figure(4, 2.3)
     axes = figure.subplots()
     values = columns.all["cost"]
     _histogram(axes, columns, values, np.linspace(0, _end(values), BINS))
     axes.set_xlabel("length [rad]")
-    return _svg(figure)
+    return as_svg(figure)
 
 
 def clearances(columns: DataColumns, safety_distance: float) -> str:
     """Histogram of the clearances by family, with the safety distance marked."""
-    figure = _figure(4, 2.3)
+    figure = make_figure(4, 2.3)
     axes = figure.subplots()
     values = 100 * columns.all["clearance"]
     end = max(_end(values), 120 * safety_distance)
@@ -139,12 +141,12 @@ def clearances(columns: DataColumns, safety_distance: float) -> str:
     place = axes.get_xaxis_transform()
     axes.text(100 * safety_distance + 0.15, 0.8, "safety\ndistance", transform=place, fontsize=7.5)
     axes.set_xlabel("clearance [cm]")
-    return _svg(figure)
+    return as_svg(figure)
 
 
 def detours(columns: DataColumns) -> str:
     """Histogram of the detours, on a logarithmic scale, of motions whose straight line is not free."""
-    figure = _figure(4, 2.3)
+    figure = make_figure(4, 2.3)
     axes = figure.subplots()
     blocked = ~columns.all["line_free"]
     values = columns.all["detour"]
@@ -153,7 +155,7 @@ def detours(columns: DataColumns) -> str:
     axes.set_yscale("log")
     _percent(axes)
     axes.set_xlabel("length / straight line")
-    return _svg(figure)
+    return as_svg(figure)
 
 
 def difficulty(columns: DataColumns) -> str:
@@ -167,18 +169,18 @@ def difficulty(columns: DataColumns) -> str:
         (clearance < high) & (clearance >= lowest)
         for high, lowest in zip(edges, (*edges[1:], -np.inf), strict=True)
     ]
-    figure = _figure(4, 2.3)
+    figure = make_figure(4, 2.3)
     top, bottom = figure.subplots(2, 1)
     _shares(top, columns, by_detour, ("line free", *(text for _, text in DETOURS)))
     _shares(bottom, columns, by_clearance, ("over 5 cm", "2 to 5", "1 to 2", "below 1"))
-    return _svg(figure)
+    return as_svg(figure)
 
 
 def goals(columns: DataColumns) -> str:
     """Numbers of goals that are given and reached, and the excess cost of those that are not the best."""
     costs = columns.sample["goal_costs"].astype(np.float64)
     given, reached = (~np.isnan(costs)).sum(axis=1), np.isfinite(costs).sum(axis=1)
-    figure = _figure(4, 2.3)
+    figure = make_figure(4, 2.3)
     left, right = figure.subplots(1, 2)
     most = costs.shape[1]
     at = np.arange(1, most + 1)
@@ -199,7 +201,7 @@ def goals(columns: DataColumns) -> str:
     right.set_xlabel("excess cost of the others [%]")
     right.set_xlim(left=0)
     _percent(right)
-    return _svg(figure)
+    return as_svg(figure)
 
 
 def joints(columns: DataColumns) -> str:
@@ -207,7 +209,7 @@ def joints(columns: DataColumns) -> str:
     manifest, q = columns.manifest, columns.sample["trajectories"]
     columns_of_panels = min(7, manifest.dof)
     rows = -(-manifest.dof // columns_of_panels)
-    figure = _figure(12, 1.95 * rows)
+    figure = make_figure(12, 1.95 * rows)
     panels = figure.subplots(rows, columns_of_panels, squeeze=False).reshape(-1)
     for panel in panels[manifest.dof :]:
         panel.set_axis_off()
@@ -230,14 +232,14 @@ def joints(columns: DataColumns) -> str:
         panel.set_xlabel("[rad]", labelpad=1)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper right", ncols=3)
-    return _svg(figure)
+    return as_svg(figure)
 
 
 def obstacles(columns: DataColumns) -> str:
     """Density of the obstacles' volume, seen from above and from the side."""
     points = _obstacle_points(columns)
     reach = max(1.0, 1.05 * float(np.abs(points).max(initial=0.0)))
-    figure = _figure(6, 3.0)
+    figure = make_figure(6, 3.0)
     for axes, (name, across) in zip(_views(figure), (("top", 1), ("side", 2)), strict=True):
         low, high = (-reach, reach) if across == 1 else (0.0, 1.25 * reach)
         cells = [64, round(64 * (high - low) / (2 * reach))]
@@ -250,12 +252,12 @@ def obstacles(columns: DataColumns) -> str:
             interpolation="bicubic",
         )
         _finish_view(axes, name, across)
-    return _svg(figure)
+    return as_svg(figure)
 
 
 def tips(positions: dict[str, Float[ndarray, "n 3"]]) -> str:
     """Where the tip is at both ends, seen from above and from the side."""
-    figure = _figure(6, 3.0)
+    figure = make_figure(6, 3.0)
     reach = 1.05 * max(0.2, *(float(np.abs(p).max(initial=0.0)) for p in positions.values()))
     for axes, (name, across) in zip(_views(figure), (("top", 1), ("side", 2)), strict=True):
         for (end, points), color in zip(positions.items(), (START, GOAL), strict=True):
@@ -270,7 +272,7 @@ def tips(positions: dict[str, Float[ndarray, "n 3"]]) -> str:
         _finish_view(axes, name, across)
         if across == 1:
             axes.legend(loc="upper left", handletextpad=0.2, markerscale=2, borderpad=0)
-    return _svg(figure)
+    return as_svg(figure)
 
 
 def _views(figure: "Figure") -> tuple["Axes", "Axes"]:

@@ -29,6 +29,10 @@ SEARCH_TIME = 10.0
 """Problems that this much search does not solve are left out [s]."""
 
 
+NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4)
+"""How networks are sampled where they are looked at alone: without guidance, the planner's steps are few."""
+
+
 @dataclass(frozen=True, eq=False)
 class Tried:
     """Figures of a network, one value for each problem."""

@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 from robotdiffuse import __version__
 from robotdiffuse.errors import InputError
@@ -29,7 +30,7 @@ CONNECT_SECONDS = 5.0
 """Until a Ray cluster that does not answer is given up; Ray itself tries for minutes."""
 LOST_NODES = 20
 """Times that a shard is begun again on another node of a Ray cluster."""
-GO_ON = "the finished shards are kept, the same command goes on"
+GO_ON = "what is finished is kept, the same command goes on"
 
 
 def versions() -> dict[str, str]:
@@ -105,9 +106,32 @@ def _end_with_parent() -> None:
 def on_ray(settings: GenerationSettings, indices: list[int]) -> Made:
     """Shards made as tasks of one core each by a Ray cluster; those of a lost node are made again elsewhere.
 
-    The cluster is the one that RAY_ADDRESS names, or is started here with all cores. Its nodes need the same
-    versions of this package and of what it computes with; where the robot is a URDF, at the same place.
-    Raises InputError if Ray is not installed, its cluster cannot be reached, or its nodes do not fit.
+    See `ray_cluster`. The nodes need the same versions of this package and of what it computes with; where
+    the robot is a URDF, at the same place. Raises InputError if they do not fit.
+    """
+    if Path(settings.robot).exists():
+        # nodes have other working folders
+        settings = replace(settings, robot=str(Path(settings.robot).resolve()))
+    here = _bearings(settings)
+    queue, running = list(reversed(indices)), {}
+    with ray_cluster() as ray:
+        task = ray.remote(num_cpus=1, max_retries=LOST_NODES)(_make_on_node)
+        while queue or running:
+            most = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
+            while queue and len(running) < most:
+                index = queue.pop()
+                running[task.remote(settings, index, here)] = index
+            done, _ = ray.wait(list(running), num_returns=1)
+            for reference in done:
+                yield running.pop(reference), ray.get(reference)
+
+
+@contextmanager
+def ray_cluster() -> Iterator[Any]:
+    """The module ray, connected to the cluster that RAY_ADDRESS names, or to one started here with all cores.
+
+    Raises InputError if Ray is not installed, its cluster cannot be reached or fails, and for an InputError
+    of a task or a node without this package.
     """
     # read when ray is imported: messages on a lost node are pages long, but for the one on the task
     os.environ.setdefault("RAY_DEDUP_LOGS_SKIP_REGEX", "Raylet is terminated")
@@ -120,23 +144,12 @@ def on_ray(settings: GenerationSettings, indices: list[int]) -> Made:
     ours = not ray.is_initialized()
     if ours:
         _check_reachable(os.environ.get("RAY_ADDRESS", ""))
-    if Path(settings.robot).exists():
-        # nodes have other working folders
-        settings = replace(settings, robot=str(Path(settings.robot).resolve()))
-    here = _bearings(settings)
-    queue, running = list(reversed(indices)), {}
+    connected = False
     try:
         if ours:
             ray.init(log_to_driver=False, logging_level=logging.CRITICAL)
-        task = ray.remote(num_cpus=1, max_retries=LOST_NODES)(_make_on_node)
-        while queue or running:
-            most = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
-            while queue and len(running) < most:
-                index = queue.pop()
-                running[task.remote(settings, index, here)] = index
-            done, _ = ray.wait(list(running), num_returns=1)
-            for reference in done:
-                yield running.pop(reference), ray.get(reference)
+        connected = True
+        yield ray
     except RayTaskError as error:
         if isinstance(error.cause, InputError):
             raise InputError(str(error.cause)) from None
@@ -148,7 +161,7 @@ def on_ray(settings: GenerationSettings, indices: list[int]) -> Made:
     except RayError as error:
         raise InputError(f"the Ray cluster failed: {_line(error)}; {GO_ON}") from None
     except (ConnectionError, RuntimeError, ValueError) as error:
-        if running:
+        if connected:
             raise
         raise InputError(f"no Ray cluster: {_line(error)}") from None
     finally:

@@ -4,6 +4,7 @@ import base64
 import html
 import io
 import json
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -58,19 +59,20 @@ iframe { flex: 1; min-width: 0; height: 100%; border: 0; }
 const replays = JSON.parse(document.getElementById("replays").textContent);
 const buttons = [...document.querySelectorAll("button")], frame = document.querySelector("iframe");
 let shown = -1;
-function show(i) {
-  if (i === shown || !replays[i]) return;
+function show(i, scroll = true) {
+  if (i === shown || !replays.pages[i]) return;
   shown = i;
   buttons.forEach((button, j) => button.setAttribute("aria-current", i === j));
-  buttons[i].scrollIntoView({ block: "nearest", inline: "nearest" });
-  frame.srcdoc = replays[i];
+  // not at first: inside another page it would scroll that one
+  if (scroll) buttons[i].scrollIntoView({ block: "nearest", inline: "nearest" });
+  frame.srcdoc = replays.pages[i].map((part) => replays.parts[part]).join("");
 }
 buttons.forEach((button, i) => button.addEventListener("click", () => show(i)));
 addEventListener("keydown", (event) => {
   const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
   if (step) { event.preventDefault(); show(shown + step); }
 });
-show(0);
+show(0, false);
 </script>
 </body>
 </html>
@@ -111,9 +113,16 @@ def write_gallery(
         if progress is not None:
             progress(i + 1, len(exhibits))
     # in JSON a '<' stands only in strings, and escaped it cannot end the script element
-    data = json.dumps(replays).replace("<", "\\u003c")
+    data = json.dumps(_shared(replays)).replace("<", "\\u003c")
     page = PAGE.replace("{{title}}", html.escape(title)).replace("{{buttons}}", "".join(buttons))
     write_atomically(target, page.replace("{{replays}}", data))
+
+
+def _shared(pages: list[str]) -> dict[str, list]:
+    """Pages as lists of parts, each kept once: the 3D library and the robot are the same in all."""
+    cut = [re.split(r'(?=<script)|(?="scene":)', page) for page in pages]
+    places = {part: i for i, part in enumerate(dict.fromkeys(part for parts in cut for part in parts))}
+    return {"parts": list(places), "pages": [[places[part] for part in parts] for parts in cut]}
 
 
 def _replay(robot: Robot, exhibit: Exhibit) -> str:

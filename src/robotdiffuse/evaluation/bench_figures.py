@@ -1,0 +1,450 @@
+"""The figures of a bench's report: what its records say of every planner, problem set and time limit.
+
+A report on a time limit needs no run of its own: records of a longer limit say what was found by then, and a
+call that ended by itself says what a longer limit would have given.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.comscore import Indicators, comscores
+from robotdiffuse.evaluation.problem_sets import read_cases
+from robotdiffuse.evaluation.records import CRASHED, OVERRAN, RAISED, Record, read_records
+from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
+from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
+from robotdiffuse.scenes.families import FAMILIES
+from robotdiffuse.scenes.rop import RopSettings
+from robotdiffuse.types import Status
+
+LIMITS = (0.1, 1.0, 10.0, 60.0)
+"""Time limits [s] of a report beside those of its records, as far as these are longer."""
+LATE_SHARE, LATE = 0.1, 0.05
+"""A returned motion may be this share of the limit, or this time [s], late: planners stop in time, and then
+the judge takes its own."""
+ROP = tuple(name for name, family in FAMILIES.items() if isinstance(family, RopSettings))
+NONTRIVIAL = ", non-trivial"
+RAN_OUT, GAVE_UP, LATER = "time ran out", "gave up before", "found one later"
+FAILURES = {
+    RAN_OUT: "no path by the end of the limit",
+    GAVE_UP: "ended without a path, long before the limit",
+    LATER: "found a path, but after the limit",
+    "scene collision": "the last path hit an obstacle",
+    "self-collision": "the last path hit the arm itself",
+    "other refusal": "the last path broke limits, missed the goal or twitched",
+    "ends refused": "start or goal said to be impossible",
+    CRASHED: "the process died",
+    OVERRAN: "the process did not answer and was killed",
+    RAISED: "an exception",
+}
+"""Why calls fail, for tables and plots."""
+REFUSED = {"scene_collision": "scene collision", "self_collision": "self-collision"}
+
+Key = tuple[str, int]
+"""A problem of a set by name, and a seed."""
+Calls = dict[Key, list[Record]]
+"""The calls of one planner on one problem set, shorter limits first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What `bench run` left in a folder."""
+
+    folder: FilePath
+    runs: tuple[dict[str, Any], ...]
+    """What each run noted of itself."""
+    records: dict[str, list[Record]]
+    """By planner, in the order of PLANNERS."""
+
+    @property
+    def reference(self) -> str:
+        """The planner that the others are compared with."""
+        return DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
+
+    @property
+    def problem_sets(self) -> list[str]:
+        return list(dict.fromkeys(r.problem_set for records in self.records.values() for r in records))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a call had done by a time limit."""
+
+    record: Record
+    found: float
+    """When the first path was found [s]; infinite if not by the limit."""
+    returned: float
+    """When the planner would have returned [s]: the limit for an anytime planner and if nothing was found."""
+    joint_length: float
+    """Of the best path by then [rad]; NaN without one, as what follows."""
+    link_length: float
+    """The paper's [m]; a longer path than the returned one is taken as longer by the same factor."""
+
+    @property
+    def solved(self) -> bool:
+        return self.found < np.inf
+
+    @property
+    def failure(self) -> str:
+        """One of FAILURES."""
+        record = self.record
+        if record.solved:
+            return LATER
+        if record.status in FAILURES:
+            return record.status
+        if record.status != Status.TIMEOUT.value:
+            return "ends refused"
+        if record.refused:
+            return REFUSED.get(record.refused, "other refusal")
+        return GAVE_UP if record.ended_by_itself and record.time < self.returned else RAN_OUT
+
+
+@dataclass(frozen=True)
+class Row:
+    """A planner's figures at a time limit. Means are over the problems that it solved; NaN without any."""
+
+    planner: str
+    success: float
+    success_interval: tuple[float, float]
+    """95 %, by E. B. Wilson's method over problems."""
+    collision: float
+    """Share of the problems on which the last answer was a path in collision."""
+    link_length: float
+    """The paper's path length [m]."""
+    first: float
+    """Median time to the first path [s]."""
+    returned: float
+    """Mean time until the planner returns [s], over all problems; an unsolved one counts the limit."""
+    comscore: float
+    """Among the rows of this table."""
+    paired: Paired | None
+    """Against the reference, by joint-space lengths; None for itself and where it has no row."""
+    clearance: float
+    """Mean of the least clearance of a motion [m]; this and what follows is of the returned motions."""
+    turning: float
+    tip_length: float
+    duration: float
+    jerk: float
+    sparc_joint: float
+    sparc_tip: float
+    memory: float
+    """Most memory of the process [MB]."""
+    failures: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Planners at a time limit, on the problems that all of them have been given this time for."""
+
+    limit: float
+    problems: int
+    of: int
+    """Problems of the section."""
+    seeds: int
+    rows: tuple[Row, ...]
+    missing: tuple[str, ...]
+    """Planners that were not run this long."""
+    families: dict[str, dict[str, tuple[int, int]]]
+    """Solved calls and all calls, by family and planner."""
+    keys: tuple[Key, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A planner's success and lengths over time, by its longest calls."""
+
+    planner: str
+    calls: int
+    end: float
+    """What was found later than this [s] is known of some problems alone."""
+    found: Float[ndarray, "solved"]
+    """When first paths were found [s], sorted."""
+    anytime: bool
+    """Whether paths were improved, in more than a tenth of the solved calls on non-trivial problems."""
+    times: Float[ndarray, "t"]
+    """From half of these problems on [s]."""
+    ratios: Float[ndarray, "t"]
+    """Median at these times of joint-space length to the best known one, over the non-trivial problems that
+    it solves in the end; those not solved yet count as infinite."""
+
+
+@dataclass(frozen=True)
+class Section:
+    """A problem set, or its non-trivial part."""
+
+    name: str
+    problem_set: str
+    comparisons: tuple[Comparison, ...]
+    """Shorter limits first."""
+    curves: tuple[Curve, ...]
+
+    @property
+    def main(self) -> Comparison:
+        """With most planners and problems, and of those the longest limit."""
+        return max(self.comparisons, key=lambda c: (len(c.rows) * c.problems, c.limit))
+
+
+def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench:
+    """The records of all planners of a run, or of some.
+
+    Raises InputError for a folder that `bench run` did not fill, damaged files and planners without records.
+    """
+    files = {file.stem: file for file in sorted((folder / "records").glob("*.jsonl"))}
+    if not files:
+        raise InputError(f"{folder} holds no records of a bench; `robotdiffuse bench run` makes them")
+    order = {name: i for i, name in enumerate(PLANNERS)}
+    names = sorted(files, key=lambda name: (order.get(name.partition("@")[0], len(order)), name))
+    for name in planners or ():
+        if name not in files:
+            raise InputError(f"planners names {name!r}, of which {folder} has no records; {', '.join(names)}")
+    chosen = [name for name in names if planners is None or name in planners]
+    records = {name: read_records(files[name]) for name in chosen}
+    if not any(records.values()):
+        raise InputError(f"{folder} holds no records yet; go on with `robotdiffuse bench run`")
+    return Bench(folder, _read_runs(folder / "runs.jsonl"), records)
+
+
+def _read_runs(file: FilePath) -> tuple[dict[str, Any], ...]:
+    try:
+        lines = file.read_text().splitlines() if file.is_file() else []
+        runs = tuple(json.loads(line) for line in lines)
+        for name in ("date", "versions", "planners", "problems", "time_limit", "seeds", "count"):
+            if not all(name in run for run in runs):
+                raise ValueError(f"a run without {name}")
+        return runs
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{file} is damaged: {error}; results cannot be read without it") from None
+
+
+def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Section]:
+    """All problem sets; those of random obstacles with trivial problems also without them.
+
+    `limits`: the time limits [s] to report; None: those of the records, and LIMITS below them.
+    Raises InputError if no planner was run as long as any of these.
+    """
+    found = []
+    for problem_set in bench.problem_sets:
+        calls = {name: calls_on(records, problem_set) for name, records in bench.records.items()}
+        records = [r for of in calls.values() for key in of for r in of[key]]
+        names = list(dict.fromkeys(r.name for r in records))
+        cases = [case.name for case in read_cases(bench.folder, problem_set)]
+        places = {name: i for i, name in enumerate(dict.fromkeys([*cases, *names]))}
+        chosen = _limits(records) if limits is None else sorted(limits)
+        parts = {problem_set: set(names)}
+        if any(r.trivial for r in records) and {r.family for r in records} <= set(ROP):
+            parts[problem_set + NONTRIVIAL] = {r.name for r in records if r.solved and not r.trivial}
+        for name, problems in parts.items():
+            part = {
+                planner: {key: of[key] for key in of if key[0] in problems} for planner, of in calls.items()
+            }
+            comparisons = [
+                _comparison(bench, problem_set, part, len(problems), places, limit) for limit in chosen
+            ]
+            kept = tuple(c for c in comparisons if c.rows)
+            if kept:
+                found.append(Section(name, problem_set, kept, _curves(part)))
+    if not found:
+        raise InputError(
+            f"limits are {', '.join(f'{x:g}' for x in limits or ())} s; no planner was run that long"
+        )
+    return found
+
+
+def counting(records: Sequence[Record], limit: float) -> Record | None:
+    """The record that says what a planner does within a limit [s], of its calls on one problem with one seed,
+    shorter limits first: of the least limit that is as long, else one that ended by itself."""
+    for record in records:
+        if record.time_limit >= limit:
+            return record
+    return next((record for record in reversed(records) if record.ended_by_itself), None)
+
+
+def outcome(record: Record, limit: float) -> Outcome:
+    """What was done within a limit [s] that the record counts for."""
+    late = max(LATE_SHARE * limit, LATE) if record.time_limit == limit else 0.0
+    by_then = [(at, length) for at, length in record.progress if record.solved and at <= limit + late]
+    if not by_then:
+        return Outcome(record, np.inf, limit, np.nan, np.nan)
+    length, final = by_then[-1][1], record.joint_length
+    link = np.nan if record.link_length is None else record.link_length
+    factor = length / final if final else 1.0
+    return Outcome(record, min(by_then[0][0], limit), min(record.time, limit), length, link * factor)
+
+
+def calls_on(records: Iterable[Record], problem_set: str) -> Calls:
+    """A planner's calls on a problem set, of its records."""
+    calls: Calls = {}
+    for record in records:
+        if record.problem_set == problem_set:
+            calls.setdefault((record.name, record.seed), []).append(record)
+    for of in calls.values():
+        of.sort(key=lambda record: record.time_limit)
+    return calls
+
+
+def _limits(records: Sequence[Record]) -> list[float]:
+    recorded = {record.time_limit for record in records}
+    return sorted(recorded | {limit for limit in LIMITS if limit < max(recorded)})
+
+
+def _counted(
+    bench: Bench, planner: str, problem_set: str, calls: Calls, places: dict[str, int], limit: float
+) -> dict[Key, Record]:
+    """The records that count for a limit.
+
+    Where a planner has been given this time on the first problems alone, only those count: of the others,
+    the ones that ended by themselves before are known, which are easy ones.
+    """
+    counted = {key: record for key, of in calls.items() if (record := counting(of, limit)) is not None}
+    if len(counted) == len(calls):
+        return counted
+    given = [
+        (run["seeds"], run["count"] or len(places))
+        for run in bench.runs
+        if planner in run["planners"] and problem_set in run["problems"] and run["time_limit"] >= limit
+    ]
+    return {
+        key: record
+        for key, record in counted.items()
+        if any(key[1] < seeds and places[key[0]] < count for seeds, count in given)
+    }
+
+
+def _comparison(
+    bench: Bench,
+    problem_set: str,
+    calls: dict[str, Calls],
+    problems: int,
+    places: dict[str, int],
+    limit: float,
+) -> Comparison:
+    counted = {name: _counted(bench, name, problem_set, of, places, limit) for name, of in calls.items()}
+    present = [name for name, of in counted.items() if of]
+    shared = set.intersection(*(set(counted[name]) for name in present)) if present else set()
+    keys = tuple(sorted(shared, key=lambda key: (places[key[0]], key[1])))
+    if not keys:
+        return Comparison(limit, 0, problems, 0, (), tuple(calls), {}, ())
+    outcomes = {name: [outcome(counted[name][key], limit) for key in keys] for name in present}
+    names = tuple(dict.fromkeys(name for name, _ in keys))
+    scores = comscores([_indicators(of) for of in outcomes.values()])
+    lengths = {name: _problem_lengths(keys, of) for name, of in outcomes.items()}
+    rows = tuple(
+        _row(name, outcomes[name], len(names), score, _paired(lengths, name, bench.reference))
+        for name, score in zip(present, scores.tolist(), strict=True)
+    )
+    families: dict[str, dict[str, tuple[int, int]]] = {}
+    for name, of in outcomes.items():
+        calls_of = Counter(o.record.family for o in of)
+        solved = Counter(o.record.family for o in of if o.solved)
+        for family in calls_of:
+            families.setdefault(family, {})[name] = solved[family], calls_of[family]
+    seeds = len({seed for _, seed in keys})
+    missing = tuple(name for name in calls if name not in present)
+    return Comparison(limit, len(names), problems, seeds, rows, missing, families, keys)
+
+
+def _mean(values: Iterable[float | None]) -> float:
+    known = [value for value in values if value is not None and value == value]
+    return float(np.mean(known)) if known else np.nan
+
+
+def _indicators(outcomes: Sequence[Outcome]) -> Indicators:
+    """As the paper's, of all calls; the length over the solved ones."""
+    return Indicators(
+        success=100 * float(np.mean([o.solved for o in outcomes])),
+        collision=100 * float(np.mean([o.record.in_collision for o in outcomes])),
+        length=_mean(o.link_length for o in outcomes),
+        time=float(np.mean([o.returned for o in outcomes])),
+    )
+
+
+def _problem_lengths(keys: Sequence[Key], outcomes: Sequence[Outcome]) -> Float[ndarray, "problems"]:
+    """One joint-space length of each problem [rad]: the median of its seeds, NaN if half or more failed."""
+    of: dict[str, list[float]] = {}
+    for (name, _), o in zip(keys, outcomes, strict=True):
+        of.setdefault(name, []).append(o.joint_length)
+    values = (np.array(lengths) for lengths in of.values())
+    return np.array([np.nanmedian(v) if 2 * np.isnan(v).sum() < len(v) else np.nan for v in values])
+
+
+def _paired(lengths: dict[str, Float[ndarray, "n"]], name: str, reference: str) -> Paired | None:
+    if name == reference or reference not in lengths:
+        return None
+    return compare(lengths[name], lengths[reference])
+
+
+def _row(
+    planner: str, outcomes: Sequence[Outcome], problems: int, comscore: float, paired: Paired | None
+) -> Row:
+    solved = [o for o in outcomes if o.solved]
+    success = len(solved) / len(outcomes)
+    indicators = _indicators(outcomes)
+
+    def mean(field: str) -> float:
+        return _mean(getattr(o.record, field) for o in solved)
+
+    return Row(
+        planner=planner,
+        success=success,
+        # the seeds of one problem are no independent trials: as many trials as problems
+        success_interval=wilson_interval(round(success * problems), problems),
+        collision=indicators.collision / 100,
+        link_length=indicators.length,
+        first=float(np.median([o.found for o in solved])) if solved else np.nan,
+        returned=indicators.time,
+        comscore=comscore,
+        paired=paired,
+        clearance=mean("min_clearance"),
+        turning=mean("turning"),
+        tip_length=mean("tip_length"),
+        duration=mean("duration"),
+        jerk=mean("jerk"),
+        sparc_joint=mean("sparc_joint"),
+        sparc_tip=mean("sparc_tip"),
+        memory=max((o.record.memory for o in outcomes if o.record.memory is not None), default=np.nan),
+        failures=dict(Counter(o.failure for o in outcomes if not o.solved)),
+    )
+
+
+def _curves(calls: dict[str, Calls]) -> tuple[Curve, ...]:
+    """On the problems that every planner has been called on."""
+    with_calls = {name: of for name, of in calls.items() if of}
+    keys = sorted(set.intersection(*(set(of) for of in with_calls.values()))) if with_calls else []
+    best = {
+        key: min(
+            (r.joint_length for of in with_calls.values() for r in of[key] if r.joint_length), default=1.0
+        )
+        for key in keys
+    }
+    if not keys:
+        return ()
+    longest = max(of[key][-1].time_limit for of in with_calls.values() for key in keys)
+    return tuple(
+        _curve(name, {key: of[key][-1] for key in keys}, best, longest) for name, of in with_calls.items()
+    )
+
+
+def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], longest: float) -> Curve:
+    """`longest`: limit of any planner [s], where the plot ends."""
+    end = min([longest, *(r.time_limit for r in records.values() if not r.ended_by_itself)])
+    done = {key: r for key, r in records.items() if outcome(r, r.time_limit).found <= end}
+    found = np.sort([min(r.progress[0][0], end) for r in done.values()])
+    hard = {key: r for key, r in done.items() if not r.trivial}
+    improved = sum(len(r.progress) > 1 for r in hard.values())
+    times = np.geomspace(1e-4, end, 240)
+    lengths = np.full((len(hard), len(times)), np.inf)
+    for row, (key, record) in zip(lengths, hard.items(), strict=True):
+        for at, length in record.progress:
+            row[times >= min(at, end)] = length / best[key]
+    with np.errstate(invalid="ignore"):
+        ratios = np.median(lengths, axis=0) if hard else np.full(len(times), np.inf)
+    known = np.isfinite(ratios)
+    return Curve(planner, len(records), end, found, improved > 0.1 * len(hard), times[known], ratios[known])

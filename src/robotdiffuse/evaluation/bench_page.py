@@ -1,0 +1,375 @@
+"""The page of a bench: plots and tables in one HTML file that needs no network; and what to replay."""
+
+import html
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.evaluation import bench_plots, bench_report, data_plots
+from robotdiffuse.evaluation.bench_figures import (
+    Bench,
+    Comparison,
+    Outcome,
+    Section,
+    calls_on,
+    counting,
+    outcome,
+)
+from robotdiffuse.evaluation.bench_report import TextTable
+from robotdiffuse.evaluation.data_page import STYLE
+from robotdiffuse.evaluation.problem_sets import Case, read_cases
+from robotdiffuse.evaluation.records import Record
+from robotdiffuse.files import write_atomically
+from robotdiffuse.paths.export import check_output
+from robotdiffuse.problem import JointGoal
+
+OWN_STYLE = """
+[hidden] { display: none !important; }
+.pick { position: sticky; top: 0; z-index: 2; display: flex; flex-wrap: wrap; gap: 6px 18px;
+  margin: 20px -26px 14px; padding: 10px 26px; background: rgba(242, 244, 246, .93);
+  backdrop-filter: blur(6px); border-bottom: 1px solid var(--line); }
+.pick div { display: flex; flex-wrap: wrap; gap: 5px; }
+.pick button { padding: 5px 12px; border: 0; border-radius: 999px; background: white; color: var(--ink);
+  font: inherit; font-size: 13px; cursor: pointer; box-shadow: 0 0 0 1px var(--line); }
+.pick button:hover { box-shadow: 0 0 0 1px rgba(34, 43, 56, .28); }
+.pick button[aria-pressed=true] { background: var(--ink); color: white; }
+.cards + .cards { margin-top: 14px; }
+.wide { overflow-x: auto; margin: 2px -20px 0; padding: 0 20px 6px; }
+.card .wide svg { min-width: 470px; }
+.card.w12 .wide svg { min-width: 880px; }
+table { width: 100%; border-collapse: collapse; font-size: 12.8px; font-variant-numeric: tabular-nums; }
+th { padding: 5px 8px; border-bottom: 1px solid #ccd2d9; color: var(--soft); font-weight: 500;
+  font-size: 12px; line-height: 1.25; text-align: right; vertical-align: bottom; }
+td { padding: 3.5px 8px; border-bottom: 1px solid #f0f2f4; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { position: sticky; left: 0; padding-left: 0; background: white;
+  text-align: left; }
+td:first-child i { display: inline-block; width: 9px; height: 9px; margin-right: 8px; border-radius: 3px; }
+tr.ours td { font-weight: 640; }
+tbody tr:hover td { background: #f7f8fa; }
+td.best { color: #0a7d5e; font-weight: 640; }
+td.dim { color: var(--soft); }
+.bar { display: inline-block; width: 74px; height: 8px; margin-right: 8px; border-radius: 4px;
+  background: #eef0f3; vertical-align: 1px; overflow: hidden; text-align: left; }
+.bar b { display: block; height: 100%; border-radius: 4px; }
+.bar + span { display: inline-block; min-width: 40px; }
+iframe { display: block; width: 100%; height: min(760px, 82vh); margin-top: 4px;
+  border: 1px solid var(--line); border-radius: 12px; }
+.wrong td { text-align: left; white-space: normal; }
+details { margin-top: 14px; } summary { cursor: pointer; font-weight: 640; font-size: 15.5px; }
+details li { margin: 5px 0; color: #4c5766; }
+h3 { margin: 26px 0 12px; font-size: 19px; font-weight: 660; letter-spacing: -.01em; }
+@media (max-width: 900px) { main { padding: 22px 12px 30px; }
+  .pick { margin: 16px -12px 12px; padding: 8px 12px; } .pick button { padding: 4px 10px; font-size: 12.5px; }
+  .tiles { grid-template-columns: repeat(2, 1fr); } }
+"""
+
+SCRIPT = """
+const chosen = {}, picks = [...document.querySelectorAll(".pick button")];
+function show() {
+  for (const part of document.querySelectorAll("[data-set]"))
+    part.hidden = part.dataset.set !== chosen.set || (part.dataset.limit || chosen.limit) !== chosen.limit;
+  for (const pick of picks) {
+    pick.setAttribute("aria-pressed", chosen[pick.dataset.kind] === pick.value);
+    if (pick.dataset.kind === "limit") pick.hidden = !limits[chosen.set].includes(pick.value);
+  }
+}
+const limits = {};
+for (const part of document.querySelectorAll("[data-limit]"))
+  (limits[part.dataset.set] = limits[part.dataset.set] || []).push(part.dataset.limit);
+for (const pick of picks) pick.addEventListener("click", () => {
+  chosen[pick.dataset.kind] = pick.value;
+  if (!limits[chosen.set].includes(chosen.limit)) chosen.limit = mains[chosen.set];
+  show();
+});
+chosen.set = picks[0].value;
+chosen.limit = mains[chosen.set];
+show();
+"""
+
+MOST_REPLAYS = 12
+HARDEST = 2
+"""Solved problems in replays, each with up to three planners; the rest is failures."""
+
+
+def write_page(bench: Bench, parts: Sequence[Section], file: str | FilePath, replays: str | None) -> None:
+    """Write the page as .html. `replays`: name of a file beside it with replays, which it shows in a frame.
+
+    Raises InputError without matplotlib and for a file that cannot be written.
+    """
+    target = check_output(file, (".html", ".htm"))
+    with data_plots.style():
+        text = _page(bench, parts, replays)
+    write_atomically(target, text, make_folder=True)
+
+
+def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
+    name = html.escape(bench.folder.resolve().name)
+    planners = list(bench.records)
+    apart = [section for section in parts if section.name == section.problem_set]
+    families = bench_plots.families([section.main for section in apart], planners)
+    limits = " and ".join(f"{x:g} s" for x in sorted({section.main.limit for section in apart}))
+    text = f"Share of problems solved within {limits}, with 95 % intervals; in brackets, how many calls"
+    frame = ""
+    if replays:
+        frame = _card(
+            "Motions",
+            12,
+            "The problems with the longest ways round, by several planners; and problems that planners "
+            "failed on, with a motion that does it where there is one; "
+            f'<a href="{html.escape(replays)}">on a page of their own</a>',
+            f'<iframe title="replays" loading="lazy" src="{html.escape(replays)}"></iframe>',
+        )
+    # in JSON a '<' stands only in strings, and escaped it cannot end the script element
+    mains = json.dumps({s.name: f"{s.main.limit:g}" for s in parts}).replace("<", "\\u003c")
+    pieces = (
+        '<!doctype html>\n<html lang="en">\n<head><meta charset="utf-8">',
+        f"<title>{name}</title>",
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<style>{STYLE}{OWN_STYLE}</style></head>\n<body><main>",
+        f"<h1>{name}</h1>",
+        f'<div class="about">{"<br>".join(html.escape(line) for line in bench_report.about(bench))}</div>',
+        f'<div class="tiles">{_tiles(bench)}</div>',
+        _picks(parts),
+        *(_section(bench, section, planners) for section in parts),
+        '<h3>All problems</h3><div class="cards">',
+        _card("Success by family", 12, text, f'<div class="wide">{families}</div>'),
+        _crashes(bench),
+        frame,
+        "</div>",
+        "<details><summary>How to read the tables</summary><ul>",
+        *(f"<li>{html.escape(note)}</li>" for note in bench_report.NOTES),
+        "</ul></details>",
+        f"</main><script>const mains = {mains};{SCRIPT}</script></body></html>\n",
+    )
+    return "\n".join(pieces)
+
+
+def _card(title: str, width: int, text: str, content: str) -> str:
+    return f'<section class="card w{width}"><h2>{title}</h2><p>{text}</p>{content}</section>'
+
+
+def _tiles(bench: Bench) -> str:
+    records = [record for of in bench.records.values() for record in of]
+    problems = {(record.problem_set, record.name) for record in records}
+    limits = sorted({record.time_limit for record in records})
+    hours = sum(record.time for record in records) / 3600
+    tiles = [
+        (f"{len(bench.records)}", "planners"),
+        (f"{len(problems):,}", f"problems in {len(bench.problem_sets)} sets"),
+        (f"{len(records):,}", "calls"),
+        (" · ".join(f"{limit:g}" for limit in limits) + "\u202fs", "time limits"),
+        (f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min", "of planning"),
+        (f"{sum(record.solved for record in records):,}", "verified motions"),
+    ]
+    return "".join(
+        f'<div class="tile"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'
+        for value, what in tiles
+    )
+
+
+def _picks(parts: Sequence[Section]) -> str:
+    """Buttons that choose the problem set and the time limit."""
+    limits = sorted({c.limit for section in parts for c in section.comparisons})
+    kinds = (
+        ("set", [(section.name, section.name) for section in parts]),
+        ("limit", [(f"{limit:g}", f"{limit:g} s") for limit in limits]),
+    )
+    return '<div class="pick">{}</div>'.format(
+        "".join(
+            "<div>{}</div>".format(
+                "".join(
+                    f'<button data-kind="{kind}" value="{html.escape(value)}">{html.escape(text)}</button>'
+                    for value, text in values
+                )
+            )
+            for kind, values in kinds
+        )
+    )
+
+
+def _section(bench: Bench, section: Section, planners: list[str]) -> str:
+    """Plots of a problem set, and the tables of each limit."""
+    name = html.escape(section.name)
+    plots = ""
+    if section.curves:
+        ran = section.curves[0].calls
+        plots = _card(
+            "Success over time",
+            6,
+            f"{name}: share of {ran} calls. Learned planners solid, sampling dashed, search dotted",
+            f'<div class="wide">{bench_plots.success_over_time(section, planners)}</div>',
+        ) + _card(
+            "Length over time",
+            6,
+            f"{name}: median length over the best known, of non-trivial problems. Points: one path a call",
+            f'<div class="wide">{bench_plots.length_over_time(section, planners)}</div>',
+        )
+    tables = "".join(
+        f'<div class="cards" data-set="{name}" data-limit="{comparison.limit:g}">'
+        f"{_comparison(bench, section, comparison)}</div>"
+        for comparison in section.comparisons
+    )
+    return f'<div class="cards" data-set="{name}">{plots}</div>{tables}'
+
+
+def _comparison(bench: Bench, section: Section, comparison: Comparison) -> str:
+    main, *others = bench_report.tables(section, comparison, bench.reference)
+    text = html.escape(bench_report.missing_line(comparison))
+    cards = [_card(html.escape(main.title), 12, text, _main_rows(main, comparison, bench))]
+    for table in others:
+        heading, _, rest = table.title.partition("; ")
+        short = len(table.columns) < 8
+        if heading.startswith("Failures"):
+            short = True
+            drawn = bench_plots.failures(section, comparison, list(bench.records))
+            cards.append(_card("Failures", 6, html.escape(rest), f'<div class="wide">{drawn}</div>'))
+        cards.append(_card(html.escape(heading), 6 if short else 12, html.escape(rest), _rows(table, bench)))
+    return "".join(cards)
+
+
+def _rows(table: TextTable, bench: Bench) -> str:
+    head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
+    body = "".join(
+        f"<tr>{_name(row[0], bench)}{''.join(f'<td>{html.escape(cell)}</td>' for cell in row[1:])}</tr>"
+        for row in table.rows
+    )
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _name(text: str, bench: Bench) -> str:
+    planner = text.partition(" ")[0]
+    color = bench_plots.color_of(planner, list(bench.records))
+    return f'<td><i style="background:{color}"></i>{html.escape(text)}</td>'
+
+
+def _main_rows(table: TextTable, comparison: Comparison, bench: Bench) -> str:
+    """With a bar for the success, and figures in green that are the best and not common."""
+    rows = comparison.rows
+    figures: dict[int, tuple[list[float], bool]] = {
+        1: ([row.success for row in rows], True),
+        3: ([row.collision for row in rows], False),
+        7: ([row.first for row in rows], False),
+        8: ([row.returned for row in rows], False),
+        9: ([row.comscore for row in rows], True),
+    }
+    best: dict[int, set[int]] = {}
+    for i, (values, high) in figures.items():
+        if not np.isnan(values).all():
+            top = (np.nanmax if high else np.nanmin)(values)
+            level = {j for j, value in enumerate(values) if value == top}
+            best[i] = level if 2 * len(level) <= len(rows) else set()
+    body = []
+    for j, (row, cells) in enumerate(zip(rows, table.rows, strict=True)):
+        color = bench_plots.color_of(row.planner, list(bench.records))
+        texts = [_name(cells[0], bench)]
+        for i, cell in enumerate(cells[1:], start=1):
+            kind = "best" if j in best.get(i, ()) else "dim" if i in (2, 6) else ""
+            share = f"{100 * row.success:.1f}%;background:{color}"
+            bar = f'<span class="bar"><b style="width:{share}"></b></span>' if i == 1 else ""
+            texts.append(f'<td class="{kind}">{bar}<span>{html.escape(cell)}</span></td>')
+        ours = ' class="ours"' if row.planner == bench.reference else ""
+        body.append(f"<tr{ours}>{''.join(texts)}</tr>")
+    head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
+    return (
+        f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
+    )
+
+
+def _crashes(bench: Bench) -> str:
+    lines = bench_report.crashes(bench)
+    if not lines:
+        return ""
+    rows = "".join(f"<tr><td>{html.escape(line)}</td></tr>" for line in lines[:20])
+    return _card("Crashes and exceptions", 12, "", f'<table class="wrong"><tbody>{rows}</tbody></table>')
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A motion that is worth a replay."""
+
+    title: str
+    caption: str
+    case: Case
+    positions: Float[ndarray, "n dof"]
+    """Waypoints [rad]; the straight line to the goal where nobody found a motion."""
+
+
+def worth_showing(bench: Bench, parts: Sequence[Section]) -> list[Shown]:
+    """Motions of the problems with the longest ways round, then of problems on which the reference, or else
+    another planner, failed; all at the main limit of their set and among those in the folder's files."""
+    tries: list[_Tries] = []
+    for section in (section for section in parts if section.name == section.problem_set):
+        calls = {name: calls_on(records, section.problem_set) for name, records in bench.records.items()}
+        cases = {case.name: case for case in read_cases(bench.folder, section.problem_set)}
+        compared = [row.planner for row in section.main.rows]
+        for name, seed in section.main.keys:
+            if seed == section.main.keys[0][1] and name in cases:
+                found = {
+                    planner: counting(calls[planner][name, seed], section.main.limit) for planner in compared
+                }
+                outcomes = {k: outcome(r, section.main.limit) for k, r in found.items() if r is not None}
+                tries.append(_Tries(cases[name], outcomes))
+    hardest = sorted((t for t in tries if t.solved), key=lambda t: (len(t.solved) < 2, -t.detour))[:HARDEST]
+    shown = [motion for t in hardest for motion in _solved(t, bench.reference)]
+    failed = [
+        t for t in tries if t.failed and t not in hardest and (t.solved or "joints" in t.case.problem["goal"])
+    ]
+    failed.sort(key=lambda t: (bench.reference not in t.failed, len(t.solved)))
+    return shown + [_failed(t, bench.reference) for t in failed[: MOST_REPLAYS - len(shown)]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Tries:
+    """What the planners made of a problem."""
+
+    case: Case
+    outcomes: dict[str, Outcome]
+
+    @property
+    def solved(self) -> list[Record]:
+        """Shortest first."""
+        records = [o.record for o in self.outcomes.values() if o.solved]
+        return sorted(records, key=lambda record: record.joint_length or 0.0)
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Why, by planner."""
+        return {name: o.failure for name, o in self.outcomes.items() if not o.solved}
+
+    @property
+    def detour(self) -> float:
+        """Length of the shortest motion over that of the straight line between its ends."""
+        best = self.solved[0]
+        straight = float(np.linalg.norm(best.waypoints[-1] - best.waypoints[0]))
+        return (best.joint_length or 0.0) / max(straight, 1e-6)
+
+
+def _solved(tries: _Tries, reference: str) -> list[Shown]:
+    """The reference's motion, the shortest and the longest."""
+    solved = tries.solved
+    chosen = [*(r for r in solved if r.planner == reference), solved[0], solved[-1]]
+    shown = []
+    for record in {record.planner: record for record in chosen}.values():
+        which = "shortest, " if record is solved[0] else "longest, " if record is solved[-1] else ""
+        caption = f"{record.joint_length:.2f} rad, {which}in {bench_report.seconds(record.time)} s"
+        shown.append(Shown(f"{record.planner} · {tries.case.name}", caption, tries.case, record.waypoints))
+    return shown
+
+
+def _failed(tries: _Tries, reference: str) -> Shown:
+    failures, solved = tries.failed, tries.solved
+    loser = reference if reference in failures else next(iter(failures))
+    title = f"{loser} fails · {tries.case.name}"
+    if solved:
+        others = f"; here: {solved[0].planner}" + (f", {len(solved)} solve it" if len(solved) > 1 else "")
+        return Shown(title, failures[loser] + others, tries.case, solved[0].waypoints)
+    problem = tries.case.load()
+    assert isinstance(problem.goal, JointGoal)
+    caption = "solved by none; here: the straight line, no solution"
+    line = np.stack([problem.start, problem.goal.positions[0]])
+    return Shown(f"not solved · {tries.case.name}", caption, tries.case, line)

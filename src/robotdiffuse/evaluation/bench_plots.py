@@ -1,0 +1,292 @@
+"""The plots of a bench's page, as SVG. All need matplotlib, which the core install lacks."""
+
+import hashlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from robotdiffuse.evaluation.bench_figures import FAILURES, Comparison, Section
+from robotdiffuse.evaluation.data_plots import FAINT, INK, LINE, SOFT, as_svg, make_figure
+from robotdiffuse.evaluation.records import CRASHED, OVERRAN, RAISED
+from robotdiffuse.evaluation.statistics import wilson_interval
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+LEARNED = {
+    "robotdiffuse": "#0c9b74",
+    "mpnet": "#d9622b",
+    "mpinets": "#c23f78",
+    "mpd": "#d99a17",
+    "edmp": "#8b55b8",
+}
+SEARCH = {"a_star": "#6b4a2f", "d_star_lite": "#b08656"}
+BLUES = ("#1d4e9e", "#3f8ae0", "#1b8fa8", "#6a6fd1", "#6fb1ea", "#41597a", "#9c93e6", "#58b9c7", "#8a9bb2")
+"""Of sampling-based planners, which are all others."""
+SOLID, DASHED, DOTTED = "-", (0, (4.5, 1.6)), (0, (1.2, 1.3))
+REASONS = dict(
+    zip(
+        FAILURES,
+        (
+            *("#c5ccd6", "#97a3b4", "#dfe4ea"),  # of time
+            *("#c8443c", "#e08a5b", "#efc49a"),  # of refused paths
+            "#b79bd6",
+            *("#2f3745", "#5a6475", "#7d4f5d"),  # of broken planners
+        ),
+        strict=True,
+    )
+)
+"""Colours of failures."""
+assert {CRASHED, OVERRAN, RAISED} <= set(REASONS)
+INSIDE = (0.085, 0.07, 0.655, 0.9)
+"""Of a figure, where the plot is when names stand beside it."""
+LABEL = 7.2
+"""Size of the names in plots [pt]."""
+
+
+def color_of(planner: str, planners: Sequence[str]) -> str:
+    """The same in all plots of a report on these planners."""
+    if planner in LEARNED or planner in SEARCH:
+        return (LEARNED | SEARCH)[planner]
+    others = [name for name in planners if name not in LEARNED and name not in SEARCH]
+    return BLUES[others.index(planner) % len(BLUES)]
+
+
+def line_of(planner: str) -> str | tuple[int, tuple[float, float]]:
+    """Learned planners solid, with other weights than the package's too, sampling-based ones dashed, search
+    dotted."""
+    return SOLID if planner.partition("@")[0] in LEARNED else DOTTED if planner in SEARCH else DASHED
+
+
+def success_over_time(section: Section, planners: Sequence[str]) -> str:
+    """The paper's figure: share of problems solved within a time, on a logarithmic axis."""
+    figure = make_figure(6, 3.7)
+    figure.set_layout_engine("none")
+    axes = figure.add_axes(INSIDE)
+    ends = {}
+    first = min((c.found[0] for c in section.curves if len(c.found)), default=0.1)
+    low, high = _decade_below(first), max(c.end for c in section.curves)
+    for curve in section.curves:
+        shares = 100 * np.arange(len(curve.found) + 1) / curve.calls
+        times = np.concatenate([[low], curve.found, [curve.end]])
+        shares = np.append(shares, shares[-1])
+        axes.step(times, shares, where="post", **_stroke(curve.planner, planners))
+        ends[curve.planner] = curve.end, float(shares[-1])
+    _time_axis(axes, low, high)
+    axes.set_ylim(-1.5, 101.5)
+    _percent(axes)
+    _names_at_right(axes, ends, planners)
+    return _svg(figure, f"success {section.name}")
+
+
+def length_over_time(section: Section, planners: Sequence[str]) -> str:
+    """Median length against time: a line where a planner improves its paths, else a point."""
+    figure = make_figure(6, 3.7)
+    figure.set_layout_engine("none")
+    axes = figure.add_axes(INSIDE)
+    curves = [curve for curve in section.curves if len(curve.times)]
+    low = _decade_below(min((c.times[0] for c in curves), default=0.1))
+    high = max((c.end for c in section.curves), default=1.0)
+    worst = max((float(np.quantile(c.ratios, 0.9)) for c in curves), default=1.5)
+    top = 1 + 1.12 * min(max(worst - 1, 0.1), 2.0)
+    ends = {}
+    for curve in curves:
+        last = min(float(curve.ratios[-1]), top)
+        if curve.anytime:
+            axes.plot(curve.times, curve.ratios, **_stroke(curve.planner, planners))
+            ends[curve.planner] = curve.end, last
+        else:
+            middle = float(curve.times[0])
+            style = _stroke(curve.planner, planners)
+            axes.plot(
+                middle,
+                last,
+                marker="o" if curve.planner in LEARNED else "s" if curve.planner in SEARCH else "D",
+                markersize=6.5 if style["linewidth"] > 2 else 4.8,
+                color=style["color"],
+                markeredgecolor="white",
+                markeredgewidth=0.7,
+                zorder=style["zorder"] + 5,
+                clip_on=False,
+            )
+            ends[curve.planner] = middle, last
+    _time_axis(axes, low, high)
+    axes.set_ylim(1 - 0.035 * (top - 1), top)
+    axes.set_ylabel("length / best known")
+    axes.grid(axis="y", color=FAINT, linewidth=0.8)
+    axes.spines[["left"]].set_visible(False)
+    _names_at_right(axes, ends, planners)
+    return _svg(figure, f"length {section.name}")
+
+
+def families(comparisons: Sequence[Comparison], planners: Sequence[str]) -> str:
+    """Success of every planner on every family of problems, with 95 % intervals."""
+    shown = [(family, of) for c in comparisons for family, of in c.families.items()]
+    across = min(4, len(shown))
+    down = -(-len(shown) // across)
+    height = 0.165 * len(planners) + 0.42
+    figure = make_figure(12, height * down + 0.1)
+    panels = figure.subplots(down, across, squeeze=False, sharey=True).reshape(-1)
+    for panel in panels[len(shown) :]:
+        panel.set_axis_off()
+    for i, (panel, (family, of)) in enumerate(zip(panels, shown, strict=False)):
+        for y, planner in enumerate(planners):
+            if planner not in of:
+                panel.text(1, y, "not run", va="center", fontsize=6.5, color="#a8b0ba")
+                continue
+            solved, n = of[planner]
+            low, high = wilson_interval(solved, n)
+            color = color_of(planner, planners)
+            panel.barh(y, 100 * solved / n, 0.66, color=color, alpha=0.88, linewidth=0)
+            panel.plot([100 * low, 100 * high], [y, y], color=INK, linewidth=0.9, solid_capstyle="butt")
+        panel.set_title(f"{family}  ({max(n for _, n in of.values())})", loc="left")
+        panel.set_xlim(0, 101)
+        panel.set_xticks([0, 50, 100], ["0", "50", "100 %"])
+        panel.grid(axis="x", color=FAINT, linewidth=0.8)
+        panel.spines[["left", "bottom"]].set_visible(False)
+        panel.tick_params(axis="x", length=0)
+        panel.set_ylim(len(planners) - 0.4, -0.6)
+        panel.set_yticks(range(len(planners)), planners)
+        panel.tick_params(axis="y", labelcolor=INK, labelsize=LABEL, labelleft=i % across == 0)
+    return _svg(figure, "families")
+
+
+def failures(section: Section, comparison: Comparison, planners: Sequence[str]) -> str:
+    """Stacked bars of the failed calls by reason, in percent of all calls."""
+    rows = {row.planner: row.failures for row in comparison.rows}
+    shown = [name for name in planners if name in rows]
+    figure = make_figure(6, 0.258 * len(shown) + 0.85)
+    axes = figure.subplots()
+    calls = max(1, len(comparison.keys))
+    left = np.zeros(len(shown))
+    for reason, color in REASONS.items():
+        shares = np.array([100 * rows[name].get(reason, 0) / calls for name in shown])
+        if shares.any():
+            axes.barh(shown, shares, 0.68, left=left, color=color, label=reason, linewidth=0)
+        left += shares
+    most = max(5.0, float(left.max(initial=0.0)))
+    for y, total in enumerate(left):
+        axes.text(total + 0.012 * most, y, f"{total:.1f}", va="center", fontsize=6.8, color=SOFT)
+    axes.set_xlim(0, 1.09 * most)
+    axes.set_ylim(len(shown) - 0.4, -0.6)
+    axes.grid(axis="x", color=FAINT, linewidth=0.8)
+    axes.spines[["left", "bottom"]].set_visible(False)
+    axes.tick_params(axis="x", length=0)
+    axes.tick_params(axis="y", labelcolor=INK, labelsize=LABEL)
+    axes.set_xlabel("calls that failed [%]")
+    if axes.get_legend_handles_labels()[0]:
+        figure.legend(loc="outside upper left", ncols=5, columnspacing=1.1, handletextpad=0.4)
+    return _svg(figure, f"failures {section.name} {comparison.limit:g}")
+
+
+def _svg(figure: "Figure", name: str) -> str:
+    """With identifiers that no plot of another name has: a reference into a hidden one draws nothing."""
+    text = as_svg(figure)
+    own = f"p{hashlib.sha256(name.encode()).hexdigest()[:8]}-"
+    for reference in ('id="', "url(#", 'href="#'):
+        text = text.replace(reference, reference + own)
+    return text
+
+
+def _stroke(planner: str, planners: Sequence[str]) -> dict[str, Any]:
+    ours = planner == "robotdiffuse"
+    return {
+        "color": color_of(planner, planners),
+        "linestyle": line_of(planner),
+        "linewidth": 2.4 if ours else 1.35,
+        "zorder": 4 if ours else 3,
+    }
+
+
+def _decade_below(time: float) -> float:
+    """With a little room, for logarithmic axes from here on."""
+    return float(10 ** np.floor(np.log10(max(time, 2e-4)) - 0.05))
+
+
+def _time_axis(axes: "Axes", low: float, high: float) -> None:
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axes.set_xscale("log")
+    axes.set_xlim(low, max(high, 2 * low))
+    axes.xaxis.set_major_locator(LogLocator(10))
+    axes.xaxis.set_major_formatter(
+        FuncFormatter(lambda t, _: f"{1e3 * t:g} ms" if t < 0.0999 else f"{t:g} s")
+    )
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.tick_params(axis="x", which="minor", length=1.6)
+    axes.grid(axis="x", color=FAINT, linewidth=0.8)
+
+
+def _percent(axes: "Axes") -> None:
+    from matplotlib.ticker import FuncFormatter
+
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} %"))
+    axes.grid(axis="y", color=FAINT, linewidth=0.8)
+    axes.spines[["left"]].set_visible(False)
+
+
+def _names_at_right(
+    axes: "Axes", ends: dict[str, tuple[float, float]], planners: Sequence[str], gap: float = 0.0535
+) -> None:
+    """Names in the colours of their lines beside the plot, in the order of the ends, moved apart to be
+    `gap` from each other [share of the height]; a thin line leads from each end to its name."""
+    transform = axes.transData + axes.transAxes.inverted()
+    at = {name: transform.transform(end) for name, end in ends.items()}
+    order = sorted(at, key=lambda name: (at[name][1], -planners.index(name)))
+    heights = _spread(np.array([at[name][1] for name in order]), gap)
+    for name, height in zip(order, heights.tolist(), strict=True):
+        (x, y), color = at[name], color_of(name, planners)
+        axes.plot(
+            [x, max(x, 1.0), 1.035],
+            [y, y, height],
+            transform=axes.transAxes,
+            color=color,
+            linewidth=0.6,
+            alpha=0.45,
+            clip_on=False,
+            zorder=1,
+        )
+        axes.plot(
+            [1.04, 1.085],
+            [height, height],
+            transform=axes.transAxes,
+            color=color,
+            linestyle=line_of(name),
+            linewidth=2.2 if name == "robotdiffuse" else 1.4,
+            clip_on=False,
+        )
+        axes.text(
+            1.097,
+            height,
+            name,
+            transform=axes.transAxes,
+            color=INK,
+            fontsize=LABEL,
+            va="center",
+            fontweight="bold" if name == "robotdiffuse" else "normal",
+        )
+    axes.spines[["bottom"]].set_color(LINE)
+
+
+def _spread(wanted: np.ndarray, gap: float) -> np.ndarray:
+    """Ascending heights as near to these as fits at `gap` from each other, within 0.01 to 0.99."""
+    blocks: list[list[float]] = []  # sum of what their first would want, count
+    for value in wanted:
+        blocks.append([value, 1])
+        while len(blocks) > 1:
+            (a, n), (b, m) = blocks[-2:]
+            if a / n + n * gap <= b / m:
+                break
+            blocks[-2:] = [[a + b - m * n * gap, n + m]]
+    heights = np.concatenate(
+        [np.clip(total / n, 0.01, 0.99 - (n - 1) * gap) + gap * np.arange(n) for total, n in blocks]
+        or [np.zeros(0)]
+    )
+    for i in range(1, len(heights)):
+        heights[i] = max(heights[i], heights[i - 1] + gap)
+    heights[-1:] = np.minimum(heights[-1:], 0.99)
+    for i in range(len(heights) - 1)[::-1]:
+        heights[i] = min(heights[i], heights[i + 1] - gap)
+    return heights

@@ -1,0 +1,94 @@
+"""How sure a figure is: intervals, and comparisons of two planners on the same problems."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+
+RESAMPLES = 2000
+TIE = 1e-6
+"""Lengths [rad] or [m] below this count as this, and logarithms of ratios within this of 0 as ties."""
+
+
+def wilson_interval(successes: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
+    """The interval of a share by its score test (E. B. Wilson 1927); (0, 1) of no trials.
+
+    Unlike that by the standard error it stays within 0 and 1 and has a width at shares of 0 and 1.
+    """
+    from scipy.stats import norm
+
+    if not 0 <= successes <= n:
+        raise InputError(f"successes is {successes}; of {n} trials it must lie in 0 to {n}")
+    if not 0 < confidence < 1:
+        raise InputError(f"confidence is {confidence}; it must lie between 0 and 1, both excluded")
+    if n == 0:
+        return 0.0, 1.0
+    z, p = float(norm.ppf((1 + confidence) / 2)), successes / n
+    middle, half = p + z**2 / (2 * n), z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
+    low, high = ((middle + side * half) / (1 + z**2 / n) for side in (-1, 1))
+    return max(low, 0.0), min(high, 1.0)
+
+
+def bootstrap_interval(
+    values: Float[ndarray, "n"], statistic: Callable[..., ndarray] = np.mean, seed: int = 0
+) -> tuple[float, float]:
+    """The 95 % interval of a statistic of independent values, by resampling them (B. Efron 1979).
+
+    statistic: as np.mean or np.median, with an argument `axis`.
+    """
+    picked = np.random.default_rng(seed).integers(0, len(values), (RESAMPLES, len(values)))
+    low, high = np.percentile(statistic(values[picked], axis=1), (2.5, 97.5))
+    return float(low), float(high)
+
+
+@dataclass(frozen=True)
+class Paired:
+    """Planner A against planner B on the same problems."""
+
+    a_only: int
+    """Problems that A alone solves."""
+    b_only: int
+    both: int
+    neither: int
+    p_success: float
+    """Of a split of `a_only` and `b_only` this uneven or more, were both planners equally good: the exact
+    test of Q. McNemar 1947, two-sided. 1.0 where they solve the same problems."""
+    ratio: float | None
+    """Median of length of A / length of B over the problems that both solve; None if there are none."""
+    ratio_interval: tuple[float, float] | None
+    """Its 95 % interval, by resampling the problems."""
+    p_length: float
+    """Of the logarithms of these ratios lying this much to one side or more, were neither planner's motions
+    longer: signed ranks (F. Wilcoxon 1945), two-sided, without ties. 1.0 where all are ties."""
+
+
+def compare(a: Float[ndarray, "n"], b: Float[ndarray, "n"]) -> Paired:
+    """Compare two planners by the lengths of their motions [rad] or [m], of the same problems in the same
+    order; NaN where one has no solution.
+
+    The tests take problems as independent: several seeds of one problem have to be made one row before,
+    or the p-values are too small. Raises InputError if the arrays differ in length.
+    """
+    from scipy.stats import binomtest, wilcoxon
+
+    if len(a) != len(b):
+        raise InputError(f"a has {len(a)} problems, b {len(b)}; they must be the same problems")
+    solved_a, solved_b = ~np.isnan(a), ~np.isnan(b)
+    both = solved_a & solved_b
+    a_only, b_only = int((solved_a & ~both).sum()), int((solved_b & ~both).sum())
+    p_success = float(binomtest(a_only, a_only + b_only).pvalue) if a_only + b_only else 1.0
+    ratio = ratio_interval = None
+    p_length = 1.0
+    if both.any():
+        logs = np.log(np.maximum(a[both], TIE)) - np.log(np.maximum(b[both], TIE))
+        logs[np.abs(logs) < TIE] = 0.0
+        ratios = np.exp(logs)
+        ratio, ratio_interval = float(np.median(ratios)), bootstrap_interval(ratios, np.median)
+        if logs.any():
+            p_length = float(wilcoxon(logs).pvalue)  # pyright: ignore[reportAttributeAccessIssue]
+    neither = len(a) - a_only - b_only - int(both.sum())
+    return Paired(a_only, b_only, int(both.sum()), neither, p_success, ratio, ratio_interval, p_length)
