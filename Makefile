@@ -1,5 +1,7 @@
 # make demo      plan a bundled problem; creates the core environment in .venv when there is none
 # make weights   makes training data and trains the weights anew, in runs/panda; the same command resumes
+# make baselines trains the learned baselines on the same data, in runs/panda
+# make table1    every planner on the same problems, in runs/table1; MBM=FOLDER adds MotionBenchMaker's
 # make install   the development environment with all extras in .venv
 # make test      all tests          make lint   ruff and pyright          make bench   all benchmarks
 
@@ -7,7 +9,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: install demo test lint bench weights clean
+.PHONY: install demo test lint bench weights baselines table1 clean
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
@@ -45,6 +47,24 @@ weights: .venv/dev.stamp
 	$(BIN)/robotdiffuse train encoder --out runs/panda/encoder --samples 160000
 	$(BIN)/robotdiffuse train planner --out runs/panda/planner --config compact \
 		--data runs/panda/data --encoder runs/panda/encoder
+
+# as much of one core's time as the network that ships had, or less
+baselines: .venv/dev.stamp
+	$(BIN)/robotdiffuse train baseline mpnet --out runs/panda/mpnet --data runs/panda/data --samples 8000000
+	$(BIN)/robotdiffuse train baseline mpinets --out runs/panda/mpinets --data runs/panda/data --samples 900000
+	$(BIN)/robotdiffuse train baseline trajectory_prior --out runs/panda/prior --data runs/panda/data \
+		--samples 1800000
+
+MBM ?=
+comma := ,
+SETS = rop,rop_dense$(if $(MBM),$(comma)$(MBM))
+RUN = $(BIN)/robotdiffuse bench run --planners all --out runs/table1 --problems
+
+table1: .venv/dev.stamp
+	$(RUN) $(SETS) --count 300 --time-limit 1
+	$(RUN) $(SETS) --count 30 --time-limit 10
+	$(BIN)/robotdiffuse bench confirm runs/table1
+	$(BIN)/robotdiffuse bench report runs/table1
 
 clean:
 	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis demo.png demo.html

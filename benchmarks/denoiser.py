@@ -11,6 +11,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 from unittest.mock import patch
@@ -27,16 +28,16 @@ from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.learning import motion_model
 from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse, encode
 from robotdiffuse.problem import Problem
 
 SAMPLES = 16
 STEPS = 5
-"""The planner's default is RobotDiffuseSettings.sampling_steps."""
 TARGET = 0.06
 """Time of a batch that we want to stay below on two cores [s]."""
 BATCHES = (16, 64, 256, 1024)
@@ -287,7 +288,7 @@ def main() -> None:
     parser.add_argument("--weights", help="folder of a trained model; default: the bundled one")
     arguments = parser.parse_args()
     print(header("numpy", "numba", "torch"))
-    planner = RobotDiffuse(RobotDiffuseSettings(weights=arguments.weights))
+    planner = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
     model = planner.model(PANDA)
     assert model is not None
     config = model.config

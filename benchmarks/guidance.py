@@ -22,6 +22,7 @@ from problems import SEED, Case, draw_cases, goal_of, judged
 from report import header, print_table, progress, wilson
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode
 from robotdiffuse.scenes.families import FAMILIES
 
@@ -184,7 +185,7 @@ def main() -> None:
     print(header("numpy", "numba", "torch"))
     print(f"weights: {arguments.weights or 'the bundled ones'}; {arguments.family}")
     cases = draw_cases(arguments.family, arguments.problems, arguments.cases).hard
-    loaded = RobotDiffuse(RobotDiffuseSettings(weights=arguments.weights))
+    loaded = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
     model = loaded.model(cases[0].problem.robot)
     assert model is not None
     success(loaded.settings, loaded, cases[:1], "compiling")

@@ -43,13 +43,13 @@ from scipy.stats import binomtest, wilcoxon
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.metrics import LinkPathLength
+from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.generation.shard_maker import resample
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.robotdiffuse import (
     Candidates,
     RobotDiffuse,
-    RobotDiffuseSettings,
     encode,
     unlearned_starts,
 )
@@ -411,7 +411,7 @@ def main() -> None:
             raise InputError(f"--sets has {name!r}; known: {', '.join((*SETS, *FAMILIES))}")
     print(header("numpy", "numba", "torch", "scipy"))
     print(f"weights: {arguments.weights or 'the bundled ones'}")
-    planner = RobotDiffuse(RobotDiffuseSettings(weights=arguments.weights))
+    planner = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
     compare(from_cases("rop", 2, None), planner, "compiling")
     words = []
     for name in arguments.sets.split(","):

@@ -28,8 +28,9 @@ from problems import PANDA, SEED, draw_cases
 from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.planners import rrt_connect_kernel as kernel
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode, unlearned_starts
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse, encode, unlearned_starts
 from robotdiffuse.planners.rrt_connect import random_state, search_space
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.rop_problems import free_configuration
@@ -176,7 +177,7 @@ def main() -> None:
     arguments = parser.parse_args()
     print(header("numpy", "numba", "torch"))
     print(f"weights: {arguments.weights or 'the bundled ones'}")
-    planner = RobotDiffuse(RobotDiffuseSettings(weights=arguments.weights))
+    planner = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
     rules = FAMILIES[arguments.family]
     assert isinstance(rules, RopSettings)
     cases = draw_cases(arguments.family, arguments.problems, arguments.cases).hard

@@ -9,6 +9,7 @@ called solved passed the judge; motions of the whole planner are confirmed by Py
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path as File
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from problems import PANDA, RUNS, SEARCH_TIME, SEED, Case, Drawn, draw_cases, fa
 from report import header, print_table, progress, share
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.trials import Draw, from_network, without_network
+from robotdiffuse.evaluation.trials import NETWORK_ALONE, Draw, from_network, without_network
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.robotdiffuse import (
     Candidates,
@@ -126,8 +127,9 @@ def report(family: str, drawn: Drawn, weights: str | None) -> None:
         "search do not solve (left out)",
         flush=True,
     )
-    planner = RobotDiffuse(RobotDiffuseSettings(weights=weights))
-    unguided = RobotDiffuse(RobotDiffuseSettings(weights=weights, guidance_steps=0))
+    planner = RobotDiffuse(replace(NETWORK_ALONE, weights=weights))
+    whole_planner = RobotDiffuse(RobotDiffuseSettings(weights=weights))
+    unguided = RobotDiffuse(replace(NETWORK_ALONE, weights=weights, guidance_steps=0))
     model = planner.model(PANDA)
     assert model is not None
     frames = model.config.frames
@@ -153,7 +155,7 @@ def report(family: str, drawn: Drawn, weights: str | None) -> None:
     print_table("", ["(b) refinement, shortcuts, judge", "solved", "length*", "CPU ms median / p95"], control)
 
     numbered = progress(list(enumerate(hard)), "whole planner")
-    outcomes, stages, refuted = zip(*(whole(planner, case, i) for i, case in numbered), strict=True)
+    outcomes, stages, refuted = zip(*(whole(whole_planner, case, i) for i, case in numbered), strict=True)
     rows = [summary("robotdiffuse", hard, list(outcomes))]
     print_table("", ["(c) whole planner", "solved", "length*", "CPU ms median / p95"], rows)
     parts = [f"{stage} {stages.count(stage) / len(stages):.1%}" for stage in sorted(set(stages))]

@@ -24,18 +24,13 @@ from rich.progress import Progress
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import trials
+from robotdiffuse.evaluation.problem_sets import family_problem, line_solves
 from robotdiffuse.evaluation.trials import SEARCH_TIME, SEED, goal_of
-from robotdiffuse.generation.problems import draw_problem
-from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.rrt_connect import RRTConnect, random_state, search_space
-from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.rop_problems import sample_problem
 from robotdiffuse.scenes.families import FAMILIES
-from robotdiffuse.scenes.rop import RopSettings
-from robotdiffuse.types import Path
-from robotdiffuse.verify import VerifySettings, verifier
 
 RUNS = 16
 """RRT-Connect runs after the one that decides; the shortest path of all is the reference length."""
@@ -61,22 +56,6 @@ class Drawn(NamedTuple):
         return [case for case in self.cases if not case.trivial]
 
 
-def draw(family: str, index: int) -> Problem:
-    """Problem number so and so of a family.
-
-    ROP: start and goal are uniform among the free configurations with the tip in the paper's region.
-    Furniture: both are poses with the fingers in two regions of it; the first solution of inverse kinematics.
-    """
-    settings = FAMILIES[family]
-    if family == "rop":
-        return trials.problem_number(index)
-    rng = np.random.default_rng([SEED, 10 + list(FAMILIES).index(family), index])
-    if isinstance(settings, RopSettings):
-        return sample_problem(PANDA, settings, rng)
-    drawn = draw_problem(GenerationSettings(mix={family: 1.0}, target="pose", goals=1), PANDA, rng)
-    return Problem(PANDA, drawn.scene, drawn.start, JointGoal(drawn.goals[:1]))
-
-
 def draw_cases(
     family: str, count: int, folder: File | None = None, search_time: float = SEARCH_TIME
 ) -> Drawn:
@@ -89,7 +68,7 @@ def draw_cases(
             if reference is None:
                 unsolved += 1
                 continue
-            cases.append(Case(draw(family, index), trivial, reference))
+            cases.append(Case(family_problem(family, index), trivial, reference))
             hard += not trivial
             progress.update(task, completed=hard)
             if hard == count:
@@ -104,7 +83,7 @@ def _judged(family: str, folder: File | None, search_time: float) -> Iterator[tu
     known = {case["index"]: case for case in map(json.loads, lines)}
     for index in itertools.count():
         if index not in known:
-            reference, trivial = _reference(draw(family, index), search_time)
+            reference, trivial = _reference(family_problem(family, index), search_time)
             known[index] = {"index": index, "reference": reference, "trivial": trivial}
             if file:
                 file.parent.mkdir(parents=True, exist_ok=True)
@@ -114,9 +93,8 @@ def _judged(family: str, folder: File | None, search_time: float) -> Iterator[tu
 
 
 def _reference(problem: Problem, search_time: float) -> tuple[float | None, bool]:
-    ends = np.stack([problem.start, goal_of(problem)])
-    if verifier(problem, VerifySettings()).path(Path(problem.robot.joint_names, ends)).valid:
-        return float(np.linalg.norm(ends[1] - ends[0])), True
+    if line_solves(problem):
+        return float(np.linalg.norm(goal_of(problem) - problem.start)), True
     found = RRTConnect().plan(problem, search_time, seed=1)
     if found.path_length is None:
         return None, False
