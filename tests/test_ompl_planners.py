@@ -95,6 +95,16 @@ def test_one_of_several_goals(planner):
         np.testing.assert_allclose(result.path.positions[-1], near, atol=1e-6)
 
 
+@pytest.mark.timeout(120)
+def test_prm_with_many_goals_ends():
+    """Its two threads waited for each other, for the roadmap and for Python's lock."""
+    rng = np.random.default_rng(0)
+    many = problem(*(RIGHT + 0.1 * rng.standard_normal((20, 7))))
+    for seed in range(5):
+        result = planners.OmplPRM().plan(many, time_limit=20.0, seed=seed)
+        assert result.path is not None and verify(many, result.path).valid
+
+
 @pytest.mark.parametrize("planner", [planners.OmplRRTConnect, planners.OmplAORRTC])
 def test_a_pose_is_reached(planner):
     to_pose = Problem(PANDA, WALL, LEFT, PoseGoal("panda_hand", link_pose(PANDA, RIGHT, "panda_hand")))

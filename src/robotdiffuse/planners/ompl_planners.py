@@ -86,6 +86,8 @@ class OmplPlanner:
     algorithm: ClassVar[type[ob.Planner]]
     anytime: ClassVar[bool]
     """Whether it goes on after its first path."""
+    backwards: ClassVar[bool] = False
+    """Whether OMPL is asked for a path from the goals to the start."""
 
     def __init__(self, settings: OmplSettings | None = None) -> None:
         """Raises InputError for a range where the planner has none."""
@@ -167,6 +169,9 @@ class OmplPRM(OmplPlanner):
     IEEE Transactions on Robotics and Automation 1996."""
 
     name, algorithm, anytime = "ompl_prm", og.PRM, False
+    # a second thread adds all goals but the first, and holds the roadmap's lock while it waits for Python's,
+    # which the first thread holds while it waits for the roadmap's; with a single goal it adds none
+    backwards = True
 
 
 class OmplRRTStar(OmplPlanner):
@@ -305,11 +310,14 @@ class _Search:
         self._information.setMotionValidator(self._motions)
         self._information.setup()
         start, goals = ends.rows()
+        self._backwards = planner.backwards
+        first, last = (goals, start[None]) if self._backwards else (start[None], goals)
         self._goals = ob.GoalStates(self._information)
-        for goal in goals:
-            self._goals.addState(self._state(goal))
+        for q in last:
+            self._goals.addState(self._state(q))
         self._definition = ob.ProblemDefinition(self._information)
-        self._definition.addStartState(self._state(start))
+        for q in first:
+            self._definition.addStartState(self._state(q))
         self._definition.setGoal(self._goals)
         if planner.anytime:
             # others would take an objective as a reason to go on after their first path
@@ -358,7 +366,8 @@ class _Search:
     def path(self) -> Float[ndarray, "n dof"]:
         """Waypoints of the shortest path."""
         states: Any = self._solution().getStates()
-        return np.array([state[0 : self._robot.dof] for state in states])
+        rows = np.array([state[0 : self._robot.dof] for state in states])
+        return rows[::-1] if self._backwards else rows
 
     def _solution(self) -> og.PathGeometric:
         solution = self._definition.getSolutionPath()
