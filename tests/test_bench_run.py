@@ -88,6 +88,16 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) 
     assert run_bench(asked, quiet, quiet) == 0
 
 
+def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An answer right behind the warm-up's line was taken for it, and then waited for in vain."""
+    answers = "import sys\nprint(flush=True)\nfor _ in sys.stdin: print('\\n{\"time\": 0.1}', flush=True)"
+    monkeypatch.setattr(planner_process, "FAR_SIDE", (sys.executable, "-c", answers))
+    monkeypatch.setattr(planner_process, "PATIENCE", 5.0)
+    process = planner_process.PlannerProcess(planner_process.Contestant.of("rrt_connect"), tmp_path / "log")
+    assert [process.plan({}, seed=0, time_limit=1.0) for _ in range(2)] == [{"time": 0.1}] * 2
+    process.close()
+
+
 def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Path) -> None:
     arguments = ["bench", "run", "--planners", "rrt_connect,shared_tree_rrt_star", "--problems", "rop"]
     arguments += ["--count", "4", "--time-limit", "2", "--workers", "2", "--out", str(tmp_path)]

@@ -74,6 +74,7 @@ class PlannerProcess:
         """`log`: what the process prints is added to this file."""
         self._planner, self._log = planner, log
         self._process: subprocess.Popen[bytes] | None = None
+        self._unread = b""
 
     def plan(self, problem: dict[str, Any], seed: int, time_limit: float) -> dict[str, Any]:
         """The answer to a task, as fields of a record; a death or an overrun is an answer too."""
@@ -103,6 +104,7 @@ class PlannerProcess:
             self._process.wait()
 
     def _start(self) -> "subprocess.Popen[bytes]":
+        self._unread = b""
         environment = os.environ | {"OMP_NUM_THREADS": "1"}
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with self._log.open("ab") as log:
@@ -118,13 +120,14 @@ class PlannerProcess:
     def _answer(self, process: "subprocess.Popen[bytes]", patience: float) -> bytes | None:
         """The next line; None if the process ends or does not answer in this time [s]."""
         assert process.stdout is not None
-        until, line = time.monotonic() + patience, b""
-        while not line.endswith(b"\n"):
+        until = time.monotonic() + patience
+        while b"\n" not in self._unread:
             ready, _, _ = select.select([process.stdout], [], [], max(until - time.monotonic(), 0.0))
             part = os.read(process.stdout.fileno(), 1 << 20) if ready else b""
             if not part:
                 return None
-            line += part
+            self._unread += part
+        line, _, self._unread = self._unread.partition(b"\n")  # more than one line may be there
         return line
 
     def _ended(self, process: "subprocess.Popen[bytes]", patience: float) -> dict[str, Any]:
