@@ -47,13 +47,14 @@ from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.generation.shard_maker import resample
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planners import rrt_connect_kernel as kernel
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.robotdiffuse import (
     Candidates,
     RobotDiffuse,
     encode,
     unlearned_starts,
 )
-from robotdiffuse.planners.rrt_connect import Ends, random_state, search_space
+from robotdiffuse.planners.rrt_connect import random_state, search_space
 from robotdiffuse.planners.shared_tree import SharedTreeSearch, SharedTreeSettings
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.problem_files import load_motion_bench_maker

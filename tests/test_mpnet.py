@@ -22,8 +22,8 @@ from robotdiffuse.learning.baselines.mpnet import (
 from robotdiffuse.learning.data.batches import TrajectoryData, resample_evenly
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_code
-from robotdiffuse.planners.rrt_connect import Ends
 from robotdiffuse.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.rop import pack_scene
@@ -82,10 +82,8 @@ def planning(weights: str, problem: Problem, **changes: object) -> NeuralPlannin
     settings = replace(MPNetPlannerSettings(weights), **changes)
     checker = CollisionChecker(problem.robot, problem.scene)
     ends = Ends(checker, problem.start, np.array([RIGHT]))
-    net = network()
-    return NeuralPlanning(
-        Call("mpnet", problem, 60.0, 0), checker, ends, net, settings, np.random.default_rng(1)
-    )
+    call, rng = Call("mpnet", problem, 60.0, 0), np.random.default_rng(1)
+    return NeuralPlanning(call, ends, network(), settings, rng)
 
 
 def wall_problem(scene: Scene = WALL) -> Problem:

@@ -192,8 +192,7 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
         patched.setattr(kernel, "motions_free", broken)
         patched.setattr(planners.lanes, "free_many", broken)
         # what surrounds the search asks the kernel as well
-        patched.setattr(planners, "usable_goals", lambda *_: RIGHT[None])
-        patched.setattr(planners, "Ends", FreeEnds)
+        patched.setattr(planners, "usable_ends", FreeEnds)
         with pytest.raises(RuntimeError, match="broken kernel"):
             planner().plan(problem(RIGHT), time_limit=20.0)
     assert plan(planner, problem(RIGHT)).solved
@@ -202,9 +201,9 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
 class FreeEnds(planners.Ends):
     """Ends that nobody checks."""
 
-    def __init__(self, checker, start, goals):
-        self.checker = checker
-        self.start, self.start_lead, self.goals, self.goal_leads = start, start, list(goals), list(goals)
+    def __init__(self, *_):
+        self.checker = CollisionChecker(PANDA, WALL)
+        self.start, self.start_lead, self.goals, self.goal_leads = LEFT, LEFT, [RIGHT], [RIGHT]
 
 
 @every

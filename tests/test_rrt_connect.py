@@ -7,11 +7,11 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import explain_collision
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import rrt_connect_kernel as kernel
+from robotdiffuse.planners.ends import retreat
 from robotdiffuse.planners.rrt_connect import (
     RRTConnect,
     RRTConnectSettings,
     random_state,
-    retreat,
     search_space,
 )
 from robotdiffuse.problem import JointGoal, PoseGoal, Problem

@@ -1,4 +1,4 @@
-"""What all planners share: the protocol, the ends of a problem, and the way from waypoints to a result."""
+"""What all planners share: the protocol, and a call with its clock and the results that it can end with."""
 
 import time
 from typing import Protocol, runtime_checkable
@@ -7,17 +7,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import explain_collision
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.timing import time_parameterize
-from robotdiffuse.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
+from robotdiffuse.problem import Problem
 from robotdiffuse.types import Path, PlanResult, Status, Trajectory
 from robotdiffuse.verify import Report, Verifier, VerifySettings, verifier
-
-GOAL_COUNT = 10
-"""Configurations that are looked for when the goal is a pose (the paper's k)."""
 
 
 @runtime_checkable
@@ -138,61 +132,3 @@ class _TimedMotion:
 
     def valid(self, trajectory: Trajectory) -> bool:
         return self.report(trajectory).valid
-
-
-def usable_goals(
-    call: Call, checker: CollisionChecker, rng: np.random.Generator, count: int = GOAL_COUNT
-) -> Float[ndarray, "k dof"] | PlanResult:
-    """The goal configurations to plan to, or the result that says why there can be no plan.
-
-    For a pose, up to `count` configurations by inverse kinematics. Configurations that the covering spheres
-    call free come alone; where there are none, those that the exact meshes call free.
-    """
-    robot, scene, start = call.problem.robot, call.problem.scene, call.problem.start
-    if not checker.free(start[None])[0]:
-        collision = explain_collision(robot, scene, start)
-        if collision is not None:
-            return call.fail(Status.INVALID_START, f"the start is in collision: {collision}")
-    goal = call.problem.goal
-    if isinstance(goal, PoseGoal):
-        return _pose_goals(call, goal, checker, rng, count)
-    return _free_goals(call, goal, checker)
-
-
-def _free_goals(
-    call: Call, goal: JointGoal, checker: CollisionChecker
-) -> Float[ndarray, "k dof"] | PlanResult:
-    free = checker.free(goal.positions)
-    if free.any():
-        return goal.positions[free]
-    collisions = [explain_collision(call.problem.robot, call.problem.scene, q) for q in goal.positions]
-    kept = [q for q, collision in zip(goal.positions, collisions, strict=True) if collision is None]
-    if kept:
-        return np.stack(kept)
-    what = "the goal is" if len(collisions) == 1 else f"all {len(collisions)} goal configurations are"
-    return call.fail(Status.INVALID_GOAL, f"{what} in collision: {collisions[0]}")
-
-
-def _pose_goals(
-    call: Call, goal: PoseGoal, checker: CollisionChecker, rng: np.random.Generator, count: int
-) -> Float[ndarray, "k dof"] | PlanResult:
-    robot, scene = call.problem.robot, call.problem.scene
-    found = inverse_kinematics(robot, goal.frame, goal.T_base_frame, count, rng=rng, accept=checker.free)
-    if len(found):
-        return found
-    reached = inverse_kinematics(robot, goal.frame, goal.T_base_frame, count, rng=rng)
-    xyz = ", ".join(f"{value:.3f}" for value in goal.T_base_frame[:3, 3])
-    if not len(reached):
-        return call.fail(
-            Status.UNREACHABLE_GOAL,
-            f"no configuration within the joint limits brings {goal.frame} to the pose at ({xyz}) m",
-        )
-    collisions = [explain_collision(robot, scene, q) for q in reached]
-    kept = [q for q, collision in zip(reached, collisions, strict=True) if collision is None]
-    if kept:
-        return np.stack(kept)
-    return call.fail(
-        Status.INVALID_GOAL,
-        f"all {len(reached)} configurations found for the pose of {goal.frame} at ({xyz}) m are in "
-        f"collision, e.g. {collisions[0]}",
-    )

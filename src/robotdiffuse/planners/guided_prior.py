@@ -12,8 +12,9 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.baselines.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.baselines.trajectory_prior import TrajectoryPrior
 from robotdiffuse.planners import rrt_connect_kernel as kernel
-from robotdiffuse.planners.base import Call, usable_goals
-from robotdiffuse.planners.rrt_connect import Ends, search_space
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.planners.rrt_connect import search_space
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import PlanResult
@@ -73,29 +74,21 @@ class GuidedPrior(ABC):
         """See `planners.base.Planner`. Raises InputError if there are no weights for the robot."""
         prior = self.prior(problem.robot)
         call = Call(self.name, problem, time_limit, seed)
-        checker, rng = CollisionChecker(problem.robot, problem.scene), np.random.default_rng(seed)
-        goals = usable_goals(call, checker, rng)
-        if isinstance(goals, PlanResult):
-            return goals
-        ends = Ends(checker, problem.start, goals)
-        if not ends.reachable:
-            return call.timeout("the start or every goal touches an obstacle too closely to plan from")
-        return self._batches(call, checker, ends, prior, rng)
+        rng = np.random.default_rng(seed)
+        ends = usable_ends(call, rng)
+        if isinstance(ends, PlanResult):
+            return ends
+        return self._batches(call, ends, prior, rng)
 
     def _batches(
-        self,
-        call: Call,
-        checker: CollisionChecker,
-        ends: Ends,
-        prior: TrajectoryPrior,
-        rng: np.random.Generator,
+        self, call: Call, ends: Ends, prior: TrajectoryPrior, rng: np.random.Generator
     ) -> PlanResult:
         start, goals = shared_out(*ends.rows(), self.samples)
-        space = search_space(checker, RESOLUTION)
+        space = search_space(ends.checker, RESOLUTION)
         closest: Attempt | None = None
         batches = 0
         while call.remaining > 0:
-            drawn = self.draw(prior, checker, start, goals, rng, lambda: call.remaining <= 0)
+            drawn = self.draw(prior, ends.checker, start, goals, rng, lambda: call.remaining <= 0)
             if drawn is None:
                 break
             batches += 1

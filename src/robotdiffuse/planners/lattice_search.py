@@ -32,8 +32,9 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import lattice_kernel as kernel
-from robotdiffuse.planners.base import Call, usable_goals
-from robotdiffuse.planners.rrt_connect import Ends, levers, search_space
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import usable_ends
+from robotdiffuse.planners.rrt_connect import FINEST, finer, levers, search_space
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -41,8 +42,6 @@ from robotdiffuse.types import PlanResult
 
 SLICE = 200
 """Expansions between two looks at the clock."""
-FINEST = 0.002
-"""Distance between checks of a motion at which a path that the judge refuses is given up [m]."""
 MOST_KEYS = 2**62
 """Nodes that can be told apart."""
 ROUNDING = 1e-4
@@ -394,17 +393,12 @@ def _plan(
     call: Call, settings: LatticeSettings, begin: Callable[..., AStarSearch | DStarLiteSearch]
 ) -> PlanResult:
     """Search until a path passes the judge, there is none, or time or memory run out."""
-    problem = call.problem
-    checker = CollisionChecker(problem.robot, problem.scene)
-    goals = usable_goals(call, checker, np.random.default_rng(call.seed))
-    if isinstance(goals, PlanResult):
-        return goals
-    ends = Ends(checker, problem.start, goals)
-    if not ends.reachable:
-        return call.timeout("the start or every goal touches an obstacle too closely to search from")
+    ends = usable_ends(call, np.random.default_rng(call.seed))
+    if isinstance(ends, PlanResult):
+        return ends
     padding = ends.kept_clearance(settings.clearance)
     while True:
-        search = begin(checker, *ends.rows(), settings, padding)
+        search = begin(ends.checker, *ends.rows(), settings, padding)
         outcome = search.run(lambda: call.remaining <= 0)
         path = search.path() if outcome is Outcome.FOUND else None
         if path is None:
@@ -415,8 +409,7 @@ def _plan(
             return result
         if settings.resolution <= FINEST or call.remaining <= 0:
             return call.timeout("the judge refused every path that was found; a larger clearance may help")
-        # the judge found contact between two checks: look twice as closely
-        settings = replace(settings, resolution=max(settings.resolution / 2, FINEST))
+        settings = replace(settings, resolution=finer(settings.resolution))
 
 
 def _reason(outcome: Outcome, settings: LatticeSettings, search: AStarSearch | DStarLiteSearch) -> str:

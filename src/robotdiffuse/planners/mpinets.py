@@ -28,8 +28,9 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.learning.baselines.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.baselines.mpinets import MPiNetsNetwork, RollOuts
 from robotdiffuse.planners import rrt_connect_kernel as kernel
-from robotdiffuse.planners.base import Call, usable_goals
-from robotdiffuse.planners.rrt_connect import Ends, search_space
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.planners.rrt_connect import search_space
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
@@ -86,18 +87,15 @@ class MPiNets:
         """See `planners.base.Planner`. Raises InputError if there are no weights for the robot."""
         network = self.network(problem.robot)
         call = Call(self.name, problem, time_limit, seed)
-        checker, rng = CollisionChecker(problem.robot, problem.scene), np.random.default_rng(seed)
-        goals = usable_goals(call, checker, rng)
-        if isinstance(goals, PlanResult):
-            return goals
-        ends = Ends(checker, problem.start, goals)
-        if not ends.reachable:
-            return call.timeout("the start or every goal touches an obstacle too closely to move from it")
+        rng = np.random.default_rng(seed)
+        ends = usable_ends(call, rng)
+        if isinstance(ends, PlanResult):
+            return ends
         best: _Motion | None = None
         tried = 0
         while best is None or call.remaining > 0:
             count = self.settings.batch if tried else 1
-            for motion in self._roll_outs(call, network, checker, ends, tried, count, rng):
+            for motion in self._roll_outs(call, network, ends, tried, count, rng):
                 if motion.free:
                     result = call.finish(motion.path(ends), "policy")
                     if result is not None:
@@ -116,7 +114,6 @@ class MPiNets:
         self,
         call: Call,
         network: MPiNetsNetwork,
-        checker: CollisionChecker,
         ends: Ends,
         tried: int,
         count: int,
@@ -127,11 +124,11 @@ class MPiNets:
         `tried` were tried before; the very first goes on even if it collides.
         """
         settings, first = self.settings, tried == 0
-        space = search_space(checker, settings.resolution)
+        space = search_space(ends.checker, settings.resolution)
         start, goals = ends.rows()
         order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")
         goal = goals[order[np.arange(tried, tried + count) % len(order)]]
-        clouds = scene_clouds(network, checker, count, rng)
+        clouds = scene_clouds(network, ends.checker, count, rng)
         roll_outs = RollOuts(network, clouds, np.repeat(start[None], count, 0), goal)
         motions = [_Motion(start, end) for end in goal]
         for step in range(settings.steps + 1):

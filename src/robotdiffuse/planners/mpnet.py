@@ -33,8 +33,9 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.learning.baselines.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.baselines.mpnet import MPNetNetwork
 from robotdiffuse.planners import rrt_connect_kernel as kernel
-from robotdiffuse.planners.base import Call, usable_goals
-from robotdiffuse.planners.rrt_connect import Ends, random_state, search_space
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.planners.rrt_connect import finer, random_state, search_space
 from robotdiffuse.problem import Problem
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.types import PlanResult
@@ -91,24 +92,20 @@ class MPNet:
         call = Call(self.name, problem, time_limit, seed)
         network = load_baseline("mpnet", self.settings.weights, problem.robot)
         assert isinstance(network, MPNetNetwork)
-        checker, rng = CollisionChecker(problem.robot, problem.scene), np.random.default_rng(seed)
-        goals = usable_goals(call, checker, rng)
-        if isinstance(goals, PlanResult):
-            return goals
-        ends = Ends(checker, problem.start, goals)
-        if not ends.reachable:
-            return call.timeout("the start or every goal touches an obstacle too closely to plan from")
+        rng = np.random.default_rng(seed)
+        ends = usable_ends(call, rng)
+        if isinstance(ends, PlanResult):
+            return ends
         settings, best, rounds = self.settings, Attempt.none(), 0
         while rounds == 0 or call.remaining > 0:
-            one = NeuralPlanning(call, checker, ends, network, settings, rng)
+            one = NeuralPlanning(call, ends, network, settings, rng)
             found = one.best()
             rounds += 1
             if found.broken == 0:
                 result = call.finish(ends.complete(found.path), self.name, one.reason(rounds))
                 if result is not None:
                     return result
-                # the judge found contact between two checks: look twice as closely
-                settings = replace(settings, resolution=max(settings.resolution / 2, 0.002))
+                settings = replace(settings, resolution=finer(settings.resolution))
             elif found.broken < best.broken:
                 best = found
         if len(best.path):
@@ -139,20 +136,19 @@ class NeuralPlanning:
     def __init__(
         self,
         call: Call,
-        checker: CollisionChecker,
         ends: Ends,
         network: MPNetNetwork,
         settings: MPNetPlannerSettings,
         rng: np.random.Generator,
     ) -> None:
         self.call, self.network, self.settings = call, network, settings
-        self.space = search_space(checker, settings.resolution, ends.kept_clearance(settings.clearance))
+        self.space = search_space(ends.checker, settings.resolution, ends.kept_clearance(settings.clearance))
         self.generator = Generator().manual_seed(int(rng.integers(2**63)))
         self.state = random_state(int(rng.integers(2**31)))
         start, goals = ends.rows()
         self.starts = np.tile(start, (settings.attempts, 1))
         self.goals = goals[(np.arange(settings.attempts) + rng.integers(len(goals))) % len(goals)]
-        self.z = scene_code(network, checker, rng)
+        self.z = scene_code(network, ends.checker, rng)
         self.replanned = 0
         """How often what collides was planned anew."""
         self.searched = False

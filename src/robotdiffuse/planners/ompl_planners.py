@@ -28,11 +28,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision import CollisionChecker, lanes
+from robotdiffuse.collision import lanes
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import rrt_connect_kernel as kernel
-from robotdiffuse.planners.base import Call, usable_goals
-from robotdiffuse.planners.rrt_connect import Ends, search_space
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.planners.rrt_connect import finer, search_space
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, PlanResult
@@ -100,13 +101,9 @@ class OmplPlanner:
     def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
         """See `planners.base.Planner`."""
         call = Call(self.name, problem, time_limit, seed)
-        checker = CollisionChecker(problem.robot, problem.scene)
-        goals = usable_goals(call, checker, np.random.default_rng(seed))
-        if isinstance(goals, PlanResult):
-            return goals
-        ends = Ends(checker, problem.start, goals)
-        if not ends.reachable:
-            return call.timeout("the start or every goal touches an obstacle too closely to search from")
+        ends = usable_ends(call, np.random.default_rng(seed))
+        if isinstance(ends, PlanResult):
+            return ends
         with _quiet():
             return self._best(call, ends) if self.anytime else self._first(call, ends)
 
@@ -121,7 +118,8 @@ class OmplPlanner:
             result = call.finish(ends.complete(search.path()), self.name)
             if result is not None:
                 return result
-            settings, attempt = _finer(settings), attempt + 1
+            settings = replace(settings, resolution=finer(settings.resolution))
+            attempt += 1
         return call.timeout()
 
     def _best(self, call: Call, ends: Ends) -> PlanResult:
@@ -142,7 +140,8 @@ class OmplPlanner:
                     if searched <= enough:
                         break
                 else:
-                    settings, attempt, searched = _finer(settings), attempt + 1, np.inf
+                    settings = replace(settings, resolution=finer(settings.resolution))
+                    attempt, searched = attempt + 1, np.inf
                     search = _Search(call, ends, self, settings, attempt)
             if call.remaining <= 0:
                 break
@@ -390,11 +389,6 @@ def _state_space(robot: Robot) -> ob.RealVectorStateSpace:
         bounds.setHigh(joint, float(robot.upper[joint]))
     states.setBounds(bounds)
     return states
-
-
-def _finer(settings: OmplSettings) -> OmplSettings:
-    """For after a path that the judge refused: it found contact between two checks."""
-    return replace(settings, resolution=max(settings.resolution / 2, 0.002))
 
 
 @contextmanager

@@ -21,8 +21,9 @@ from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.planners import rrt_connect_kernel as kernel
-from robotdiffuse.planners.base import Call, usable_goals
-from robotdiffuse.planners.rrt_connect import Ends, RRTConnect, RRTConnectSettings, random_state, search_space
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.planners.rrt_connect import RRTConnect, RRTConnectSettings, random_state, search_space
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
@@ -123,23 +124,18 @@ class RobotDiffuse:
         call = Call(self.name, problem, time_limit, seed)
         if model is None:
             call.notes.append(f"no weights come with the package for {problem.robot.name}; planned by search")
-        checker = CollisionChecker(problem.robot, problem.scene)
         rng = np.random.default_rng(seed)
-        goals = usable_goals(call, checker, rng)
-        if isinstance(goals, PlanResult):
-            return goals
-        ends = Ends(checker, problem.start, goals)
-        if ends.reachable:
-            result = self._straight(call, checker, ends)
-            if result is None and model is not None:
-                result = self._learned(call, checker, ends, model, rng)
-            if result is not None:
-                return result
-        return RRTConnect(self.settings.search).search(call, checker, goals)
+        ends = usable_ends(call, rng)
+        if isinstance(ends, PlanResult):
+            return ends
+        result = self._straight(call, ends)
+        if result is None and model is not None:
+            result = self._learned(call, ends, model, rng)
+        return result or RRTConnect(self.settings.search).search(call, ends)
 
-    def _straight(self, call: Call, checker: CollisionChecker, ends: Ends) -> PlanResult | None:
+    def _straight(self, call: Call, ends: Ends) -> PlanResult | None:
         """The straight line to the nearest goal that it reaches: no path could be shorter."""
-        space = search_space(checker, self.settings.resolution)
+        space = search_space(ends.checker, self.settings.resolution)
         start, goals = ends.rows()
         for goal in sorted(goals, key=lambda goal: float(np.linalg.norm(goal - start))):
             line = np.stack([start, goal])
@@ -150,14 +146,15 @@ class RobotDiffuse:
         return None
 
     def _learned(
-        self, call: Call, checker: CollisionChecker, ends: Ends, model: MotionModel, rng: np.random.Generator
+        self, call: Call, ends: Ends, model: MotionModel, rng: np.random.Generator
     ) -> PlanResult | None:
+        checker = ends.checker
         start, goals = ends.rows()
         code = encode(model, checker, self.settings.points, rng)
         sampled = self.sample(model, checker, code, start, goals, rng)
-        result = self._best(call, checker, ends, sampled)
+        result = self._best(call, ends, sampled)
         if result is None and call.remaining > 0:
-            result = self._best(call, checker, ends, self.refine(checker, sampled.q))
+            result = self._best(call, ends, self.refine(checker, sampled.q))
         return result
 
     def sample(
@@ -212,12 +209,10 @@ class RobotDiffuse:
         q = np.ascontiguousarray(q, np.float32)
         return Candidates(q, np.array([kernel.motions_free(space, path).all() for path in q]), stage)
 
-    def _best(
-        self, call: Call, checker: CollisionChecker, ends: Ends, candidates: Candidates
-    ) -> PlanResult | None:
+    def _best(self, call: Call, ends: Ends, candidates: Candidates) -> PlanResult | None:
         """The shortest of the free candidates that passes the judge, after shortcuts."""
         clearance = ends.kept_clearance(self.settings.search.clearance)
-        space = search_space(checker, self.settings.resolution, clearance)
+        space = search_space(ends.checker, self.settings.resolution, clearance)
         state = random_state(call.seed)
         paths = sorted(candidates.q[candidates.free], key=kernel.path_length)[: self.settings.shortened]
         short = [kernel.shortcut(space, path, self.settings.shortcuts, state) for path in paths]

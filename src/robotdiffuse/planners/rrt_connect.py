@@ -9,17 +9,17 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import rrt_connect_kernel as kernel
-from robotdiffuse.planners.base import Call, usable_goals
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import Ends, usable_ends
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots.reach import motion_radii
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import PlanResult
 
+FINEST = 0.002
+"""Least distance between two checks of a motion that is searched with [m]."""
 ITERATIONS = 2_000
 """Iterations between two looks at the clock."""
-RETREAT_STEP = 0.01
-"""Step of the way out of contact of the covering spheres [rad]."""
-RETREAT_STEPS = 100
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,12 @@ def search_space(
     )
 
 
+def finer(resolution: float) -> float:
+    """For after a path that the judge refused: it found contact between two checks, so look twice as closely
+    [m]."""
+    return max(resolution / 2, FINEST)
+
+
 def levers(robot: Robot) -> Float[ndarray, "dof"]:
     """Largest distance of any point of the arm from each joint's axis [m]."""
     return motion_radii(robot).max(axis=0, initial=0.0).astype(np.float32)
@@ -79,64 +85,6 @@ def levers(robot: Robot) -> Float[ndarray, "dof"]:
 def random_state(seed: int, attempt: int = 0) -> ndarray:
     """State of the compiled random numbers, well mixed."""
     return np.random.SeedSequence([seed, attempt]).generate_state(1, np.uint64) | np.uint64(1)
-
-
-def retreat(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> Float[ndarray, "dof"] | None:
-    """A configuration nearby that the covering spheres call free, down the gradient of the collision cost.
-
-    For a start or goal that the exact meshes call free while the spheres, which stick out, do not. None if no
-    free configuration was found within 1 rad. The judge decides on the motion there.
-    """
-    robot, at = checker.robot, q.copy()
-    for _ in range(RETREAT_STEPS):
-        if checker.free(at[None])[0]:
-            return at
-        gradient = checker.cost_gradients(at[None], margin=0.005)[1][0].astype(np.float64)
-        norm = np.linalg.norm(gradient)
-        if norm < 1e-9:
-            return None
-        at = np.clip(at - RETREAT_STEP * gradient / norm, robot.lower, robot.upper)
-    return None
-
-
-class Ends:
-    """Start and goals that the spheres call free, with the ends near contact that they stand for."""
-
-    def __init__(self, checker: CollisionChecker, start: ndarray, goals: ndarray) -> None:
-        self.checker = checker
-        self.start, self.start_lead = start, retreat(checker, start)
-        leads = [(retreat(checker, goal), goal) for goal in goals]
-        self.goals = [goal for lead, goal in leads if lead is not None]
-        self.goal_leads = [lead for lead, _ in leads if lead is not None]
-
-    @property
-    def reachable(self) -> bool:
-        """Whether a search can begin and end."""
-        return self.start_lead is not None and bool(self.goals)
-
-    def rows(self) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
-        """Where a search begins and where it may end, in float32."""
-        assert self.start_lead is not None
-        return self.start_lead.astype(np.float32), np.array(self.goal_leads, np.float32)
-
-    def kept_clearance(self, wanted: float) -> float:
-        """The distance that a path can keep to obstacles: as wanted, or half of what the ends have [m]."""
-        start, goals = self.rows()
-        leads = np.concatenate([start[None], goals])
-        return min(wanted, 0.5 * float(self.checker.link_clearances(leads).min(initial=wanted)))
-
-    def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
-        """The path with its exact ends in float64 in place of, or before and after, those of the search."""
-        assert self.start_lead is not None
-        path = path.astype(np.float64)
-        errors = [np.abs(path[-1] - lead).max() for lead in self.goal_leads]
-        i = int(np.argmin(errors))
-        rows = [self.start[None], path[1:-1], self.goals[i][None]]
-        if self.goal_leads[i] is not self.goals[i] and not np.array_equal(self.goal_leads[i], self.goals[i]):
-            rows.insert(2, self.goal_leads[i][None])
-        if not np.array_equal(self.start_lead, self.start):
-            rows.insert(1, self.start_lead[None])
-        return np.concatenate(rows)
 
 
 class RRTConnect:
@@ -150,28 +98,21 @@ class RRTConnect:
     def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
         """See `planners.base.Planner`."""
         call = Call(self.name, problem, time_limit, seed)
-        checker = CollisionChecker(problem.robot, problem.scene)
-        goals = usable_goals(call, checker, np.random.default_rng(seed))
-        if isinstance(goals, PlanResult):
-            return goals
-        return self.search(call, checker, goals)
+        ends = usable_ends(call, np.random.default_rng(seed))
+        return ends if isinstance(ends, PlanResult) else self.search(call, ends)
 
-    def search(self, call: Call, checker: CollisionChecker, goals: Float[ndarray, "k dof"]) -> PlanResult:
+    def search(self, call: Call, ends: Ends) -> PlanResult:
         """Search until a path passes the judge or time runs out; for planners that have begun a call."""
         settings = self.settings
-        ends = Ends(checker, call.problem.start, goals)
-        if not ends.reachable:
-            return call.timeout("the start or every goal touches an obstacle too closely to search from")
         attempt = 0
         while attempt == 0 or call.remaining > 0:
-            path = _Search(call, checker, ends, settings, attempt).best()
+            path = _Search(call, ends, settings, attempt).best()
             if path is None:
                 break
             result = call.finish(ends.complete(path), self.name)
             if result is not None:
                 return result
-            # the judge found contact between two checks: look twice as closely
-            settings = replace(settings, resolution=max(settings.resolution / 2, 0.002))
+            settings = replace(settings, resolution=finer(settings.resolution))
             attempt += 1
         return call.timeout()
 
@@ -179,11 +120,9 @@ class RRTConnect:
 class _Search:
     """Paths between the ends of a call, not yet judged."""
 
-    def __init__(
-        self, call: Call, checker: CollisionChecker, ends: Ends, settings: RRTConnectSettings, attempt: int
-    ) -> None:
+    def __init__(self, call: Call, ends: Ends, settings: RRTConnectSettings, attempt: int) -> None:
         self.call, self.settings = call, settings
-        self.space = search_space(checker, settings.resolution, ends.kept_clearance(settings.clearance))
+        self.space = search_space(ends.checker, settings.resolution, ends.kept_clearance(settings.clearance))
         self.state = random_state(call.seed, attempt)
         self.start, self.goals = ends.rows()
 

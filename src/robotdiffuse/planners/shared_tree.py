@@ -32,8 +32,9 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import rrt_connect_kernel as connect
 from robotdiffuse.planners import shared_tree_kernel as kernel
-from robotdiffuse.planners.base import Call, usable_goals
-from robotdiffuse.planners.rrt_connect import Ends, random_state, search_space
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import usable_ends
+from robotdiffuse.planners.rrt_connect import finer, random_state, search_space
 from robotdiffuse.problem import Problem
 from robotdiffuse.types import PlanResult
 
@@ -236,16 +237,12 @@ class SharedTreeRRTStar:
     def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
         """See `planners.base.Planner`."""
         call = Call(self.name, problem, time_limit, seed)
-        checker = CollisionChecker(problem.robot, problem.scene)
-        goals = usable_goals(call, checker, np.random.default_rng(seed))
-        if isinstance(goals, PlanResult):
-            return goals
-        ends = Ends(checker, problem.start, goals)
-        if not ends.reachable:
-            return call.timeout("the start or every goal touches an obstacle too closely to search from")
+        ends = usable_ends(call, np.random.default_rng(seed))
+        if isinstance(ends, PlanResult):
+            return ends
         settings, attempt = self.settings, 0
         while attempt == 0 or call.remaining > 0:
-            search = SharedTreeSearch(checker, *ends.rows(), settings, random_state(seed, attempt))
+            search = SharedTreeSearch(ends.checker, *ends.rows(), settings, random_state(seed, attempt))
 
             def out_of_time(search: SharedTreeSearch = search) -> bool:
                 if search.cost < np.inf:
@@ -259,8 +256,7 @@ class SharedTreeRRTStar:
             result = call.finish(ends.complete(path), self.name, reason=_reason(search))
             if result is not None:
                 return result
-            # the judge found contact between two checks: look twice as closely
-            settings = replace(settings, resolution=max(settings.resolution / 2, 0.002))
+            settings = replace(settings, resolution=finer(settings.resolution))
             attempt += 1
         return call.timeout()
 

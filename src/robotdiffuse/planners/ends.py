@@ -1,0 +1,145 @@
+"""Where a motion begins and may end: goals of a pose, ends that touch, and why there can be no plan."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.exact import explain_collision
+from robotdiffuse.planners.base import Call
+from robotdiffuse.problem import JointGoal, PoseGoal
+from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
+from robotdiffuse.types import PlanResult, Status
+
+GOAL_COUNT = 10
+"""Configurations that are looked for when the goal is a pose (the paper's k)."""
+RETREAT_STEP = 0.01
+"""Step of the way out of contact of the covering spheres [rad]."""
+RETREAT_STEPS = 100
+
+
+class Ends:
+    """Start and goals that the spheres call free, with the ends near contact that they stand for."""
+
+    def __init__(self, checker: CollisionChecker, start: ndarray, goals: ndarray) -> None:
+        self.checker = checker
+        self.start, self.start_lead = start, retreat(checker, start)
+        leads = [(retreat(checker, goal), goal) for goal in goals]
+        self.goals = [goal for lead, goal in leads if lead is not None]
+        self.goal_leads = [lead for lead, _ in leads if lead is not None]
+
+    @property
+    def reachable(self) -> bool:
+        """Whether a search can begin and end."""
+        return self.start_lead is not None and bool(self.goals)
+
+    def rows(self) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
+        """Where a search begins and where it may end, in float32."""
+        assert self.start_lead is not None
+        return self.start_lead.astype(np.float32), np.array(self.goal_leads, np.float32)
+
+    def kept_clearance(self, wanted: float) -> float:
+        """The distance that a path can keep to obstacles: as wanted, or half of what the ends have [m]."""
+        start, goals = self.rows()
+        leads = np.concatenate([start[None], goals])
+        return min(wanted, 0.5 * float(self.checker.link_clearances(leads).min(initial=wanted)))
+
+    def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+        """The path with its exact ends in float64 in place of, or before and after, those of the search."""
+        assert self.start_lead is not None
+        path = path.astype(np.float64)
+        errors = [np.abs(path[-1] - lead).max() for lead in self.goal_leads]
+        i = int(np.argmin(errors))
+        rows = [self.start[None], path[1:-1], self.goals[i][None]]
+        if self.goal_leads[i] is not self.goals[i] and not np.array_equal(self.goal_leads[i], self.goals[i]):
+            rows.insert(2, self.goal_leads[i][None])
+        if not np.array_equal(self.start_lead, self.start):
+            rows.insert(1, self.start_lead[None])
+        return np.concatenate(rows)
+
+
+def usable_ends(call: Call, rng: np.random.Generator) -> Ends | PlanResult:
+    """The ends that a search of this call can begin and end at, or the result that says why it cannot.
+
+    For a pose, up to GOAL_COUNT configurations by inverse kinematics from `rng`. Configurations that the
+    covering spheres call free come alone; where there are none, those that the exact meshes call free.
+    """
+    checker = CollisionChecker(call.problem.robot, call.problem.scene)
+    goals = _usable_goals(call, checker, rng)
+    if isinstance(goals, PlanResult):
+        return goals
+    ends = Ends(checker, call.problem.start, goals)
+    if not ends.reachable:
+        return call.timeout("the start or every goal touches an obstacle too closely to plan from")
+    return ends
+
+
+def retreat(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> Float[ndarray, "dof"] | None:
+    """A configuration nearby that the covering spheres call free, down the gradient of the collision cost.
+
+    For a start or goal that the exact meshes call free while the spheres, which stick out, do not. None if no
+    free configuration was found within 1 rad. The judge decides on the motion there.
+    """
+    robot, at = checker.robot, q.copy()
+    for _ in range(RETREAT_STEPS):
+        if checker.free(at[None])[0]:
+            return at
+        gradient = checker.cost_gradients(at[None], margin=0.005)[1][0].astype(np.float64)
+        norm = np.linalg.norm(gradient)
+        if norm < 1e-9:
+            return None
+        at = np.clip(at - RETREAT_STEP * gradient / norm, robot.lower, robot.upper)
+    return None
+
+
+def _usable_goals(
+    call: Call, checker: CollisionChecker, rng: np.random.Generator
+) -> Float[ndarray, "k dof"] | PlanResult:
+    robot, scene, start = call.problem.robot, call.problem.scene, call.problem.start
+    if not checker.free(start[None])[0]:
+        collision = explain_collision(robot, scene, start)
+        if collision is not None:
+            return call.fail(Status.INVALID_START, f"the start is in collision: {collision}")
+    goal = call.problem.goal
+    if isinstance(goal, PoseGoal):
+        return _pose_goals(call, goal, checker, rng)
+    return _free_goals(call, goal, checker)
+
+
+def _free_goals(
+    call: Call, goal: JointGoal, checker: CollisionChecker
+) -> Float[ndarray, "k dof"] | PlanResult:
+    free = checker.free(goal.positions)
+    if free.any():
+        return goal.positions[free]
+    collisions = [explain_collision(call.problem.robot, call.problem.scene, q) for q in goal.positions]
+    kept = [q for q, collision in zip(goal.positions, collisions, strict=True) if collision is None]
+    if kept:
+        return np.stack(kept)
+    what = "the goal is" if len(collisions) == 1 else f"all {len(collisions)} goal configurations are"
+    return call.fail(Status.INVALID_GOAL, f"{what} in collision: {collisions[0]}")
+
+
+def _pose_goals(
+    call: Call, goal: PoseGoal, checker: CollisionChecker, rng: np.random.Generator
+) -> Float[ndarray, "k dof"] | PlanResult:
+    robot, scene = call.problem.robot, call.problem.scene
+    found = inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=checker.free)
+    if len(found):
+        return found
+    reached = inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng)
+    xyz = ", ".join(f"{value:.3f}" for value in goal.T_base_frame[:3, 3])
+    if not len(reached):
+        return call.fail(
+            Status.UNREACHABLE_GOAL,
+            f"no configuration within the joint limits brings {goal.frame} to the pose at ({xyz}) m",
+        )
+    collisions = [explain_collision(robot, scene, q) for q in reached]
+    kept = [q for q, collision in zip(reached, collisions, strict=True) if collision is None]
+    if kept:
+        return np.stack(kept)
+    return call.fail(
+        Status.INVALID_GOAL,
+        f"all {len(reached)} configurations found for the pose of {goal.frame} at ({xyz}) m are in "
+        f"collision, e.g. {collisions[0]}",
+    )
