@@ -24,7 +24,7 @@ from rich.progress import Progress
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import trials
-from robotdiffuse.evaluation.problem_sets import family_problem, line_solves
+from robotdiffuse.evaluation.bench.problem_sets import family_problem, line_solves
 from robotdiffuse.evaluation.trials import SEARCH_TIME, SEED, goal_of
 from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.rrt_connect import RRTConnect, random_state, search_space

@@ -16,7 +16,7 @@ import numpy as np
 from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.problem_sets import line_solves
+from robotdiffuse.evaluation.bench.problem_sets import line_solves
 from robotdiffuse.evaluation.trials import SEED, goal_of, problem_number
 from robotdiffuse.planners.lattice_search import DStarLiteSearch, DStarLiteSettings, Outcome
 from robotdiffuse.problem import Problem

@@ -3,7 +3,7 @@
 import os
 import time
 
-from robotdiffuse.evaluation import planner_process
+from robotdiffuse.evaluation.bench import planner_process
 from robotdiffuse.planners import PLANNERS, Entry
 from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problem import Problem

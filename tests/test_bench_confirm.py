@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from robotdiffuse.cli import main
-from robotdiffuse.evaluation.problem_sets import gather_cases
-from robotdiffuse.evaluation.records import Record, RecordFile
+from robotdiffuse.evaluation.bench.problem_sets import gather_cases
+from robotdiffuse.evaluation.bench.records import Record, RecordFile
 from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problem import JointGoal
 

@@ -9,10 +9,10 @@ import pytest
 
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation import bench_figures, bench_page, bench_plots, bench_report
-from robotdiffuse.evaluation.bench_figures import GAVE_UP, LATER, RAN_OUT, counting, outcome
-from robotdiffuse.evaluation.problem_sets import Case, family_problem, problem_record
-from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.bench import figures, page, plots, report
+from robotdiffuse.evaluation.bench.figures import GAVE_UP, LATER, RAN_OUT, counting, outcome
+from robotdiffuse.evaluation.bench.problem_sets import Case, family_problem, problem_record
+from robotdiffuse.evaluation.bench.records import Record
 
 RUN = {
     "date": "2026-01-02 03:04",
@@ -122,7 +122,7 @@ def small(tmp_path: Path) -> Path:
     return write(tmp_path / "small_run", records)
 
 
-def rows(section: bench_figures.Section, limit: float) -> dict[str, bench_figures.Row]:
+def rows(section: figures.Section, limit: float) -> dict[str, figures.Row]:
     comparison = next(c for c in section.comparisons if c.limit == limit)
     return {row.planner: row for row in comparison.rows}
 
@@ -159,10 +159,10 @@ def test_the_judge_may_end_after_the_limit_of_the_call_alone() -> None:
 
 
 def test_figures_of_a_small_run(small: Path) -> None:
-    bench = bench_figures.read_bench(small)
+    bench = figures.read_bench(small)
     assert next(iter(bench.records)) == bench.reference == "robotdiffuse"
     assert set(bench.records) == {"robotdiffuse", "mpnet", "ompl_rrt_star"}
-    whole, apart = bench_figures.sections(bench)
+    whole, apart = figures.sections(bench)
     assert (whole.name, apart.name) == ("rop", "rop, non-trivial")
     assert [c.limit for c in whole.comparisons] == [0.1, 1.0, 10.0]
     assert [c.problems for c in whole.comparisons] == [4, 4, 4]
@@ -186,7 +186,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
 
 
 def test_comscore_of_a_small_run(small: Path) -> None:
-    whole, _ = bench_figures.sections(bench_figures.read_bench(small), [1.0])
+    whole, _ = figures.sections(figures.read_bench(small), [1.0])
     of = rows(whole, 1.0)
     lengths = {"robotdiffuse": 6.0, "mpnet": 6.6, "ompl_rrt_star": 9.0}
     times = {"robotdiffuse": 0.05, "mpnet": 0.51, "ompl_rrt_star": 1.0}
@@ -206,7 +206,7 @@ def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_pa
     records += [failed("edmp", name, 1.0, 1.0) for name in names]
     folder = write(tmp_path / "run", records, {10.0: 2})
     keep_problems(folder, names)
-    (section,) = bench_figures.sections(bench_figures.read_bench(folder))
+    (section,) = figures.sections(figures.read_bench(folder))
     whole = {c.limit: c for c in section.comparisons}
     assert whole[1.0].problems == 6
     assert whole[1.0].missing == ()
@@ -224,7 +224,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
         records.append(solved("robotdiffuse", "b", 1.0, [(0.1, 2.0)], seed=seed))
         one = solved("mpd", "b", 1.0, [(0.1, 2.0)], seed=seed)
         records.append(one if seed == 0 else failed("mpd", "b", 1.0, 1.0, seed=seed))
-    (section,) = bench_figures.sections(bench_figures.read_bench(write(tmp_path / "run", records)), [1.0])
+    (section,) = figures.sections(figures.read_bench(write(tmp_path / "run", records)), [1.0])
     row = rows(section, 1.0)["mpd"]
     assert section.main.seeds == 3
     assert row.success == pytest.approx(4 / 6)
@@ -234,7 +234,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
 
 
 def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) -> None:
-    whole, _ = bench_figures.sections(bench_figures.read_bench(small))
+    whole, _ = figures.sections(figures.read_bench(small))
     curves = {curve.planner: curve for curve in whole.curves}
     assert curves["mpnet"].end == 10.0
     assert curves["ompl_rrt_star"].found.tolist() == [0.05, 0.5, 5.0]
@@ -248,8 +248,8 @@ def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) 
 
 
 def test_latex_is_escaped_and_every_row_has_all_columns(small: Path) -> None:
-    bench = bench_figures.read_bench(small)
-    text = bench_report.latex(bench, bench_figures.sections(bench))
+    bench = figures.read_bench(small)
+    text = report.latex(bench, figures.sections(bench))
     assert r"ompl\_rrt\_star" in text
     assert r"Abacus\_9 \& sons" in text
     assert not re.search(r"(?<!\\)[_#]", text)
@@ -262,15 +262,15 @@ def test_latex_is_escaped_and_every_row_has_all_columns(small: Path) -> None:
 
 
 def test_the_paper_stands_beside_ours(small: Path) -> None:
-    bench = bench_figures.read_bench(small)
-    whole, _ = bench_figures.sections(bench)
-    table = bench_report.paper_table(whole, whole.main)
+    bench = figures.read_bench(small)
+    whole, _ = figures.sections(bench)
+    table = report.paper_table(whole, whole.main)
     assert table is not None
     of = {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
     assert of["ompl_rrt_star (RRT*)"]["paper: success"] == "73.3"
     assert of["ompl_rrt_star (RRT*)"]["paper: returns"] == "600"
     assert of["robotdiffuse (RobotDiffuse)"]["paper: ComScore"] == "0.765"
-    text = bench_report.markdown(bench, [whole])
+    text = report.markdown(bench, [whole])
     widths = [line.count("|") - line.count("\\|") for line in text.splitlines() if line.startswith("| robot")]
     assert max(widths) == 12
 
@@ -306,8 +306,8 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     lines = ",".join(json.dumps(case.__dict__) for case in cases)
     (small / "problems").mkdir()
     (small / "problems" / "rop.json").write_text(f'{{"drawn": 4, "cases": [{lines}]}}')
-    bench = bench_figures.read_bench(small)
-    shown = bench_page.worth_showing(bench, bench_figures.sections(bench, [1.0]))
+    bench = figures.read_bench(small)
+    shown = page.worth_showing(bench, figures.sections(bench, [1.0]))
     titles = [motion.title for motion in shown]
     assert titles[0] == "robotdiffuse · rop/0"  # solved by all; made up as one and the same
     assert "ompl_rrt_star · rop/0" in titles
@@ -317,21 +317,21 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     }
     captions = {motion.title: motion.caption for motion in shown}
     assert captions["mpnet fails · rop/2"].startswith("gave up before; here: robotdiffuse")
-    assert len(shown) <= bench_page.MOST_REPLAYS
+    assert len(shown) <= page.MOST_REPLAYS
 
 
 def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="no records of a bench"):
-        bench_figures.read_bench(small / "nowhere")
+        figures.read_bench(small / "nowhere")
     with pytest.raises(InputError, match=r"'foo'.*mpnet, .*"):
-        bench_figures.read_bench(small, ["foo"])
+        figures.read_bench(small, ["foo"])
     with pytest.raises(InputError, match="no planner was run that long"):
-        bench_figures.sections(bench_figures.read_bench(small, ["ompl_rrt_star"]), [60.0])
+        figures.sections(figures.read_bench(small, ["ompl_rrt_star"]), [60.0])
     assert main(["bench", "report", str(small), "--limits", "1,x"]) == 2
     assert "limits are '1,x'" in capsys.readouterr().err
     (small / "runs.jsonl").write_text('{"date": 1}\n')
     with pytest.raises(InputError, match=r"runs\.jsonl is damaged"):
-        bench_figures.read_bench(small)
+        figures.read_bench(small)
     with (small / "records" / "mpnet.jsonl").open("a") as stream:
         stream.write("{broken\n")
     assert main(["bench", "report", str(small)]) == 2
@@ -342,7 +342,7 @@ def test_an_empty_folder_says_how_to_go_on(tmp_path: Path) -> None:
     (tmp_path / "records").mkdir()
     (tmp_path / "records" / "mpnet.jsonl").touch()
     with pytest.raises(InputError, match="no records yet"):
-        bench_figures.read_bench(tmp_path)
+        figures.read_bench(tmp_path)
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 13, 18])
@@ -351,7 +351,7 @@ def test_names_beside_a_plot_keep_apart_and_inside(count: int) -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         wanted = np.sort(rng.choice([rng.uniform(0.3, 1.0, count), np.full(count, 0.99)]))
-        heights = bench_plots._spread(wanted, gap)
+        heights = plots._spread(wanted, gap)
         assert len(heights) == count
         assert (np.diff(heights) >= gap - 1e-9).all()
         assert count == 0 or (heights[0] >= 0.01 and heights[-1] <= 0.99)

@@ -16,10 +16,10 @@ import pytest
 import faulty_planner
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation import planner_process
-from robotdiffuse.evaluation.problem_sets import family_problem, gather_cases, line_solves
-from robotdiffuse.evaluation.records import Record, RecordFile, read_records
-from robotdiffuse.evaluation.runner import BenchSettings, open_tasks, run_bench
+from robotdiffuse.evaluation.bench import planner_process
+from robotdiffuse.evaluation.bench.problem_sets import family_problem, gather_cases, line_solves
+from robotdiffuse.evaluation.bench.records import Record, RecordFile, read_records
+from robotdiffuse.evaluation.bench.runner import BenchSettings, open_tasks, run_bench
 from robotdiffuse.planners import PLANNERS
 from robotdiffuse.problem_files import problem_record
 from robotdiffuse.types import Path as Motion

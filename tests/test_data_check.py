@@ -10,8 +10,8 @@ import pytest
 from box_arm import box_arm
 from motion_stores import line, random_motions, record, write_motions
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data_check import KINDS, check_data
-from robotdiffuse.evaluation.data_rows import motion_of, pick_rows, problem_of, scene_of
+from robotdiffuse.evaluation.data.check import KINDS, check_data
+from robotdiffuse.evaluation.data.rows import motion_of, pick_rows, problem_of, scene_of
 from robotdiffuse.learning.data.shards import read_shard, shard_path, write_shard
 from robotdiffuse.problem import JointGoal
 from robotdiffuse.scenes.rop import RopSettings, floor_box

@@ -11,9 +11,9 @@ pytest.importorskip("matplotlib")
 from box_arm import box_arm
 from motion_stores import random_motions, write_motions
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation import data_report
-from robotdiffuse.evaluation.data_page import size_in_words, write_page
-from robotdiffuse.evaluation.data_report import FRAMES_KEPT, QUANTILES, describe, read_columns
+from robotdiffuse.evaluation.data import report
+from robotdiffuse.evaluation.data.page import size_in_words, write_page
+from robotdiffuse.evaluation.data.report import FRAMES_KEPT, QUANTILES, describe, read_columns
 from robotdiffuse.robots import load_robot
 
 ARM = box_arm()
@@ -46,7 +46,7 @@ def test_figures(tmp_path, rows):
 
 
 def test_large_sets_are_sampled_evenly(tmp_path, rows, monkeypatch):
-    monkeypatch.setattr(data_report, "SAMPLE", 4)
+    monkeypatch.setattr(report, "SAMPLE", 4)
     write_motions(tmp_path, ARM, rows, shard=3)
     columns = read_columns(tmp_path)
     assert len(columns.all["cost"]) == 11

@@ -17,7 +17,7 @@ from numpy import ndarray
 from factory_runs import contents, in_this_process
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data_rows import path_of, problem_of
+from robotdiffuse.evaluation.data.rows import path_of, problem_of
 from robotdiffuse.generation import GenerationSettings, factory, generate, problems
 from robotdiffuse.generation.problems import draw_problem
 from robotdiffuse.generation.shard_maker import NUMBERS, make_shard, resample

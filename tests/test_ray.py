@@ -12,8 +12,8 @@ import pytest
 
 from factory_runs import contents, in_this_process
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.records import read_records
-from robotdiffuse.evaluation.runner import BenchSettings, run_bench
+from robotdiffuse.evaluation.bench.records import read_records
+from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
 from robotdiffuse.generation import GenerationSettings, factory, generate, workers
 
 # read when ray is imported: no telemetry, and no pages of logs when a node is lost

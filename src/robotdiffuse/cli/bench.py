@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from numpy import ndarray
 
-    from robotdiffuse.evaluation.bench_figures import Bench, Section
+    from robotdiffuse.evaluation.bench.figures import Bench, Section
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -96,7 +96,7 @@ def run_run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from robotdiffuse.evaluation.runner import BenchSettings, run_bench
+    from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
 
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers is for this machine's processes; --cluster uses all cores that it has")
@@ -127,9 +127,9 @@ def run_run(arguments: argparse.Namespace) -> int:
 def run_report(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
-    from robotdiffuse.evaluation import bench_report
-    from robotdiffuse.evaluation.bench_figures import read_bench, sections
-    from robotdiffuse.evaluation.bench_page import write_page
+    from robotdiffuse.evaluation.bench import report
+    from robotdiffuse.evaluation.bench.figures import read_bench, sections
+    from robotdiffuse.evaluation.bench.page import write_page
     from robotdiffuse.files import write_atomically
 
     planners = None if arguments.planners is None else arguments.planners.split(",")
@@ -138,8 +138,8 @@ def run_report(arguments: argparse.Namespace) -> int:
     parts = sections(bench, limits)
     out = Path(arguments.out or arguments.folder)
     print_bench(bench, parts)
-    write_atomically(out / "report.md", bench_report.markdown(bench, parts), make_folder=True)
-    write_atomically(out / "report.tex", bench_report.latex(bench, parts))
+    write_atomically(out / "report.md", report.markdown(bench, parts), make_folder=True)
+    write_atomically(out / "report.tex", report.latex(bench, parts))
     replays = None if arguments.no_replays else _write_replays(bench, parts, out / "replays.html")
     write_page(bench, parts, out / "index.html", replays)
     files = ["index.html", *([replays] if replays else []), "report.md", "report.tex"]
@@ -149,7 +149,7 @@ def run_report(arguments: argparse.Namespace) -> int:
 
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
     """The name of the file; None if there is nothing to replay."""
-    from robotdiffuse.evaluation.bench_page import worth_showing
+    from robotdiffuse.evaluation.bench.page import worth_showing
     from robotdiffuse.problem_files import Robots
     from robotdiffuse.types import Path as Waypoints
     from robotdiffuse.viewer.gallery import Exhibit, write_gallery
@@ -183,7 +183,7 @@ def print_bench(bench: "Bench", parts: "list[Section]") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from robotdiffuse.evaluation.bench_report import main_table, missing_line
+    from robotdiffuse.evaluation.bench.report import main_table, missing_line
 
     console = Console(width=None if sys.stdout.isatty() else 150)
     for section in parts:
@@ -207,7 +207,7 @@ def run_confirm(arguments: argparse.Namespace) -> int:
     from rich.table import Table
 
     try:
-        from robotdiffuse.evaluation.confirm import confirm
+        from robotdiffuse.evaluation.bench.confirm import confirm
     except ImportError:
         raise InputError('PyBullet is not installed: pip install "robotdiffuse[sim]"') from None
 

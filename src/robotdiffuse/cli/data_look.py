@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 
     from rich.progress import Progress
 
-    from robotdiffuse.evaluation.data_check import DataCheck
-    from robotdiffuse.evaluation.data_report import DataSummary, Spread
+    from robotdiffuse.evaluation.data.check import DataCheck
+    from robotdiffuse.evaluation.data.report import DataSummary, Spread
     from robotdiffuse.robots.robot import Robot
     from robotdiffuse.viewer.gallery import Exhibit
 
@@ -102,7 +102,7 @@ def _bar() -> "Progress":
 
 
 def run_info(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.data_page import write_page
+    from robotdiffuse.evaluation.data.page import write_page
 
     page = Path(arguments.page or Path(arguments.folder) / "report.html")
     print_summary(write_page(arguments.folder, page, _robot(arguments.robot)))
@@ -116,7 +116,7 @@ def print_summary(summary: "DataSummary") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from robotdiffuse.evaluation.data_page import size_in_words
+    from robotdiffuse.evaluation.data.page import size_in_words
 
     console, counts = Console(), summary.counts
     made = f"{summary.trajectories:,}"
@@ -168,7 +168,7 @@ def _rounded(value: float) -> str:
 
 
 def run_check(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.evaluation.data_check import check_data
+    from robotdiffuse.evaluation.data.check import check_data
 
     with _bar() as bar:
         task = bar.add_task("motions", total=None)
@@ -191,7 +191,7 @@ def print_check(check: "DataCheck") -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from robotdiffuse.evaluation.data_check import KINDS
+    from robotdiffuse.evaluation.data.check import KINDS
 
     console = Console()
     title = f"{check.robot}: {'clean' if check.clean else 'violations found'}"
@@ -240,7 +240,7 @@ def run_view(arguments: argparse.Namespace) -> int:
 
 def _exhibits(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[Exhibit]":
     """Random rows, in the order of the shards."""
-    from robotdiffuse.evaluation.data_rows import family_names, motion_of, random_rows, scene_of
+    from robotdiffuse.evaluation.data.rows import family_names, motion_of, random_rows, scene_of
     from robotdiffuse.learning.data.shards import read_manifest
     from robotdiffuse.viewer.gallery import Exhibit
 

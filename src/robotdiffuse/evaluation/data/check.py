@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data_rows import path_of, pick_rows, problem_of, scene_of
+from robotdiffuse.evaluation.data.rows import path_of, pick_rows, problem_of, scene_of
 from robotdiffuse.learning.data.shards import (
     Manifest,
     Shard,

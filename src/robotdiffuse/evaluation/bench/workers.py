@@ -8,9 +8,9 @@ from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from robotdiffuse.evaluation.planner_process import Contestant, PlannerProcess
-from robotdiffuse.evaluation.problem_sets import Case
-from robotdiffuse.evaluation.records import Record, record_from_json
+from robotdiffuse.evaluation.bench.planner_process import Contestant, PlannerProcess
+from robotdiffuse.evaluation.bench.problem_sets import Case
+from robotdiffuse.evaluation.bench.records import Record, record_from_json
 from robotdiffuse.generation.workers import ray_cluster
 
 CHUNK = 20

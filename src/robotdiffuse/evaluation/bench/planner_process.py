@@ -1,7 +1,8 @@
 """A process of its own for each planner: a crash, an endless loop or a leak there hurts nobody else.
 
-The far side is `python -m robotdiffuse.evaluation.planner_process NAME [WEIGHTS]`: it reads a task per line
-and writes an answer per line, both JSON. Warming up, for compiled code and imports, is apart from timing.
+The far side is `python -m robotdiffuse.evaluation.bench.planner_process NAME [WEIGHTS]`: it reads a task per
+line and writes an answer per line, both JSON. Warming up, for compiled code and imports, is apart from
+timing.
 """
 
 import json
@@ -21,8 +22,8 @@ from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
+from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.metrics import MotionMeasures
-from robotdiffuse.evaluation.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.planners import check_planner, load_planner
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.problem import JointGoal, Problem
@@ -33,7 +34,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
 from robotdiffuse.types import PlanResult
 
-FAR_SIDE = sys.executable, "-m", "robotdiffuse.evaluation.planner_process"
+FAR_SIDE = sys.executable, "-m", "robotdiffuse.evaluation.bench.planner_process"
 WARM_UP_SECONDS = 1.0
 WARM_UP_RADIUS = 0.08
 """Of balls in the way [m]."""

@@ -1,4 +1,4 @@
-"""What is in a data set, in figures. `data_page` draws the same as a page of plots."""
+"""What is in a data set, in figures. `page` draws the same as a page of plots."""
 
 from dataclasses import dataclass, field
 from pathlib import Path as FilePath
@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data_rows import family_names
+from robotdiffuse.evaluation.data.rows import family_names
 from robotdiffuse.learning.data.shards import (
     SPLITS,
     Manifest,

@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.evaluation import bench_plots, bench_report, data_plots
-from robotdiffuse.evaluation.bench_figures import (
+from robotdiffuse.evaluation import look
+from robotdiffuse.evaluation.bench import plots, report
+from robotdiffuse.evaluation.bench.figures import (
     Bench,
     Comparison,
     Outcome,
@@ -20,10 +21,10 @@ from robotdiffuse.evaluation.bench_figures import (
     counting,
     outcome,
 )
-from robotdiffuse.evaluation.bench_report import TextTable
-from robotdiffuse.evaluation.data_page import STYLE
-from robotdiffuse.evaluation.problem_sets import Case, read_cases
-from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.bench.problem_sets import Case, read_cases
+from robotdiffuse.evaluation.bench.records import Record
+from robotdiffuse.evaluation.bench.report import TextTable
+from robotdiffuse.evaluation.look import STYLE
 from robotdiffuse.files import write_atomically
 from robotdiffuse.paths.export import check_output
 from robotdiffuse.problem import JointGoal
@@ -102,7 +103,7 @@ def write_page(bench: Bench, parts: Sequence[Section], file: str | FilePath, rep
     Raises InputError without matplotlib and for a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
-    with data_plots.style():
+    with look.style():
         text = _page(bench, parts, replays)
     write_atomically(target, text, make_folder=True)
 
@@ -111,7 +112,7 @@ def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
     name = html.escape(bench.folder.resolve().name)
     planners = list(bench.records)
     apart = [section for section in parts if section.name == section.problem_set]
-    families = bench_plots.families([section.main for section in apart], planners)
+    families = plots.families([section.main for section in apart], planners)
     limits = " and ".join(f"{x:g} s" for x in sorted({section.main.limit for section in apart}))
     text = f"Share of problems solved within {limits}, with 95 % intervals; in brackets, how many calls"
     frame = ""
@@ -132,7 +133,7 @@ def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         f"<style>{STYLE}{OWN_STYLE}</style></head>\n<body><main>",
         f"<h1>{name}</h1>",
-        f'<div class="about">{"<br>".join(html.escape(line) for line in bench_report.about(bench))}</div>',
+        f'<div class="about">{"<br>".join(html.escape(line) for line in report.about(bench))}</div>',
         f'<div class="tiles">{_tiles(bench)}</div>',
         _picks(parts),
         *(_section(bench, section, planners) for section in parts),
@@ -142,7 +143,7 @@ def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
         frame,
         "</div>",
         "<details><summary>How to read the tables</summary><ul>",
-        *(f"<li>{html.escape(note)}</li>" for note in bench_report.NOTES),
+        *(f"<li>{html.escape(note)}</li>" for note in report.NOTES),
         "</ul></details>",
         f"</main><script>const mains = {mains};{SCRIPT}</script></body></html>\n",
     )
@@ -195,38 +196,38 @@ def _picks(parts: Sequence[Section]) -> str:
 def _section(bench: Bench, section: Section, planners: list[str]) -> str:
     """Plots of a problem set, and the tables of each limit."""
     name = html.escape(section.name)
-    plots = ""
+    curves = ""
     if section.curves:
         ran = section.curves[0].calls
-        plots = _card(
+        curves = _card(
             "Success over time",
             6,
             f"{name}: share of {ran} calls. Learned planners solid, sampling dashed, search dotted",
-            f'<div class="wide">{bench_plots.success_over_time(section, planners)}</div>',
+            f'<div class="wide">{plots.success_over_time(section, planners)}</div>',
         ) + _card(
             "Length over time",
             6,
             f"{name}: median length over the best known, of non-trivial problems. Points: one path a call",
-            f'<div class="wide">{bench_plots.length_over_time(section, planners)}</div>',
+            f'<div class="wide">{plots.length_over_time(section, planners)}</div>',
         )
     tables = "".join(
         f'<div class="cards" data-set="{name}" data-limit="{comparison.limit:g}">'
         f"{_comparison(bench, section, comparison)}</div>"
         for comparison in section.comparisons
     )
-    return f'<div class="cards" data-set="{name}">{plots}</div>{tables}'
+    return f'<div class="cards" data-set="{name}">{curves}</div>{tables}'
 
 
 def _comparison(bench: Bench, section: Section, comparison: Comparison) -> str:
-    main, *others = bench_report.tables(section, comparison, bench.reference)
-    text = html.escape(bench_report.missing_line(comparison))
+    main, *others = report.tables(section, comparison, bench.reference)
+    text = html.escape(report.missing_line(comparison))
     cards = [_card(html.escape(main.title), 12, text, _main_rows(main, comparison, bench))]
     for table in others:
         heading, _, rest = table.title.partition("; ")
         short = len(table.columns) < 8
         if heading.startswith("Failures"):
             short = True
-            drawn = bench_plots.failures(section, comparison, list(bench.records))
+            drawn = plots.failures(section, comparison, list(bench.records))
             cards.append(_card("Failures", 6, html.escape(rest), f'<div class="wide">{drawn}</div>'))
         cards.append(_card(html.escape(heading), 6 if short else 12, html.escape(rest), _rows(table, bench)))
     return "".join(cards)
@@ -243,7 +244,7 @@ def _rows(table: TextTable, bench: Bench) -> str:
 
 def _name(text: str, bench: Bench) -> str:
     planner = text.partition(" ")[0]
-    color = bench_plots.color_of(planner, list(bench.records))
+    color = plots.color_of(planner, list(bench.records))
     return f'<td><i style="background:{color}"></i>{html.escape(text)}</td>'
 
 
@@ -265,7 +266,7 @@ def _main_rows(table: TextTable, comparison: Comparison, bench: Bench) -> str:
             best[i] = level if 2 * len(level) <= len(rows) else set()
     body = []
     for j, (row, cells) in enumerate(zip(rows, table.rows, strict=True)):
-        color = bench_plots.color_of(row.planner, list(bench.records))
+        color = plots.color_of(row.planner, list(bench.records))
         texts = [_name(cells[0], bench)]
         for i, cell in enumerate(cells[1:], start=1):
             kind = "best" if j in best.get(i, ()) else "dim" if i in (2, 6) else ""
@@ -281,7 +282,7 @@ def _main_rows(table: TextTable, comparison: Comparison, bench: Bench) -> str:
 
 
 def _crashes(bench: Bench) -> str:
-    lines = bench_report.crashes(bench)
+    lines = report.crashes(bench)
     if not lines:
         return ""
     rows = "".join(f"<tr><td>{html.escape(line)}</td></tr>" for line in lines[:20])
@@ -356,7 +357,7 @@ def _solved(tries: _Tries, reference: str) -> list[Shown]:
     shown = []
     for record in {record.planner: record for record in chosen}.values():
         which = "shortest, " if record is solved[0] else "longest, " if record is solved[-1] else ""
-        caption = f"{record.joint_length:.2f} rad, {which}in {bench_report.seconds(record.time)} s"
+        caption = f"{record.joint_length:.2f} rad, {which}in {report.seconds(record.time)} s"
         shown.append(Shown(f"{record.planner} · {tries.case.name}", caption, tries.case, record.waypoints))
     return shown
 

@@ -6,8 +6,8 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.problem_sets import Case, read_cases
-from robotdiffuse.evaluation.records import Record, read_records
+from robotdiffuse.evaluation.bench.problem_sets import Case, read_cases
+from robotdiffuse.evaluation.bench.records import Record, read_records
 from robotdiffuse.problem_files import Robots
 from robotdiffuse.simulation.oracle import OracleContact, PyBulletOracle
 from robotdiffuse.types import Path

@@ -1,16 +1,13 @@
 """The plots of the page on a data set, as SVG. All need matplotlib, which the core install lacks."""
 
-import io
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data_report import REASONS, DataColumns, DataSummary
+from robotdiffuse.evaluation.data.report import REASONS, DataColumns, DataSummary
+from robotdiffuse.evaluation.look import FAINT, INK, as_svg, make_figure
 from robotdiffuse.scenes.sampling import BOX, SPHERE
 
 if TYPE_CHECKING:
@@ -18,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
-INK, SOFT, LINE, FAINT = "#222b38", "#6b7684", "#d9dde2", "#eef0f3"
 START, GOAL = "#4f7fd9", "#10a37f"
 """As in the replay."""
 FAMILIES = ("#4f7fd9", "#e09a5f", "#8d76c4", "#5aa7a7")
@@ -26,8 +22,6 @@ OUTCOMES = {"solved": "#10a37f", "unsolved": "#d97b5c", "refused": "#c94f4f", "t
 GRADES = ("#dfe3e8", "#a9c1ec", "#6b95de", "#34599f")
 """From easy to hard."""
 DETOURS = ((1.05, "up to 5 % longer"), (1.25, "up to 25 %"), (np.inf, "more"))
-WIDTHS = {4: 4.1, 6: 6.25, 12: 12.7}
-"""Of a plot by the columns of the page that it spans [inch]; so text is of one size everywhere."""
 ABOVE: dict[str, Any] = {
     "loc": "lower left",
     "bbox_to_anchor": (0.0, 0.98),
@@ -44,61 +38,6 @@ TAIL = 0.995
 POINTS_PER_OBSTACLE = 64
 MOST_OBSTACLES = 20_000
 MOST_TIPS = 2_500
-
-
-@contextmanager
-def style() -> Iterator[None]:
-    """One look for all plots. Raises InputError if matplotlib is missing."""
-    try:
-        import matplotlib
-    except ImportError:
-        raise InputError(
-            'the page needs matplotlib, which is not installed: pip install "robotdiffuse[data]"'
-        ) from None
-    look: dict[Any, Any] = {
-        "svg.fonttype": "none",
-        "svg.hashsalt": "robotdiffuse",
-        "font.size": 8.0,
-        "text.color": INK,
-        "axes.edgecolor": LINE,
-        "axes.labelcolor": SOFT,
-        "axes.labelsize": 8.0,
-        "axes.titlesize": 8.5,
-        "axes.titlecolor": INK,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.axisbelow": True,
-        "xtick.color": LINE,
-        "ytick.color": LINE,
-        "xtick.labelcolor": SOFT,
-        "ytick.labelcolor": SOFT,
-        "xtick.labelsize": 7.5,
-        "ytick.labelsize": 7.5,
-        "xtick.major.size": 3.0,
-        "ytick.major.size": 0.0,
-        "legend.frameon": False,
-        "legend.fontsize": 7.5,
-        "legend.handlelength": 0.9,
-        "legend.handleheight": 0.9,
-        "figure.constrained_layout.use": True,
-    }
-    with matplotlib.rc_context(look):
-        yield
-
-
-def make_figure(width: int, height: float) -> "Figure":
-    """As wide as so many columns of the page, and so high [inch]."""
-    from matplotlib.figure import Figure
-
-    return Figure((WIDTHS[width], height))
-
-
-def as_svg(figure: "Figure") -> str:
-    """The text of an element."""
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", transparent=True, dpi=220, metadata={"Date": None, "Creator": None})
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
 
 
 def outcomes(summary: DataSummary) -> str:

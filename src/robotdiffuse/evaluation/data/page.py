@@ -9,41 +9,15 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.evaluation import data_plots
-from robotdiffuse.evaluation.data_report import DataColumns, DataSummary, read_columns, summarize
+from robotdiffuse.evaluation import look
+from robotdiffuse.evaluation.data import plots
+from robotdiffuse.evaluation.data.report import DataColumns, DataSummary, read_columns, summarize
+from robotdiffuse.evaluation.look import STYLE
 from robotdiffuse.files import write_atomically
 from robotdiffuse.paths.export import check_output
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
-
-STYLE = """
-:root { --ink: #222b38; --soft: #6b7684; --line: rgba(34, 43, 56, .09); }
-* { box-sizing: border-box; }
-body { margin: 0; background: #f2f4f6; color: var(--ink);
-  font: 14px/1.45 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-main { max-width: 1320px; margin: 0 auto; padding: 34px 26px 40px; }
-h1 { margin: 0; font-size: 27px; font-weight: 680; letter-spacing: -.018em; }
-.about { margin: 5px 0 22px; color: var(--soft); }
-.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(136px, 1fr)); gap: 12px;
-  margin-bottom: 14px; }
-.tile, .card { background: white; border: 1px solid var(--line); border-radius: 14px;
-  box-shadow: 0 2px 12px rgba(30, 40, 60, .045); }
-.tile { padding: 12px 16px 11px; }
-.tile b { display: block; font-size: 23px; font-weight: 640; letter-spacing: -.02em;
-  font-variant-numeric: tabular-nums; }
-.tile span { color: var(--soft); font-size: 12.5px; }
-.cards { display: grid; grid-template-columns: repeat(12, 1fr); gap: 14px; }
-.card { padding: 17px 20px 12px; min-width: 0; display: flex; flex-direction: column; }
-.card h2 { margin: 0; font-size: 15.5px; font-weight: 640; letter-spacing: -.005em; }
-.card p { margin: 2px 0 10px; color: var(--soft); font-size: 12.5px; }
-.card svg { display: block; width: 100%; height: auto; margin-top: auto; }
-.card svg text { font-family: system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial,
-  sans-serif !important; }
-.w4 { grid-column: span 4; } .w6 { grid-column: span 6; } .w12 { grid-column: span 12; }
-footer { margin-top: 20px; color: var(--soft); font-size: 12px; }
-@media (max-width: 900px) { .w4, .w6 { grid-column: span 12; } }
-"""
 
 
 def write_page(folder: str | FilePath, file: str | FilePath, robot: Robot | None = None) -> DataSummary:
@@ -69,66 +43,66 @@ def _page(name: str, columns: DataColumns, summary: DataSummary, robot: Robot) -
     sampled = len(columns.sample["cost"])
     drawn = "" if sampled == summary.trajectories else f", of {sampled:,} of the motions"
     cm = f"{100 * summary.safety_distance:.3g} cm"
-    plots: tuple[tuple[str, int, str, Callable[[], str]], ...] = (
+    shown: tuple[tuple[str, int, str, Callable[[], str]], ...] = (
         (
             "Problems",
             4,
             f"What became of the {summary.counts.get('tried', 0):,} problems that were drawn",
-            lambda: data_plots.outcomes(summary),
+            lambda: plots.outcomes(summary),
         ),
         (
             "Path length",
             4,
             "Joint-space length of the motions, by family of scenes",
-            lambda: data_plots.lengths(columns),
+            lambda: plots.lengths(columns),
         ),
         (
             "Clearance",
             4,
             f"Least distance between arm and obstacles; the search keeps {cm} away from the ends",
-            lambda: data_plots.clearances(columns, summary.safety_distance),
+            lambda: plots.clearances(columns, summary.safety_distance),
         ),
         (
             "Detour",
             4,
             "Path length over that of the straight line, where the line is not free",
-            lambda: data_plots.detours(columns),
+            lambda: plots.detours(columns),
         ),
         (
             "Difficulty",
             4,
             "How far round the motion has to go, and how narrow it gets",
-            lambda: data_plots.difficulty(columns),
+            lambda: plots.difficulty(columns),
         ),
         (
             "Goals",
             4,
             "Goal configurations per problem, and what the others cost over the best one",
-            lambda: data_plots.goals(columns),
+            lambda: plots.goals(columns),
         ),
         (
             "Joints",
             12,
             f"Where the joints are between their limits: all frames, starts and goals{drawn}",
-            lambda: data_plots.joints(columns),
+            lambda: plots.joints(columns),
         ),
         (
             "Obstacles",
             6,
             f"Density of obstacles, without the floor{drawn}; the cross is the robot's base",
-            lambda: data_plots.obstacles(columns),
+            lambda: plots.obstacles(columns),
         ),
         (
             "Tip",
             6,
             f"Where the robot's {html.escape(robot.tip)} starts and ends, of some of the motions",
-            lambda: data_plots.tips(tips),
+            lambda: plots.tips(tips),
         ),
     )
-    with data_plots.style():
+    with look.style():
         cards = "\n".join(
             f'<section class="card w{width}"><h2>{title}</h2><p>{text}</p>{plot()}</section>'
-            for title, width, text, plot in plots
+            for title, width, text, plot in shown
         )
     return "\n".join(
         (

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.bench.problem_sets import read_cases
+from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED, Record, read_records
 from robotdiffuse.evaluation.comscore import Indicators, comscores
-from robotdiffuse.evaluation.problem_sets import read_cases
-from robotdiffuse.evaluation.records import CRASHED, OVERRAN, RAISED, Record, read_records
 from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
 from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.scenes.families import FAMILIES

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robotdiffuse.evaluation.bench_figures import FAILURES, Comparison, Section
-from robotdiffuse.evaluation.data_plots import FAINT, INK, LINE, SOFT, as_svg, make_figure
-from robotdiffuse.evaluation.records import CRASHED, OVERRAN, RAISED
+from robotdiffuse.evaluation.bench.figures import FAILURES, Comparison, Section
+from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
+from robotdiffuse.evaluation.look import FAINT, INK, LINE, SOFT, as_svg, make_figure
 from robotdiffuse.evaluation.statistics import wilson_interval
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robotdiffuse.evaluation.bench_figures import (
+from robotdiffuse.evaluation.bench.figures import (
     FAILURES,
     ROP,
     Bench,
