@@ -31,9 +31,12 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
+from robotdiffuse.planners import lattice_graph
 from robotdiffuse.planners import lattice_kernel as kernel
+from robotdiffuse.planners import lattice_table as table
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import usable_ends
+from robotdiffuse.planners.lattice_graph import UNITS, Lattice
 from robotdiffuse.planners.rrt_connect import FINEST, finer, levers, search_space
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots.robot import Robot
@@ -122,7 +125,7 @@ class Outcome(Enum):
 
 
 class _Graph(NamedTuple):
-    lattice: kernel.Lattice
+    lattice: Lattice
     lowest: Float[ndarray, "dof"]
     highest: Float[ndarray, "dof"]
     """The joint limits."""
@@ -153,13 +156,13 @@ def _make_graph(
     half = _moves(robot.dof, settings.joints_per_move)
     moves = np.concatenate([half, -half])
     goals_at = (goals.astype(np.float64) - origin) / spacing
-    lattice = kernel.Lattice(
+    lattice = Lattice(
         origin,
         float(spacing),
         counts,
         strides,
         moves,
-        np.ceil(kernel.UNITS * np.sqrt(np.abs(moves).sum(axis=1))).astype(np.int64),
+        np.ceil(UNITS * np.sqrt(np.abs(moves).sum(axis=1))).astype(np.int64),
         1 / sqrt(min(settings.joints_per_move, robot.dof)),
         np.ascontiguousarray(goals, np.float32),
         goals_at,
@@ -192,21 +195,21 @@ class _Search:
         self.checker, self.settings, self.padding = checker, settings, padding
         self.goals = goals
         self._graph = _make_graph(checker.robot, start, goals, settings)
-        self._table = kernel.make_table(self._graph.lattice, settings.max_nodes, incremental)
+        self._table = table.make_table(self._graph.lattice, settings.max_nodes, incremental)
         self._space = search_space(checker, settings.resolution, padding)
 
     @property
     def expansions(self) -> int:
         """Nodes expanded so far; one that is expanded again counts again."""
-        return int(self._table.count[kernel.EXPANSIONS])
+        return int(self._table.count[table.EXPANSIONS])
 
     @property
     def nodes(self) -> int:
         """Nodes in memory."""
-        return int(self._table.count[kernel.NODES]) - 1
+        return int(self._table.count[table.NODES]) - 1
 
     def _radians(self, units: int) -> float:
-        return float("inf") if units >= kernel.INFINITE else units * self.settings.spacing / kernel.UNITS
+        return float("inf") if units >= table.INFINITE else units * self.settings.spacing / UNITS
 
     def _waypoints(self, keys: Int[ndarray, "n"]) -> Float[ndarray, "m dof"]:
         """The nodes at which the path turns, and the goal."""
@@ -214,7 +217,7 @@ class _Search:
         at = keys[:, None] // lattice.strides % lattice.counts
         turns = np.ones(len(keys), np.bool_)
         turns[1:-1] = (np.diff(at, 2, axis=0) != 0).any(axis=1)
-        goal = self.goals[self._table.count[kernel.GOAL]].astype(np.float64)
+        goal = self.goals[self._table.count[table.GOAL]].astype(np.float64)
         return np.concatenate([self._graph.configurations(keys[turns]), goal[None]])
 
 
@@ -244,12 +247,12 @@ class AStarSearch(_Search):
     @property
     def cost(self) -> float:
         """Length of the best path so far [rad]; infinite if there is none."""
-        return self._radians(int(self._table.g[kernel.AT_GOAL]))
+        return self._radians(int(self._table.g[table.AT_GOAL]))
 
     def path(self) -> Float[ndarray, "n dof"] | None:
         """Waypoints from the start to a goal; None if there is none yet."""
-        node = int(self._table.parent[kernel.AT_GOAL])
-        if self._table.g[kernel.AT_GOAL] >= kernel.INFINITE:
+        node = int(self._table.parent[table.AT_GOAL])
+        if self._table.g[table.AT_GOAL] >= table.INFINITE:
             return None
         keys = []
         while node >= 0:
@@ -276,12 +279,12 @@ class DStarLiteSearch(_Search):
         self._reaches = (0.5 * settings.spacing * moves @ levers(checker.robot)).astype(np.float32)
         """How far any point of the arm gets by half of each move [m]."""
         self._offset = 0
-        self._start = int(kernel.find_or_add(self._table, self._graph.start_key))
+        self._start = int(table.find_or_add(self._table, self._graph.start_key))
         self._has_room = self._update(np.full(len(self._table.keys), np.inf, np.float32))
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
         """Search on until there is a path, none, no more room, or `stop` says so."""
-        if self._table.state[self._start] == kernel.BLOCKED:
+        if self._table.state[self._start] == table.BLOCKED:
             return Outcome.EXHAUSTED
         if not self._has_room:
             return Outcome.FULL
@@ -299,7 +302,7 @@ class DStarLiteSearch(_Search):
 
     def path(self) -> Float[ndarray, "n dof"] | None:
         """Waypoints from the start to a goal, after `run` came back with FOUND; None if there are none."""
-        if self._table.rhs[self._start] >= kernel.INFINITE:
+        if self._table.rhs[self._start] >= table.INFINITE:
             return None
         return self._waypoints(kernel.path_from(self._graph.lattice, self._table, self._last, self._start))
 
@@ -346,13 +349,13 @@ class DStarLiteSearch(_Search):
         if np.abs(at - whole).max() > 1e-3 or (whole < 0).any() or (whole >= lattice.counts).any():
             raise InputError(f"start is {np.round(start, 4)}; it must be a node of the lattice")
         before = self._table.keys[self._start] // lattice.strides % lattice.counts
-        node = int(kernel.find_or_add(self._table, int(whole @ lattice.strides)))
+        node = int(table.find_or_add(self._table, int(whole @ lattice.strides)))
         if node < 0:
             raise InputError(f"start is {np.round(start, 4)}; the search never saw it and has no room for it")
         steps = np.abs(whole - before)
         way = max(float(np.linalg.norm(steps)), float(steps.sum()) * lattice.slope)
         # rounded up: what is queued must stay below its true key
-        self._offset += ceil(kernel.UNITS * way + kernel.ROUNDING) if way else 0
+        self._offset += ceil(UNITS * way + lattice_graph.ROUNDING) if way else 0
         self._start = node
 
     def _update(self, near: Float[ndarray, "capacity"]) -> bool:
