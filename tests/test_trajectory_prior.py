@@ -107,10 +107,12 @@ def test_the_loss_falls() -> None:
 
 
 def test_share_of_trivial_motions() -> None:
-    network, data, rng = TrajectoryPrior(RANGES, SMALL), data_of(30), np.random.default_rng(0)
-    drawn = network._rows(data, 4000, rng)
-    assert data.trivial[drawn].mean() == pytest.approx(SMALL.trivial_share, abs=0.02)
+    data, rng = data_of(30), np.random.default_rng(0)
+    drawn = data.draw(4000, 0.2, rng)
+    assert data.trivial[drawn].mean() == pytest.approx(0.2, abs=0.02)
     assert set(np.unique(drawn)) == set(range(30))
+    for trivial in (np.ones(30, bool), np.zeros(30, bool)):  # of one kind alone
+        assert set(np.unique(replace(data, trivial=trivial).draw(4000, 0.2, rng))) == set(range(30))
 
 
 def test_success_needs_motions_that_are_not_trivial() -> None:

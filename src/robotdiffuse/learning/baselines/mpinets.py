@@ -237,7 +237,7 @@ class MPiNetsNetwork(BaselineNetwork):
 
     def draw(self, data: TrajectoryData, count: int, rng: np.random.Generator) -> Steps:
         """Random frames of random motions, forwards or backwards, and the frames that follow them."""
-        rows = self._rows(data, count, rng)
+        rows = data.draw(count, self.settings.trivial_share, rng)
         last = data.q.shape[1] - 1
         way = np.where(rng.random(count) < 0.5, 1, -1)
         frame = rng.integers(0, last + 1, count)
@@ -249,13 +249,6 @@ class MPiNetsNetwork(BaselineNetwork):
         clouds = self.clouds(kinds, params, rng)
         here, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
         return Steps(here, after, end, clouds, kinds, params)
-
-    def _rows(self, data: TrajectoryData, count: int, rng: np.random.Generator) -> ndarray:
-        trivial, hard = np.flatnonzero(data.trivial), np.flatnonzero(~data.trivial)
-        if not len(trivial) or not len(hard):
-            return rng.integers(0, len(data), count)
-        easy = rng.random(count) < self.settings.trivial_share
-        return np.where(easy, rng.choice(trivial, count), rng.choice(hard, count))
 
     def clouds(
         self, kinds: Int8[ndarray, "n k"], params: Float32[ndarray, "n k 10"], rng: np.random.Generator

@@ -134,7 +134,8 @@ class MPNetNetwork(BaselineNetwork):
         """The root mean square of the steps between waypoints, which Pnet's output is in units of."""
         if len(data):
             rng = np.random.default_rng(0)
-            here, following, _ = self._samples(data.q[self._rows(data, 5_000, rng)], rng)
+            rows = data.draw(5_000, self.settings.trivial_share, rng)
+            here, following, _ = self._samples(data.q[rows], rng)
             step = self.normalized(following) - self.normalized(here)
             self.step_scale.fill_(max(float(np.sqrt(np.mean(step**2))), 1e-3))
 
@@ -167,7 +168,7 @@ class MPNetNetwork(BaselineNetwork):
         """
         of = self.settings
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-        rows = self._rows(data, max(1, count // of.waypoints), rng)
+        rows = data.draw(max(1, count // of.waypoints), of.trivial_share, rng)
         cloud = self.clouds(data, rows, generator)
         with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
             if fraction < of.pretraining:
@@ -218,12 +219,6 @@ class MPNetNetwork(BaselineNetwork):
                 ended[joined] = True
                 forth, back = back, forth
         return float(found.mean())
-
-    def _rows(self, data: TrajectoryData, count: int, rng: np.random.Generator) -> Int[ndarray, "count"]:
-        trivial, hard = np.flatnonzero(data.trivial), np.flatnonzero(~data.trivial)
-        easy = rng.random(count) < self.settings.trivial_share
-        pools = trivial if len(trivial) else hard, hard if len(hard) else trivial
-        return np.where(easy, *(pool[rng.integers(0, len(pool), count)] for pool in pools))
 
     def _samples(
         self, q: Float[ndarray, "scenes frames dof"], rng: np.random.Generator

@@ -124,7 +124,7 @@ class TrajectoryPrior(BaselineNetwork):
                 f"the data have {data.q.shape[1]} frames and trajectory_prior.frames is {frames}; "
                 "they must be the same"
             )
-        q = data.q[self._rows(data, count, rng)]
+        q = data.q[data.draw(count, self.settings.trivial_share, rng)]
         back = rng.random(count) < 0.5
         q[back] = q[back, ::-1]
         clean = self.normalized(q.astype(np.float32))
@@ -142,17 +142,6 @@ class TrajectoryPrior(BaselineNetwork):
         predicted = self(torch.from_numpy(noisy).to(device), of_levels)
         target = torch.from_numpy(noise).to(device)
         return (predicted - target)[:, 1:-1].square().mean()
-
-    def _rows(self, data: TrajectoryData, count: int, rng: np.random.Generator) -> Int[ndarray, "count"]:
-        """Random rows, `trivial_share` of them trivial where the data have both kinds."""
-        trivial, hard = np.flatnonzero(data.trivial), np.flatnonzero(~data.trivial)
-        share = self.settings.trivial_share if len(hard) else 1.0
-        easy = rng.random(count) < (share if len(trivial) else 0.0)
-        rows = np.empty(count, np.int64)
-        for mask, pool in ((easy, trivial), (~easy, hard)):
-            if mask.any():
-                rows[mask] = pool[rng.integers(0, len(pool), int(mask.sum()))]
-        return rows
 
     def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
         """Share of motions that are free, of one sample each under simple guidance with all of the costs.

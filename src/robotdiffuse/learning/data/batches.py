@@ -3,12 +3,13 @@
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path as FilePath
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int8
+from jaxtyping import Bool, Float, Float32, Int, Int8
 from numpy import ndarray
 from torch import Tensor
 
@@ -74,6 +75,20 @@ class TrajectoryData:
         """The rows for training, and at most so many of those for validation."""
         cut = len(self) - self.validation
         return self._rows(slice(None, cut), 0), self._rows(slice(cut, cut + most), min(most, self.validation))
+
+    @cached_property
+    def pools(self) -> tuple[Int[ndarray, "m"], Int[ndarray, "k"]]:
+        """Rows that are trivial, and rows that are not."""
+        return np.flatnonzero(self.trivial), np.flatnonzero(~self.trivial)
+
+    def draw(self, count: int, trivial_share: float, rng: np.random.Generator) -> Int[ndarray, "count"]:
+        """Random rows, so large a share of them trivial where the data have both kinds."""
+        share = trivial_share if all(map(len, self.pools)) else float(len(self.pools[0]) > 0)
+        easy = rng.random(count) < share
+        rows = np.empty(count, np.int64)
+        for mask, pool in zip((easy, ~easy), self.pools, strict=True):
+            rows[mask] = pool[rng.integers(0, max(len(pool), 1), int(mask.sum()))]
+        return rows
 
     def _rows(self, rows: slice, validation: int) -> "TrajectoryData":
         return TrajectoryData(
@@ -275,19 +290,11 @@ class Batches:
     ) -> None:
         """clearances: (kinds [n, k], params [n, k, 10], q [n, rows, dof]) to what ClearanceFn gives."""
         self.data, self.model, self.clearances = data, model, clearances
-        self.weight_limit = weight_limit
-        self.trivial, self.hard = np.flatnonzero(data.trivial), np.flatnonzero(~data.trivial)
-        if not len(self.hard):
-            self.trivial_share = 1.0
-        else:
-            self.trivial_share = trivial_share if len(self.trivial) else 0.0
+        self.trivial_share, self.weight_limit = trivial_share, weight_limit
 
     def draw(self, count: int, rng: np.random.Generator) -> Batch:
         """A random batch."""
-        easy = rng.random(count) < self.trivial_share
-        rows = np.empty(count, np.int64)
-        for mask, pool in ((easy, self.trivial), (~easy, self.hard)):
-            rows[mask] = pool[rng.integers(0, max(len(pool), 1), int(mask.sum()))]
+        rows = self.data.draw(count, self.trivial_share, rng)
         # One level from each of `count` equal parts of the range: less variance than independent draws.
         parts = (np.arange(count) + rng.random(count)) / count
         levels = 1 + (parts * self.model.schedule.steps).astype(np.int64)
