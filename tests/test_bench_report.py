@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -298,6 +299,8 @@ def test_the_command_writes_everything(
     assert (out / "report.md").exists()
     assert (out / "report.tex").exists()
     assert not (out / "replays.html").exists()
+    for name in ("success_rop", "length_rop", "success_rop_non_trivial", "length_rop_non_trivial"):
+        assert ElementTree.parse(out / f"{name}.svg").getroot().tag.endswith("svg")
 
 
 def test_what_is_shown_is_hard_or_failed(small: Path) -> None:

@@ -49,8 +49,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     report = actions.add_parser(
         "report",
         help="tables, plots and replays of what `bench run` found",
-        description="Write report.md, report.tex, index.html (plots and tables) and replays.html (motions in "
-        "3D), and print the table of each problem set.",
+        description="Write report.md, report.tex, index.html (plots and tables), replays.html (motions in "
+        "3D) and curves of success and length over time as .svg, and print the table of each problem set.",
     )
     report.add_argument("folder", metavar="FOLDER", help="folder of `robotdiffuse bench run`")
     report.add_argument(
@@ -129,7 +129,7 @@ def run_report(arguments: argparse.Namespace) -> int:
 
     from robotdiffuse.evaluation.bench import report
     from robotdiffuse.evaluation.bench.figures import read_bench, sections
-    from robotdiffuse.evaluation.bench.page import write_page
+    from robotdiffuse.evaluation.bench.page import write_page, write_plots
     from robotdiffuse.files import write_atomically
 
     planners = None if arguments.planners is None else arguments.planners.split(",")
@@ -143,7 +143,8 @@ def run_report(arguments: argparse.Namespace) -> int:
     replays = None if arguments.no_replays else _write_replays(bench, parts, out / "replays.html")
     write_page(bench, parts, out / "index.html", replays)
     files = ["index.html", *([replays] if replays else []), "report.md", "report.tex"]
-    print(f"wrote {', '.join(str(out / name) for name in files)}")
+    curves = write_plots(bench, parts, out)
+    print(f"wrote {', '.join(str(out / name) for name in files)} and {len(curves)} plots as .svg")
     return 0
 
 

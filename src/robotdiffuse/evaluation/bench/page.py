@@ -2,6 +2,7 @@
 
 import html
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -106,6 +107,24 @@ def write_page(bench: Bench, parts: Sequence[Section], file: str | FilePath, rep
     with look.style():
         text = _page(bench, parts, replays)
     write_atomically(target, text, make_folder=True)
+
+
+def write_plots(bench: Bench, parts: Sequence[Section], folder: FilePath) -> list[str]:
+    """Write the curves of each problem set as success_SET.svg and length_SET.svg; returns their names.
+
+    Raises InputError as `write_page`.
+    """
+    files = []
+    for section in parts:
+        if section.curves:
+            name = "_".join(re.findall(r"\w+", section.name))
+            for kind, draw in (("success", plots.success_over_time), ("length", plots.length_over_time)):
+                with look.style():
+                    drawn = draw(section, list(bench.records))
+                on_white = drawn.replace("<svg ", '<svg style="background: white" ', 1)  # the ink is dark
+                files.append(f"{kind}_{name}.svg")
+                write_atomically(folder / files[-1], on_white)
+    return files
 
 
 def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
