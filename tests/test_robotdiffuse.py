@@ -1,5 +1,6 @@
 """The default planner: every stage verified, point clouds, robots without weights, reproducible."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from robotdiffuse.planners.robotdiffuse import (
     encode,
     unlearned_starts,
 )
+from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
@@ -100,8 +102,30 @@ def test_search_answers_where_the_network_gives_nothing(planner, monkeypatch):
 
     monkeypatch.setattr(RobotDiffuse, "sample", nothing)
     monkeypatch.setattr(RobotDiffuse, "refine", nothing)
-    result = planner.plan(PROBLEM, time_limit=10.0)
-    assert result.stage == "rrt_connect" and result.path is not None and verify(PROBLEM, result.path).valid
+    for quick in (True, False):
+        if not quick:
+            monkeypatch.setattr(RRTConnect, "first", lambda *_: None)
+        result = planner.plan(PROBLEM, time_limit=10.0)
+        assert result.stage == "rrt_connect" and result.path is not None
+        assert verify(PROBLEM, result.path).valid
+
+
+def test_the_first_path_comes_before_the_network_is_asked(planner, monkeypatch):
+    """So time that runs out while it samples costs no plan; and what is returned is no longer."""
+    began = []
+
+    def late(self, *arguments, sample=RobotDiffuse.sample):
+        began.append(time.perf_counter() - start)
+        time.sleep(0.3)
+        return sample(self, *arguments)
+
+    planner.plan(PROBLEM, time_limit=10.0)
+    monkeypatch.setattr(RobotDiffuse, "sample", late)
+    start = time.perf_counter()
+    result = planner.plan(PROBLEM, time_limit=0.2)
+    assert result.path is not None and verify(PROBLEM, result.path).valid
+    (first, longest), *_, (_, shortest) = result.progress
+    assert first < began[0] and result.path.length == pytest.approx(shortest) and shortest <= longest
 
 
 def test_a_candidate_that_the_judge_refuses_is_not_returned(planner, monkeypatch):

@@ -1,8 +1,9 @@
 """RobotDiffuse: the paper's diffusion model, and around it what makes its motions dependable.
 
-The straight line if it is free; else a batch of trajectories sampled by the diffusion model under collision
-guidance; else the same trajectories after more gradient steps (refinement); else search. Everything goes
-through the judge, and the result names the stage that its path comes from.
+The straight line if it is free. Else a quick search for a path to fall back on, within milliseconds; then a
+batch of trajectories sampled by the diffusion model under collision guidance, or, where none of them is free,
+the same after more gradient steps (refinement). The shortest of all is the answer; where there is none, a
+longer search. Everything goes through the judge, and the result names the stage that its path comes from.
 """
 
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from robotdiffuse.planners.rrt_connect import RRTConnect, RRTConnectSettings, ra
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
-from robotdiffuse.types import PlanResult
+from robotdiffuse.types import Path, PlanResult
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,15 @@ class RobotDiffuse:
         ends = usable_ends(call, rng)
         if isinstance(ends, PlanResult):
             return ends
+        search = RRTConnect(self.settings.search)
         result = self._straight(call, ends)
         if result is None and model is not None:
-            result = self._learned(call, ends, model, rng)
-        return result or RRTConnect(self.settings.search).search(call, ends)
+            quick = search.first(call, ends)
+            if quick is not None:
+                call.improved(quick.length)
+            candidates = self._learned(call, ends, model, rng)
+            result = self._best(call, ends, candidates, quick)
+        return result or search.search(call, ends)
 
     def _straight(self, call: Call, ends: Ends) -> PlanResult | None:
         """The straight line to the nearest goal that it reaches: no path could be shorter."""
@@ -145,17 +151,14 @@ class RobotDiffuse:
                     return result
         return None
 
-    def _learned(
-        self, call: Call, ends: Ends, model: MotionModel, rng: np.random.Generator
-    ) -> PlanResult | None:
+    def _learned(self, call: Call, ends: Ends, model: MotionModel, rng: np.random.Generator) -> Candidates:
         checker = ends.checker
         start, goals = ends.rows()
         code = encode(model, checker, self.settings.points, rng)
         sampled = self.sample(model, checker, code, start, goals, rng)
-        result = self._best(call, ends, sampled)
-        if result is None and call.remaining > 0:
-            result = self._best(call, ends, self.refine(checker, sampled.q))
-        return result
+        if sampled.free.any() or call.remaining <= 0:
+            return sampled
+        return self.refine(checker, sampled.q)
 
     def sample(
         self,
@@ -209,18 +212,22 @@ class RobotDiffuse:
         q = np.ascontiguousarray(q, np.float32)
         return Candidates(q, np.array([kernel.motions_free(space, path).all() for path in q]), stage)
 
-    def _best(self, call: Call, ends: Ends, candidates: Candidates) -> PlanResult | None:
-        """The shortest of the free candidates that passes the judge, after shortcuts."""
+    def _best(self, call: Call, ends: Ends, candidates: Candidates, quick: Path | None) -> PlanResult | None:
+        """The shortest that passes the judge of the free candidates, after shortcuts, and the quick path."""
         clearance = ends.kept_clearance(self.settings.search.clearance)
         space = search_space(ends.checker, self.settings.resolution, clearance)
         state = random_state(call.seed)
         paths = sorted(candidates.q[candidates.free], key=kernel.path_length)[: self.settings.shortened]
         short = [kernel.shortcut(space, path, self.settings.shortcuts, state) for path in paths]
-        for path in sorted(short, key=kernel.path_length):
-            result = call.finish(ends.complete(path), candidates.stage)
+        names = call.problem.robot.joint_names
+        found = [(Path(names, ends.complete(path)), candidates.stage) for path in short]
+        if quick is not None:
+            found.append((quick, RRTConnect.name))
+        for path, stage in sorted(found, key=lambda one: one[0].length):
+            result = call.finish(path.positions, stage)
             if result is not None:
                 return result
-            if call.remaining <= 0:
+            if call.remaining <= 0 and quick is None:
                 return None
         return None
 

@@ -14,7 +14,8 @@ from robotdiffuse.planners.ends import Ends, usable_ends
 from robotdiffuse.problem import Problem
 from robotdiffuse.robots.reach import motion_radii
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.types import PlanResult
+from robotdiffuse.types import Path, PlanResult
+from robotdiffuse.verify import VerifySettings, verifier
 
 FINEST = 0.002
 """Least distance between two checks of a motion that is searched with [m]."""
@@ -101,6 +102,14 @@ class RRTConnect:
         ends = usable_ends(call, np.random.default_rng(seed))
         return ends if isinstance(ends, PlanResult) else self.search(call, ends)
 
+    def first(self, call: Call, ends: Ends) -> Path | None:
+        """A path that passes the judge, its motion not yet timed; None if ITERATIONS iterations find none."""
+        found = _Search(call, ends, self.settings, 0).shortened(call.elapsed)
+        if found is None:
+            return None
+        path = Path(call.problem.robot.joint_names, ends.complete(found))
+        return path if verifier(call.problem, VerifySettings()).path(path).valid else None
+
     def search(self, call: Call, ends: Ends) -> PlanResult:
         """Search until a path passes the judge or time runs out; for planners that have begun a call."""
         settings = self.settings
@@ -128,19 +137,19 @@ class _Search:
 
     def best(self) -> Float[ndarray, "n dof"] | None:
         """The first path, or the shortest after restarts for as long as the settings say."""
-        best = self._shortened(self.call.time_limit)
+        best = self.shortened(self.call.time_limit)
         if best is None:
             return None
         until = min(self.call.elapsed + self.settings.optimize_time, self.call.time_limit)
         while self.call.elapsed < until:
-            other = self._shortened(until)
+            other = self.shortened(until)
             if other is not None:
                 if kernel.path_length(other) < kernel.path_length(best):
                     best = other
                 best = kernel.shortcut(self.space, best, self.settings.shortcuts, self.state)
         return best
 
-    def _shortened(self, until: float) -> Float[ndarray, "n dof"] | None:
+    def shortened(self, until: float) -> Float[ndarray, "n dof"] | None:
         """The shortest of some paths, shortened; None if the first of them takes until `until` [s]."""
         best: ndarray | None = None
         for _ in range(self.settings.searches):
