@@ -58,11 +58,12 @@ baselines: .venv/dev.stamp
 MBM ?=
 comma := ,
 SETS = rop,rop_dense$(if $(MBM),$(comma)$(MBM))
-RUN = $(BIN)/robotdiffuse bench run --planners all --out runs/table1 --problems
+RUN = $(BIN)/robotdiffuse bench run --out runs/table1 --problems $(SETS)
 
 table1: .venv/dev.stamp
-	$(RUN) $(SETS) --count 300 --time-limit 1
-	$(RUN) $(SETS) --count 30 --time-limit 10
+	$(RUN) --planners all --count 300 --time-limit 1
+	$(RUN) --planners all --count 60 --time-limit 10
+	$(RUN) --planners ompl_rrt_star,ompl_informed_rrt_star,ompl_bit_star --count 8 --time-limit 60
 	$(BIN)/robotdiffuse bench confirm runs/table1
 	$(BIN)/robotdiffuse bench report runs/table1
 

@@ -46,10 +46,12 @@ def confirm(
         if record.solved:
             by_case.setdefault((record.problem_set, record.name), []).append(record)
     sets = sorted({record.problem_set for record in records})
-    cases = {case.key: case for name in sets for case in read_cases(out, name)[:count]}
-    lost = [key for key in by_case if count is None and key not in cases]
+    kept = {name: read_cases(out, name) for name in sets}
+    known = {case.key for of in kept.values() for case in of}
+    lost = [key for key in by_case if key not in known]
     if lost:
         raise InputError(f"{out}/problems lacks {lost[0][1]} of {lost[0][0]}, which has results")
+    cases = {case.key: case for of in kept.values() for case in of[:count]}
     by_case = {key: by_case[key] for key in cases if key in by_case}
     robots: Robots = {}
     checked = {record.planner: 0 for record in records}
