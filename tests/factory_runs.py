@@ -11,7 +11,10 @@ from pathlib import Path
 from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.shard_maker import Arrays, Counts, make_shard
 
-COMMAND = (sys.executable, "-c", "import sys; from robotdiffuse.cli import main; sys.exit(main())")
+HEARS_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+"""Where a shell starts the tests in the background, they and their children would ignore it."""
+RUN = "from robotdiffuse.cli import main; raise SystemExit(main())"
+COMMAND = (sys.executable, "-c", f"{HEARS_CTRL_C}; {RUN}")
 
 
 def in_this_process(
@@ -45,7 +48,7 @@ def shards(out: Path) -> int:
     return len(list(out.glob("shard_*.zarr")))
 
 
-def wait_for_shards(run: subprocess.Popen[str], out: Path, count: int, seconds: float = 60.0) -> None:
+def wait_for_shards(run: subprocess.Popen[str], out: Path, count: int, seconds: float = 300.0) -> None:
     """Until the folder holds so many shards, or the command has ended."""
     end = time.monotonic() + seconds
     while shards(out) < count and run.poll() is None:
@@ -53,7 +56,7 @@ def wait_for_shards(run: subprocess.Popen[str], out: Path, count: int, seconds: 
         time.sleep(0.005)
 
 
-def group_ends(group: int, seconds: float = 30.0) -> bool:
+def group_ends(group: int, seconds: float = 120.0) -> bool:
     """Whether all processes of a group end within a time."""
     end = time.monotonic() + seconds
     while members(group):

@@ -69,7 +69,7 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
     far_side = sys.executable, str(Path(faulty_planner.__file__))
     monkeypatch.setattr(planner_process, "FAR_SIDE", far_side)
-    monkeypatch.setattr(planner_process, "PATIENCE", 8.0)
+    monkeypatch.setattr(planner_process, "PATIENCE", 20.0)
     monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
 
 
@@ -81,7 +81,7 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) 
     assert found[faulty_planner.SOLVES].solved and found[faulty_planner.TALKS].solved
     assert found[faulty_planner.RAISES].status == "exception"
     assert found[faulty_planner.RAISES].reason == "ValueError: no such thing"
-    assert found[faulty_planner.DIES].status == "crashed" and "SIGABRT" in found[faulty_planner.DIES].reason
+    assert found[faulty_planner.DIES].status == "crashed" and "SIGKILL" in found[faulty_planner.DIES].reason
     assert found[faulty_planner.HANGS].status == "overran"
     log = (tmp_path / "logs" / "faulty.log").read_text()
     assert "about to die" in log and "this is no answer" in log and "ValueError" in log
@@ -104,7 +104,7 @@ def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Pat
     command = [sys.executable, "-m", "robotdiffuse", *arguments]
     run = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
     first = tmp_path / "records" / "rrt_connect.jsonl"
-    until = time.monotonic() + 120
+    until = time.monotonic() + 400
     while not (first.is_file() and first.read_text().count("\n") >= 2):
         assert run.poll() is None and time.monotonic() < until
         time.sleep(0.02)

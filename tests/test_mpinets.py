@@ -189,7 +189,8 @@ def test_solved_means_verified(goal: "np.ndarray | PoseGoal") -> None:
 @pytest.mark.usefixtures("straight_weights")
 def test_a_path_in_collision_is_no_result() -> None:
     problem = Problem(PANDA, Scene([Box(WALL[:3], WALL[3:6])]), LEFT, RIGHT)
-    result = MPiNets().plan(problem, 0.5, 1)
+    MPiNets().plan(problem, 0.1, 1)  # compiles and loads
+    result = MPiNets().plan(problem, 2.0, 1)
     assert result.status is Status.TIMEOUT and result.path is None
     assert result.refused == "scene_collision"
     assert "not free of collision" in result.reason

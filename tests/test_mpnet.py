@@ -263,7 +263,7 @@ def test_solved_means_verified(weights: str, hybrid: bool) -> None:
 def test_hybrid_replanning_joins_what_the_network_does_not(weights: str) -> None:
     problem = wall_problem()
     settings = MPNetPlannerSettings(weights, attempts=1, steps=1, replanning=0, hybrid=True)
-    result = MPNet(settings).plan(problem, 20.0)
+    result = MPNet(settings).plan(problem, 120.0)
     assert result.solved and "RRT-Connect" in result.reason
 
 

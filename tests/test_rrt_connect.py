@@ -147,7 +147,7 @@ def test_no_way_through_times_out():
     checker = CollisionChecker(PANDA, SEALED)
     assert checker.free(np.stack([LEFT, RIGHT])).all()
     result = RRTConnect().plan(Problem(PANDA, SEALED, LEFT, JointGoal(RIGHT[None])), time_limit=0.3)
-    assert result.status is Status.TIMEOUT and result.path is None and "0.3" in result.reason
+    assert result.status is Status.TIMEOUT and result.path is None and "no path was found in" in result.reason
 
 
 @pytest.mark.parametrize(

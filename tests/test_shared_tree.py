@@ -236,7 +236,7 @@ def test_solved_means_verified(family, index) -> None:
 
 def test_the_same_seed_gives_the_same_path() -> None:
     problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
-    first, second = (load_planner("shared_tree_rrt_star").plan(problem, 20.0, seed=4) for _ in range(2))
+    first, second = (load_planner("shared_tree_rrt_star").plan(problem, 120.0, seed=4) for _ in range(2))
     assert first.path is not None and second.path is not None
     assert np.array_equal(first.path.positions, second.path.positions)
 

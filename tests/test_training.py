@@ -178,7 +178,7 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
     settings = planner_settings(data, samples=160, gradient_norm=1e6, validation_problems=1, device="cpu")
     launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
     run = start("two", settings, out, *launcher)
-    said = run.communicate()[0]
+    said = run.communicate(timeout=500)[0]
     assert run.returncode == 0, said
     assert said.count("planner: 100.0%, 160 samples") == 2, "the first process alone reports"
     first, second = json.loads((out / "seen.json").read_text())

@@ -19,7 +19,7 @@ from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraini
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.run import TrainingRun, Validation
 
-STEP_SECONDS = 0.1
+STEP_SECONDS = 0.3
 STOP_AFTER = 3
 
 

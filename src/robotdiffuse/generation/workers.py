@@ -28,6 +28,8 @@ Made = Generator[tuple[int, tuple[Arrays, Counts]], None, None]
 PACKAGES = ("numpy", "numba", "zarr")
 CONNECT_SECONDS = 5.0
 """Until a Ray cluster that does not answer is given up; Ray itself tries for minutes."""
+GONE_SECONDS = 5.0
+"""Until a process that was told to end is not waited for any more."""
 LOST_NODES = 20
 """Times that a shard is begun again on another node of a Ray cluster."""
 GO_ON = "what is finished is kept, the same command goes on"
@@ -88,6 +90,8 @@ def stop_pool(pool: ProcessPoolExecutor, patience: float = 0.0) -> None:
         process.join(max(until - time.monotonic(), 0.0))
         if patience > 0 and process.is_alive():
             process.kill()
+    for process in processes:
+        process.join(GONE_SECONDS)
 
 
 def prepare_worker() -> None:

@@ -135,8 +135,7 @@ class RobotDiffuse:
             quick = search.first(call, ends)
             if quick is not None:
                 call.improved(quick.length)
-            candidates = self._learned(call, ends, model, rng)
-            result = self._best(call, ends, candidates, quick)
+            result = self._learned(call, ends, model, rng, quick)
         return result or search.search(call, ends)
 
     def _straight(self, call: Call, ends: Ends) -> PlanResult | None:
@@ -151,14 +150,21 @@ class RobotDiffuse:
                     return result
         return None
 
-    def _learned(self, call: Call, ends: Ends, model: MotionModel, rng: np.random.Generator) -> Candidates:
-        checker = ends.checker
+    def _learned(
+        self, call: Call, ends: Ends, model: MotionModel, rng: np.random.Generator, quick: Path | None
+    ) -> PlanResult | None:
+        """The shortest motion of the network's and the quick path, or the quick path if time is over."""
+        if call.remaining <= 0 and quick is not None:
+            return call.finish(quick.positions, RRTConnect.name)
         start, goals = ends.rows()
-        code = encode(model, checker, self.settings.points, rng)
-        sampled = self.sample(model, checker, code, start, goals, rng)
-        if sampled.free.any() or call.remaining <= 0:
-            return sampled
-        return self.refine(checker, sampled.q)
+        code = encode(model, ends.checker, self.settings.points, rng)
+        sampled = self.sample(model, ends.checker, code, start, goals, rng)
+        result = self._best(call, ends, sampled, quick) if sampled.free.any() else None
+        if result is None and call.remaining > 0:
+            result = self._best(call, ends, self.refine(ends.checker, sampled.q), quick)
+        if result is None and quick is not None:
+            result = call.finish(quick.positions, RRTConnect.name)
+        return result
 
     def sample(
         self,

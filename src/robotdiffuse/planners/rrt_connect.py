@@ -103,7 +103,10 @@ class RRTConnect:
         return ends if isinstance(ends, PlanResult) else self.search(call, ends)
 
     def first(self, call: Call, ends: Ends) -> Path | None:
-        """A path that passes the judge, its motion not yet timed; None if ITERATIONS iterations find none."""
+        """A path that passes the judge, its motion not yet timed.
+
+        None if ITERATIONS iterations find none, or the judge refuses it.
+        """
         found = _Search(call, ends, self.settings, 0).shortened(call.elapsed)
         if found is None:
             return None

@@ -76,6 +76,7 @@ class PlannerProcess:
         self._planner, self._log = planner, log
         self._process: subprocess.Popen[bytes] | None = None
         self._unread = b""
+        self._closed = False
 
     def plan(self, problem: dict[str, Any], seed: int, time_limit: float) -> dict[str, Any]:
         """The answer to a task, as fields of a record; a death or an overrun is an answer too."""
@@ -83,6 +84,8 @@ class PlannerProcess:
         process = self._process
         if process is None or process.poll() is not None:
             process = self._process = self._start()
+            if self._closed:  # by another thread, which did not see this process
+                process.kill()
             if self._answer(process, START_SECONDS) is None:
                 return self._ended(process, START_SECONDS)
         assert process.stdin is not None
@@ -92,14 +95,15 @@ class PlannerProcess:
         except BrokenPipeError:
             return self._ended(process, 0.0)
         # a robot that is new to the process is warmed up first
+        if self._answer(process, START_SECONDS) is None:
+            return self._ended(process, START_SECONDS)
         patience = time_limit + PATIENCE
-        answer = self._answer(process, START_SECONDS)
-        if answer is not None:
-            answer = self._answer(process, patience)
+        answer = self._answer(process, patience)
         return self._ended(process, patience) if answer is None else json.loads(answer)
 
     def close(self) -> None:
-        """End the process."""
+        """End the process, whatever another thread waits for."""
+        self._closed = True
         if self._process is not None:
             self._process.kill()
             self._process.wait()

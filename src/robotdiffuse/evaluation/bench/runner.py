@@ -4,6 +4,7 @@ import json
 import os
 import platform
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -98,11 +99,12 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
             calls = 0
             wanting = {contestants[name]: found for name, found in tasks.items() if found}
             made = on_this_machine(wanting, settings.workers, logs) if local else on_ray(wanting, logs)
-            for record in made:
-                files[record.planner].append(record)
-                calls += 1
-                left[record.planner] -= 1
-                done(record.planner, wanted - left[record.planner], wanted)
+            with closing(made):  # a Ctrl-C here ends the planners too
+                for record in made:
+                    files[record.planner].append(record)
+                    calls += 1
+                    left[record.planner] -= 1
+                    done(record.planner, wanted - left[record.planner], wanted)
             return calls
         finally:
             for file in files.values():

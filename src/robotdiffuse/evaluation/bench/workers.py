@@ -1,7 +1,7 @@
 """Who makes a bench's calls: processes of this machine, or a Ray cluster. Either yields records."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -41,7 +41,9 @@ def record_of(planner: Contestant, task: Task, answer: dict[str, Any]) -> Record
     return record_from_json(about | answer)
 
 
-def on_this_machine(tasks: dict[Contestant, list[Task]], workers: int, logs: FilePath) -> Iterator[Record]:
+def on_this_machine(
+    tasks: dict[Contestant, list[Task]], workers: int, logs: FilePath
+) -> Generator[Record, None, None]:
     """Calls by a process for each planner, `workers` of them at a time; what they print goes to `logs`."""
     stop, news, ready = threading.Event(), threading.Condition(), list[Record]()
     processes: list[PlannerProcess] = []
@@ -77,7 +79,7 @@ def on_this_machine(tasks: dict[Contestant, list[Task]], workers: int, logs: Fil
         pool.shutdown(cancel_futures=True)
 
 
-def on_ray(tasks: dict[Contestant, list[Task]], logs: FilePath) -> Iterator[Record]:
+def on_ray(tasks: dict[Contestant, list[Task]], logs: FilePath) -> Generator[Record, None, None]:
     """Calls in portions, each by a process of its own on a node of a Ray cluster; see `ray_cluster`.
 
     The nodes need this package, and weights and files at the same places.
