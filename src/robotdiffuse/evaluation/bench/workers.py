@@ -13,6 +13,7 @@ from robotdiffuse.evaluation.bench.problem_sets import Case
 from robotdiffuse.evaluation.bench.records import Record, record_from_json
 from robotdiffuse.generation.workers import ray_cluster
 
+Made = Generator[Record, None, None]
 CHUNK = 20
 """Calls of one planner that a node of a cluster makes in one go, with one start of the process."""
 
@@ -41,9 +42,7 @@ def record_of(planner: Contestant, task: Task, answer: dict[str, Any]) -> Record
     return record_from_json(about | answer)
 
 
-def on_this_machine(
-    tasks: dict[Contestant, list[Task]], workers: int, logs: FilePath
-) -> Generator[Record, None, None]:
+def on_this_machine(tasks: dict[Contestant, list[Task]], workers: int, logs: FilePath) -> Made:
     """Calls by a process for each planner, `workers` of them at a time; what they print goes to `logs`."""
     stop, news, ready = threading.Event(), threading.Condition(), list[Record]()
     processes: list[PlannerProcess] = []
@@ -79,7 +78,7 @@ def on_this_machine(
         pool.shutdown(cancel_futures=True)
 
 
-def on_ray(tasks: dict[Contestant, list[Task]], logs: FilePath) -> Generator[Record, None, None]:
+def on_ray(tasks: dict[Contestant, list[Task]], logs: FilePath) -> Made:
     """Calls in portions, each by a process of its own on a node of a Ray cluster; see `ray_cluster`.
 
     The nodes need this package, and weights and files at the same places.
