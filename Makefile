@@ -63,7 +63,7 @@ RUN = $(BIN)/robotdiffuse bench run --out runs/table1 --problems $(SETS)
 table1: .venv/dev.stamp
 	$(RUN) --planners all --count 300 --time-limit 1
 	$(RUN) --planners all --count 60 --time-limit 10
-	$(RUN) --planners ompl_rrt_star,ompl_informed_rrt_star,ompl_bit_star --count 8 --time-limit 60
+	$(RUN) --planners ompl_rrt_star,ompl_informed_rrt_star,ompl_bit_star --count 5 --time-limit 60
 	$(BIN)/robotdiffuse bench confirm runs/table1
 	$(BIN)/robotdiffuse bench report runs/table1
 

@@ -36,15 +36,14 @@ def filled_meanwhile(folder: str, workers: int, robot: str) -> Iterator[None]:
             time.sleep(POLL)
         yield
         return
+    from robotdiffuse.generation.workers import interrupts_not_passed_on
+
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     factory = context.Process(target=_fill, args=(folder, workers, robot, theirs))
-    # Ctrl-C is for this process, which then ends the factory: it never hears it, see `_fill`
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
+    # Ctrl-C is for this process, which then ends the factory
+    with interrupts_not_passed_on():
         factory.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     theirs.close()
     try:
         _wait_for_shard(folder, ours)

@@ -14,6 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,7 @@ def on_this_machine(settings: GenerationSettings, indices: list[int], workers: i
         while queue or running:
             while queue and len(running) < workers + 1:
                 index = queue.pop()
-                with _interrupts_not_passed_on():
+                with interrupts_not_passed_on():
                     running[pool.submit(make_shard, settings, index)] = index
             for job in wait(running, return_when=FIRST_COMPLETED).done:
                 yield running.pop(job), job.result()
@@ -67,11 +68,12 @@ def on_this_machine(settings: GenerationSettings, indices: list[int], workers: i
 
 
 @contextmanager
-def _interrupts_not_passed_on() -> Iterator[None]:
+def interrupts_not_passed_on() -> Iterator[None]:
     """Ctrl-C never reaches processes that are started meanwhile: they inherit the signal mask.
 
     So it is the parent alone that handles it, even while workers are still importing.
     """
+    resource_tracker.ensure_running()  # the first process starts it, which would lift the mask again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -18,6 +18,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.data.rows import path_of, pick_rows, problem_of, scene_of
+from robotdiffuse.generation.workers import prepare_worker
 from robotdiffuse.learning.data.shards import (
     Manifest,
     Shard,
@@ -186,9 +187,7 @@ class _Processes:
     def __init__(self, workers: int) -> None:
         self._pool = None
         if workers > 1:
-            self._pool = ProcessPoolExecutor(
-                workers, multiprocessing.get_context("spawn"), _leave_interrupts_to_the_parent
-            )
+            self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _prepare)
 
     def __enter__(self) -> "_Processes":
         return self
@@ -201,8 +200,10 @@ class _Processes:
         return map(call, items) if self._pool is None else self._pool.map(call, items)
 
 
-def _leave_interrupts_to_the_parent() -> None:
+def _prepare() -> None:
+    """A worker leaves Ctrl-C to its parent, and ends with it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    prepare_worker()
 
 
 @dataclass(frozen=True)
