@@ -135,7 +135,10 @@ class RobotDiffuse:
             quick = search.first(call, ends)
             if quick is not None:
                 call.improved(quick.length)
-            result = self._learned(call, ends, model, rng, quick)
+            if call.remaining > 0 or quick is None:
+                result = self._learned(call, ends, model, rng, quick)
+            if result is None and quick is not None:
+                result = call.finish(quick.positions, search.name)
         return result or search.search(call, ends)
 
     def _straight(self, call: Call, ends: Ends) -> PlanResult | None:
@@ -153,17 +156,13 @@ class RobotDiffuse:
     def _learned(
         self, call: Call, ends: Ends, model: MotionModel, rng: np.random.Generator, quick: Path | None
     ) -> PlanResult | None:
-        """The shortest motion of the network's and the quick path, or the quick path if time is over."""
-        if call.remaining <= 0 and quick is not None:
-            return call.finish(quick.positions, RRTConnect.name)
+        """The shortest of the network's motions and the quick path; None if none passes in time."""
         start, goals = ends.rows()
         code = encode(model, ends.checker, self.settings.points, rng)
         sampled = self.sample(model, ends.checker, code, start, goals, rng)
         result = self._best(call, ends, sampled, quick) if sampled.free.any() else None
         if result is None and call.remaining > 0:
             result = self._best(call, ends, self.refine(ends.checker, sampled.q), quick)
-        if result is None and quick is not None:
-            result = call.finish(quick.positions, RRTConnect.name)
         return result
 
     def sample(

@@ -114,17 +114,16 @@ def write_plots(bench: Bench, parts: Sequence[Section], folder: FilePath) -> lis
 
     Raises InputError as `write_page`.
     """
-    files = []
-    for section in parts:
-        if section.curves:
+    planners, drawn = list(bench.records), {}
+    with look.style():
+        for section in (section for section in parts if section.curves):
             name = "_".join(re.findall(r"\w+", section.name))
-            for kind, draw in (("success", plots.success_over_time), ("length", plots.length_over_time)):
-                with look.style():
-                    drawn = draw(section, list(bench.records))
-                on_white = drawn.replace("<svg ", '<svg style="background: white" ', 1)  # the ink is dark
-                files.append(f"{kind}_{name}.svg")
-                write_atomically(folder / files[-1], on_white)
-    return files
+            drawn[f"success_{name}.svg"] = plots.success_over_time(section, planners)
+            drawn[f"length_{name}.svg"] = plots.length_over_time(section, planners)
+    for file, svg in drawn.items():
+        # the ink is dark
+        write_atomically(folder / file, svg.replace("<svg ", '<svg style="background: white" ', 1))
+    return list(drawn)
 
 
 def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
