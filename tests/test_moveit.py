@@ -13,9 +13,16 @@ import yaml
 from robotdiffuse.errors import InputError
 from robotdiffuse.problem import JointGoal, PoseGoal
 from robotdiffuse.problem_files import load_motion_bench_maker, load_problems
-from robotdiffuse.robots import load_robot
+from robotdiffuse.robots import Robot, load_robot
+from robotdiffuse.robots.add import add_robot
 from robotdiffuse.scenes.files import read_yaml
-from robotdiffuse.scenes.moveit import moveit_frames, moveit_request, moveit_scene, read_moveit_scene
+from robotdiffuse.scenes.moveit import (
+    MoveItFrames,
+    moveit_frames,
+    moveit_request,
+    moveit_scene,
+    read_moveit_scene,
+)
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
 from robotdiffuse.transforms import rotation_about, rotation_from_quaternion
 
@@ -123,9 +130,61 @@ def test_poses_compose_from_the_base_outwards() -> None:
     assert isinstance(shape, Sphere)
     np.testing.assert_allclose(shape.center, expected, atol=1e-12)
     data["world"]["collision_objects"][0]["header"]["frame_id"] = "panda_link0"
-    [shape] = moveit_scene(data, moveit_frames(data, "panda_link0"), Path()).shapes
+    [shape] = moveit_scene(data, moveit_frames(data, load_robot("panda")), Path()).shapes
     assert isinstance(shape, Sphere)
     np.testing.assert_allclose(shape.center, np.array([0, 2.0, 0]) + turn @ in_object, atol=1e-12)
+
+
+MOUNTED = """<robot name="mounted">
+  <link name="world"/><link name="stand"/>
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="arm"><collision><origin xyz="0.3 0 0"/><geometry><box size="0.4 0.05 0.05"/></geometry></collision>
+  </link>
+  <joint name="mount" type="fixed"><parent link="world"/><child link="stand"/>
+    <origin xyz="1 2 0.5" rpy="0 0 1.5707963267948966"/></joint>
+  <joint name="rail" type="{kind}"><parent link="stand"/><child link="base"/><origin xyz="0 0 0.3"/>
+    <axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
+</robot>"""
+"""An arm on a stand in the world: its base is not the root of the URDF."""
+
+
+def mounted(folder: Path, kind: str) -> Robot:
+    (folder / "mounted.urdf").write_text(MOUNTED.format(kind=kind))
+    return add_robot(folder / "mounted.urdf", base="base", out=folder / "mounted").robot
+
+
+def test_scene_in_the_world_of_a_robot_whose_base_is_not_its_root(tmp_path: Path) -> None:
+    """`robot add --base` once dropped the transform between them: verified motions met obstacles by 8 cm."""
+    robot = mounted(tmp_path, "fixed")
+    in_base = np.array([0.5, 0.0, 0.1])
+    turn = rotation_about(Z, np.pi / 2)
+    in_world = turn @ in_base + [1, 2, 0.8]
+    for frame, at in {
+        "": in_world,
+        "world": in_world,
+        "stand": in_base + [0, 0, 0.3],
+        "base": in_base,
+    }.items():
+        pose = {"position": at.tolist(), "orientation": [0, 0, 0, 1]}
+        data = scene_data(**ball(header={"frame_id": frame}, primitive_poses=[pose]))
+        [shape] = moveit_scene(data, moveit_frames(data, robot), tmp_path).shapes
+        assert isinstance(shape, Sphere)
+        np.testing.assert_allclose(shape.center, in_base, atol=1e-9, err_msg=frame)
+
+
+def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_path: Path) -> None:
+    robot = mounted(tmp_path, "prismatic")
+    data = scene_data(**ball(header={"frame_id": "world"}))
+    data["fixed_frame_transforms"] = [
+        {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"}
+    ]
+    with pytest.raises(InputError, match="a joint moves base in world"):
+        moveit_scene(data, moveit_frames(data, robot), tmp_path)
+    data = scene_data(**ball(header={"frame_id": "base"}))
+    [shape] = moveit_scene(data, moveit_frames(data, robot), tmp_path).shapes
+    assert isinstance(shape, Sphere) and shape.center.tolist() == [1, 0, 0]
 
 
 def test_pose_of_the_object_alone_is_enough() -> None:
@@ -224,7 +283,7 @@ def test_pose_goal(tmp_path: Path) -> None:
     assert isinstance(goal, PoseGoal) and goal.frame == "panda_hand"
     np.testing.assert_allclose(goal.T_base_frame[:3, 3], [0.4, 0, 0.5])
     np.testing.assert_allclose(goal.T_base_frame[:3, :3], np.diag([1.0, -1, -1]), atol=1e-12)
-    link, T = moveit_request(data, {"": np.diag([-1.0, -1, 1, 1])}).pose_goal or ("", np.eye(4))
+    link, T = moveit_request(data, MoveItFrames(None, np.diag([-1.0, -1, 1, 1]))).pose_goal or ("", np.eye(4))
     assert link == "panda_hand"
     np.testing.assert_allclose(T[:3, 3], [-0.4, 0, 0.5])
     flipped = np.diag([-1.0, -1, 1]) @ rotation_from_quaternion(np.array([0.0, 1, 0, 0]))

@@ -196,7 +196,7 @@ def _moveit_problem(scene_file: Path, robot: Robot | None, robots: Robots) -> Pr
         if robot is None:
             robot_name = data.get("robot_model_name") if isinstance(data, dict) else None
             robot = _robot(robot_name, {}, scene_file.parent, robots)
-        frames = moveit_frames(data, robot.base)
+        frames = moveit_frames(data, robot)
         scene = moveit_scene(data, frames, scene_file.parent)
         where = request_file
         return _requested(robot, scene, moveit_request(read_yaml(request_file), frames), robots)
@@ -239,11 +239,11 @@ def _problem(where: str, data: object, folder: Path, robots: Robots) -> Problem:
             "problem", data, ("robot", "scene", "request") if requested else FIELDS, ("locked",)
         )
         robot = _robot(values["robot"], values.get("locked", {}), folder, robots)
-        frames, notes = moveit_frames({}, robot.base), ()
+        frames, notes = moveit_frames({}, robot), ()
         if isinstance(values["scene"], str):
             file = folder / values["scene"]
             content = read_yaml(file)
-            frames = moveit_frames(content, robot.base)
+            frames = moveit_frames(content, robot)
             scene = moveit_scene(content, frames, file.parent)
         else:
             scene, notes = read_scene(values["scene"], folder)

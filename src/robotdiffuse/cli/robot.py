@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING
 from robotdiffuse.cli.arguments import assignment, natural
 
 if TYPE_CHECKING:
+    from jaxtyping import Float
+    from numpy import ndarray
+
     from robotdiffuse.robots.robot import Robot
 
 
@@ -94,6 +97,8 @@ def print_robot(robot: "Robot") -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from robotdiffuse.transforms import inverse
+
     console = Console()
     headings = ("joint", "kind", "lower", "upper", "velocity", "accel.", "jerk")
     joints = Table(*headings, title=robot.name, title_justify="left")
@@ -105,6 +110,9 @@ def print_robot(robot: "Robot") -> None:
     meshes = sum(len(pieces) for pieces in robot.meshes.values())
     table = Table(show_header=False)
     table.add_row("base, tip", escape(f"{robot.base}, {robot.tip}"))
+    if robot.root not in ("", robot.base):
+        at = "on a joint that moves it" if robot.T_base_root is None else _place(inverse(robot.T_base_root))
+        table.add_row(f"base in {escape(robot.root)}", at)
     table.add_row("links", str(len(robot.link_names)))
     table.add_row(
         "collision model", f"{spheres} spheres on {len(robot.spheres)} links, {meshes} convex meshes"
@@ -115,3 +123,10 @@ def print_robot(robot: "Robot") -> None:
     for note in robot.notes:
         table.add_row("note", escape(note))
     console.print(table)
+
+
+def _place(T: "Float[ndarray, '4 4']") -> str:
+    from robotdiffuse.transforms import quaternion_from_rotation
+
+    xyz, wxyz = T[:3, 3], quaternion_from_rotation(T[:3, :3])
+    return " ".join(["xyz", *(f"{value:g}" for value in xyz), "wxyz", *(f"{value:.4g}" for value in wxyz)])

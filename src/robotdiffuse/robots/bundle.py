@@ -14,7 +14,8 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
-FORMAT = 1
+FORMAT = 2
+"""2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""
 ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
@@ -74,6 +75,8 @@ def _to_json(robot: Robot, source: dict[str, str]) -> dict:
         "units": "metres, radians, seconds; quaternions wxyz; spheres are x y z radius in the link's frame",
         "base": robot.base,
         "tip": robot.tip,
+        "root": robot.root or robot.base,
+        "above": {link: _pose_to_json(T_base_link) for link, T_base_link in robot.above.items()},
         "locked": robot.locked,
         "joints": [_joint_to_json(joint) for joint in robot.joints],
         "spheres": {link: np.round(spheres, 6).tolist() for link, spheres in robot.spheres.items()},
@@ -83,18 +86,20 @@ def _to_json(robot: Robot, source: dict[str, str]) -> dict:
 
 
 def _joint_to_json(joint: Joint) -> dict:
-    T = joint.T_parent_joint
     data = {
         "name": joint.name,
         "kind": joint.kind,
         "parent": joint.parent,
         "child": joint.child,
-        "xyz": T[:3, 3].tolist(),
-        "wxyz": quaternion_from_rotation(T[:3, :3]).tolist(),
+        **_pose_to_json(joint.T_parent_joint),
     }
     if joint.kind in MOVING_KINDS:
         data |= {"axis": joint.axis.tolist()} | {name: getattr(joint, name) for name in LIMITS}
     return data
+
+
+def _pose_to_json(T: Float[ndarray, "4 4"]) -> dict[str, list[float]]:
+    return {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}
 
 
 def _dump(data: dict) -> str:
@@ -144,14 +149,14 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
         allowed_collisions=frozenset(frozenset(map(str, pair)) for pair in data["allowed_collisions"]),
         locked={str(name): float(value) for name, value in data["locked"].items()},
         notes=tuple(map(str, data["notes"])),
+        root=str(data["root"]),
+        above={str(link): _pose_from_json(pose, f"above: {link}") for link, pose in data["above"].items()},
     )
 
 
 def _joint_from_json(data: dict) -> Joint:
     name, kind = str(data["name"]), str(data["kind"])
-    xyz = _array([data["xyz"]], 3, f"joint {name}: xyz")[0]
-    wxyz = _array([data["wxyz"]], 4, f"joint {name}: wxyz")[0]
-    T = transform(xyz, rotation_from_quaternion(wxyz))
+    T = _pose_from_json(data, f"joint {name}")
     if kind == "fixed":
         return Joint(name, kind, str(data["parent"]), str(data["child"]), T, np.array([0.0, 0.0, 1.0]))
     if kind not in MOVING_KINDS:
@@ -173,6 +178,12 @@ def _joint_from_json(data: dict) -> Joint:
         acceleration,
         jerk,
     )
+
+
+def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:
+    xyz = _array([data["xyz"]], 3, f"{what}: xyz")[0]
+    wxyz = _array([data["wxyz"]], 4, f"{what}: wxyz")[0]
+    return transform(xyz, rotation_from_quaternion(wxyz))
 
 
 def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:

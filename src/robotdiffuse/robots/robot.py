@@ -74,12 +74,22 @@ class Robot:
     """Values of the movable joints that planning holds [rad] or [m]."""
     notes: tuple[str, ...] = ()
     """What the reader of the URDF changed or ignored."""
+    root: str = ""
+    """Root link of the URDF; the base if it is empty."""
+    above: dict[str, Float[ndarray, "4 4"]] = field(default_factory=dict)
+    """T_base_link of the links above the base that fixed joints connect with it, the root among them unless a
+    joint moves the base about."""
     source: str | None = None
     """The file or the name that `load_robot` got, unless bundled: how problem files name the robot."""
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
         return (self.base, *(joint.child for joint in self.joints))
+
+    @property
+    def T_base_root(self) -> Float[ndarray, "4 4"] | None:
+        """Where the URDF's root is seen from the base; None if a movable joint lies between them."""
+        return np.eye(4) if self.root in ("", self.base) else self.above.get(self.root)
 
     @cached_property
     def planned_joints(self) -> tuple[Joint, ...]:

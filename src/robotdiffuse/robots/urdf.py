@@ -14,7 +14,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
-from robotdiffuse.transforms import rotation_from_rpy, transform
+from robotdiffuse.transforms import inverse, rotation_from_rpy, transform
 
 KINDS = (*MOVING_KINDS, "fixed")
 DEFAULT_VELOCITY = 1.0
@@ -37,7 +37,8 @@ def read_urdf(
 ) -> Robot:
     """A robot from a URDF file, with convex collision meshes and without spheres.
 
-    `base` is the root of the tree by default. The default tip: from the base, follow the subtree with the
+    `base` is the root of the tree by default; where it stands in the root's frame is kept, for scenes that
+    are given there, while links above it are left out. The default tip: from the base, follow the subtree with the
     most movable joints in a row, as far as the link where the gripper branches off (two or more subtrees
     with movable joints, none with more than three in a row); without a gripper, on to the deepest link. So
     it is panda_hand for a Panda with fingers. Movable joints off the chain from base to tip are locked, at
@@ -67,6 +68,8 @@ def read_urdf(
         joints=tuple(joints),
         meshes={link: parts for link, parts in meshes.items() if parts},
         notes=tuple(tree.notes),
+        root=tree.root,
+        above=tree.above(base),
     )
     on_chain = {joint.name for joint in robot.planned_joints if joint.lower < joint.upper}
     rest = {
@@ -145,17 +148,18 @@ class _Tree:
         self.name = root.get("name") or self.path.stem
         self.links = {self._name(link, "link"): link for link in root.findall("link")}
         self.elements = {self._name(joint, "joint"): joint for joint in root.findall("joint")}
-        parents: dict[str, str] = {}
+        self.parents: dict[str, str] = {}
+        """The joint above each link but the root."""
         self.children: dict[str, list[str]] = {}
         for name, element in self.elements.items():
             parent, child = self._end(name, element, "parent"), self._end(name, element, "child")
-            if child in parents:
+            if child in self.parents:
                 raise InputError(
-                    f"{self.path}: link {child} has two parent joints ({parents[child]}, {name})"
+                    f"{self.path}: link {child} has two parent joints ({self.parents[child]}, {name})"
                 )
-            parents[child] = name
+            self.parents[child] = name
             self.children.setdefault(parent, []).append(name)
-        roots = [link for link in self.links if link not in parents]
+        roots = [link for link in self.links if link not in self.parents]
         if len(roots) != 1:
             raise InputError(f"{self.path}: a URDF has one root link, this one has {len(roots)}: {roots[:5]}")
         self.root = roots[0]
@@ -197,6 +201,20 @@ class _Tree:
             joints.append(self._joint(name))
             joints += self.below(joints[-1].child)
         return joints
+
+    def above(self, link: str) -> dict[str, Float[ndarray, "4 4"]]:
+        """T_link_ancestor of the links above a link, up to the first movable joint."""
+        found: dict[str, ndarray] = {}
+        T_link_ancestor = np.eye(4)
+        while link in self.parents:
+            name = self.parents[link]
+            element = self.elements[name]
+            if element.get("type") != "fixed":
+                break
+            link = self._end(name, element, "parent")
+            T_link_ancestor = T_link_ancestor @ inverse(self._origin(element, f"joint {name}"))
+            found[link] = T_link_ancestor
+        return found
 
     def _joint(self, name: str) -> Joint:
         element = self.elements[name]

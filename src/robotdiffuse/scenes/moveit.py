@@ -14,6 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import read_mesh, read_yaml
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Shape, Sphere, shown, unit_quaternion, vector
@@ -42,42 +43,74 @@ class MoveItRequest:
     """A link and T_base_link."""
 
 
-def read_moveit_scene(file: str | Path, base: str | None = None) -> Scene:
+def read_moveit_scene(file: str | Path, robot: Robot | None = None) -> Scene:
     """The collision objects of a planning scene, in the frame of the robot's base.
 
-    `base` is the name of the robot's base link, for objects that are given in its frame. Where the base
-    stands is taken from robot_state.multi_dof_joint_state; frames from fixed_frame_transforms. The allowed
+    Where the root of the robot's URDF stands is taken from robot_state.multi_dof_joint_state, where its base
+    is from there from the robot (None: base and root are one), frames from fixed_frame_transforms. The allowed
     collision matrix is not used: the robot brings its own. Raises InputError, naming file and object, for
     a missing or damaged file, unknown frames, and shapes without a counterpart (cone, plane, octomap).
     """
     data = read_yaml(file)
     try:
-        return moveit_scene(data, moveit_frames(data, base), Path(file).parent)
+        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
 
 
-def moveit_frames(data: object, base: str | None = None) -> dict[str, Float[ndarray, "4 4"]]:
-    """T_base_frame of the frames that objects of a parsed planning scene may be given in; '' is its own."""
+class MoveItFrames(dict[str, ndarray]):
+    """T_base_frame of the frames that objects of a planning scene may be given in; '' is the scene's own.
+
+    A frame that is not there raises InputError, which says what is known, or why the place of the robot's
+    base in the scene is not.
+    """
+
+    def __init__(self, robot: Robot | None, T_world_root: Float[ndarray, "4 4"]) -> None:
+        super().__init__({} if robot is None else robot.above | {robot.base: np.eye(4)})
+        T_base_root = np.eye(4) if robot is None else robot.T_base_root
+        self.lost = ""
+        """Why the scene's own frame is not known; empty if it is."""
+        if T_base_root is not None:
+            self[""] = self["world"] = T_base_root @ inverse(T_world_root)
+        elif robot is not None:
+            self.lost = f"a joint moves {robot.base} in {robot.root}"
+
+    def of(self, where: str, entry: dict[str, Any]) -> Float[ndarray, "4 4"]:
+        """T_base_frame of the frame that the header of an entry names."""
+        name = _mapping(f"{where}.header", entry.get("header")).get("frame_id") or ""
+        if name in self:
+            return self[name]
+        known = [frame for frame in self if frame]
+        if self.lost:
+            raise InputError(
+                f"frame_id of {where} is {name!r}, and where the robot's base is in it cannot be known: "
+                f"{self.lost}; known frames: {', '.join(known)}"
+            )
+        raise unknown_name(f"frame_id of {where}:", name, known)
+
+
+def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
+    """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`."""
     state = _mapping("robot_state", _mapping("a planning scene", data).get("robot_state"))
     _refuse_attached(state)
     floating = _mapping("multi_dof_joint_state", state.get("multi_dof_joint_state"))
     transforms = _list("multi_dof_joint_state.transforms", floating.get("transforms"))
-    T_world_base = np.eye(4)
+    T_world_root = np.eye(4)
     if transforms:
-        T_world_base = _pose("multi_dof_joint_state.transforms[0]", transforms[0], "translation", "rotation")
-    T_base_world = inverse(T_world_base)
-    frames = {"": T_base_world, "world": T_base_world}
+        T_world_root = _pose("multi_dof_joint_state.transforms[0]", transforms[0], "translation", "rotation")
+    frames = MoveItFrames(robot, T_world_root)
     fixed = _list("fixed_frame_transforms", _mapping("a planning scene", data).get("fixed_frame_transforms"))
     for i, entry in enumerate(fixed):
         where = f"fixed_frame_transforms[{i}]"
-        parent = _frame(where, _mapping(where, entry), frames)
-        T = _pose(f"{where}.transform", _mapping(where, entry).get("transform"), "translation", "rotation")
-        frames[str(_mapping(where, entry).get("child_frame_id", ""))] = parent @ T
-    return frames if base is None else frames | {base: np.eye(4)}
+        entry = _mapping(where, entry)
+        child = str(entry.get("child_frame_id", ""))
+        T = _pose(f"{where}.transform", entry.get("transform"), "translation", "rotation")
+        if not frames.lost and (robot is None or child != robot.base):
+            frames[child] = frames.of(where, entry) @ T
+    return frames
 
 
-def moveit_scene(data: object, frames: dict[str, Float[ndarray, "4 4"]], folder: Path) -> Scene:
+def moveit_scene(data: object, frames: MoveItFrames, folder: Path) -> Scene:
     """`read_moveit_scene` for a parsed file; `folder` is where mesh files are looked up."""
     world = _mapping("world", _mapping("a planning scene", data).get("world"))
     octomap = _mapping("octomap", _mapping("octomap", world.get("octomap")).get("octomap"))
@@ -93,10 +126,10 @@ def moveit_scene(data: object, frames: dict[str, Float[ndarray, "4 4"]], folder:
     return Scene(shapes)
 
 
-def _object(entry: dict[str, Any], frames: dict[str, ndarray], folder: Path) -> list[Shape]:
+def _object(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> list[Shape]:
     if _list("planes", entry.get("planes")):
         raise InputError("planes are not supported; use a large box")
-    T_base_object = _frame("header", entry, frames) @ _pose("pose", entry.get("pose") or NO_POSE)
+    T_base_object = frames.of("header", entry) @ _pose("pose", entry.get("pose") or NO_POSE)
     name = str(entry.get("id") or "object")
     shapes: list[Shape] = []
     for key, build in (("primitive", _primitive), ("mesh", _mesh)):
@@ -144,7 +177,7 @@ def _mesh(where: str, part: dict[str, Any], xyz: ndarray, wxyz: ndarray, name: s
     return Mesh(vertices, faces, xyz, wxyz, name=name)
 
 
-def moveit_request(data: object, frames: dict[str, Float[ndarray, "4 4"]]) -> MoveItRequest:
+def moveit_request(data: object, frames: MoveItFrames) -> MoveItRequest:
     """Start and goals of a parsed request; `frames` as of its scene.
 
     Several goal constraints of joints are a set of goals. A position and an orientation constraint of one
@@ -182,7 +215,7 @@ def _joint_goal(where: str, goal: object) -> dict[str, float]:
     return values
 
 
-def _pose_goal(goal: dict[str, Any], frames: dict[str, ndarray]) -> tuple[str, ndarray]:
+def _pose_goal(goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray]:
     where = "goal_constraints[0]"
     places = _list(f"{where}.position_constraints", goal.get("position_constraints"))
     turns = _list(f"{where}.orientation_constraints", goal.get("orientation_constraints"))
@@ -198,9 +231,9 @@ def _pose_goal(goal: dict[str, Any], frames: dict[str, ndarray]) -> tuple[str, n
     poses = _list("constraint_region.primitive_poses", region.get("primitive_poses"))
     if len(poses) != 1:
         raise InputError(f"{where}: constraint_region has {len(poses)} primitive_poses; it must have one")
-    T_base_region = _frame("header", place, frames) @ _pose("constraint_region.primitive_poses[0]", poses[0])
+    T_base_region = frames.of("header", place) @ _pose("constraint_region.primitive_poses[0]", poses[0])
     turned = _pose(where, {"position": [0, 0, 0], "orientation": turn.get("orientation")})
-    rotation = (_frame("header", turn, frames) @ turned)[:3, :3]
+    rotation = (frames.of("header", turn) @ turned)[:3, :3]
     return str(link), transform(T_base_region[:3, 3], rotation)
 
 
@@ -220,13 +253,6 @@ def _list(where: str, value: object) -> list[Any]:
     if value is not None and not isinstance(value, list):
         raise InputError(f"{where} is {shown(value)}; it must be a list")
     return value or []
-
-
-def _frame(where: str, entry: dict[str, Any], frames: dict[str, ndarray]) -> ndarray:
-    name = _mapping(f"{where}.header", entry.get("header")).get("frame_id") or ""
-    if name not in frames:
-        raise unknown_name(f"frame_id of {where}:", name, [frame for frame in frames if frame])
-    return frames[name]
 
 
 def _xyz(where: str, value: object) -> ndarray:
