@@ -28,15 +28,15 @@ from rich.progress import track
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.collision.lanes import W, make_workspace
+from robotdiffuse.collision.kernels.lanes import W, make_workspace
 from robotdiffuse.collision.signed_distance import SignedDistance
-from robotdiffuse.planners.rrt_connect import RRTConnectSettings, search_space
-from robotdiffuse.planners.rrt_connect_kernel import Space, motion_free
-from robotdiffuse.problem_files import load_motion_bench_maker
+from robotdiffuse.planners.rrt_connect.kernel import Space, motion_free
+from robotdiffuse.planners.rrt_connect.planner import RRTConnectSettings, search_space
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, sample_scene
+from robotdiffuse.problems.files import load_motion_bench_maker
+from robotdiffuse.problems.rop_problems import base_spheres
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.rop_problems import base_spheres
-from robotdiffuse.scenes.rop import ROP, ROP_DENSE, sample_scene
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud

@@ -20,13 +20,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from problems import PANDA, SEED, draw_cases, goal_of
 from report import header, print_table
 from torch import nn
 from torch.nn import functional
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
+from problems import PANDA, SEED, draw_cases, goal_of
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.learning import motion_model
@@ -34,7 +34,7 @@ from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, encode
-from robotdiffuse.problem import Problem
+from robotdiffuse.problems.problem import Problem
 
 SAMPLES = 16
 STEPS = 5

@@ -18,13 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from problems import SEED, Case, draw_cases, goal_of, judged
 from report import header, print_table, progress, wilson
 
+from problems import SEED, Case, draw_cases, goal_of, judged
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode
-from robotdiffuse.scenes.families import FAMILIES
+from robotdiffuse.problems.families import FAMILIES
 
 STEPS = (1, 2, 5, 10, 50, 200)
 """Sampling steps."""

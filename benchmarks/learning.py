@@ -36,17 +36,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from problems import PANDA, SEED, draw_cases, goal_of
 from report import header, print_table, progress
 from scipy.stats import binomtest, wilcoxon
 
+from problems import PANDA, SEED, draw_cases, goal_of
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.metrics import LinkPathLength
 from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.generation.shard_maker import resample
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.robotdiffuse import (
     Candidates,
@@ -54,11 +53,12 @@ from robotdiffuse.planners.robotdiffuse import (
     encode,
     unlearned_starts,
 )
-from robotdiffuse.planners.rrt_connect import random_state, search_space
-from robotdiffuse.planners.shared_tree import SharedTreeSearch, SharedTreeSettings
-from robotdiffuse.problem import JointGoal, Problem
-from robotdiffuse.problem_files import load_motion_bench_maker
-from robotdiffuse.scenes.families import FAMILIES
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
+from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.files import load_motion_bench_maker
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation import DepthCamera, World, point_cloud
 from robotdiffuse.types import Path

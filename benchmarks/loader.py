@@ -17,12 +17,13 @@ import numpy as np
 import torch
 from report import header, print_table
 
-from robotdiffuse.learning.data.dataset import RopDataset
-from robotdiffuse.learning.data.shards import SPLITS, Manifest, write_manifest, write_shard
+from robotdiffuse.data.dataset import RopDataset
+from robotdiffuse.data.shards import SPLITS, Manifest, write_manifest, write_shard
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, sample_scene
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.rop import ROP, ROP_DENSE, pack_scene, sample_scene
+from robotdiffuse.scenes.packed import pack_scene
 from robotdiffuse.scenes.scene import Scene
 
 FRAMES, SLOTS, GOALS, SHARD = 254, 12, 10, 1000

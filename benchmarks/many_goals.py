@@ -24,18 +24,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from problems import PANDA, SEED, draw_cases
 from report import header, print_table, progress
 
+from problems import PANDA, SEED, draw_cases
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.trials import NETWORK_ALONE
-from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, encode, unlearned_starts
-from robotdiffuse.planners.rrt_connect import random_state, search_space
-from robotdiffuse.problem import JointGoal, Problem
-from robotdiffuse.rop_problems import free_configuration
-from robotdiffuse.scenes.families import FAMILIES
-from robotdiffuse.scenes.rop import RopSettings
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.families.rop import RopSettings
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.rop_problems import free_configuration
 from robotdiffuse.types import Path
 from robotdiffuse.verify import VerifySettings, verifier
 

@@ -14,12 +14,11 @@ from pathlib import Path as File
 from typing import NamedTuple
 
 import numpy as np
-from problems import PANDA, RUNS, SEARCH_TIME, SEED, Case, Drawn, draw_cases, families_of, goal_of, judged
 from report import header, print_table, progress, share
 
+from problems import PANDA, RUNS, SEARCH_TIME, SEED, Case, Drawn, draw_cases, families_of, goal_of, judged
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.trials import NETWORK_ALONE, Draw, from_network, without_network
-from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.robotdiffuse import (
     Candidates,
     RobotDiffuse,
@@ -27,9 +26,10 @@ from robotdiffuse.planners.robotdiffuse import (
     encode,
     unlearned_starts,
 )
-from robotdiffuse.planners.rrt_connect import random_state, search_space
-from robotdiffuse.problem import Problem
-from robotdiffuse.scenes.families import FAMILIES
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.simulation.oracle import PyBulletOracle
 from robotdiffuse.types import Path
 

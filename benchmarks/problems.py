@@ -26,11 +26,11 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import trials
 from robotdiffuse.evaluation.bench.problem_sets import family_problem, line_solves
 from robotdiffuse.evaluation.trials import SEARCH_TIME, SEED, goal_of
-from robotdiffuse.planners import rrt_connect_kernel as kernel
-from robotdiffuse.planners.rrt_connect import RRTConnect, random_state, search_space
-from robotdiffuse.problem import Problem
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect, random_state, search_space
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.families import FAMILIES
 
 RUNS = 16
 """RRT-Connect runs after the one that decides; the shortest path of all is the reference length."""

@@ -18,8 +18,8 @@ from report import header, print_table, progress
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.bench.problem_sets import line_solves
 from robotdiffuse.evaluation.trials import SEED, goal_of, problem_number
-from robotdiffuse.planners.lattice_search import DStarLiteSearch, DStarLiteSettings, Outcome
-from robotdiffuse.problem import Problem
+from robotdiffuse.planners.lattice.planner import DStarLiteSearch, DStarLiteSettings, Outcome
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
 
 MOVES = 0.02, 0.05, 0.1

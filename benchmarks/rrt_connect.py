@@ -19,19 +19,19 @@ from rich.progress import track
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.errors import InputError
-from robotdiffuse.planners import rrt_connect_kernel as kernel
-from robotdiffuse.planners.rrt_connect import (
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import (
     Ends,
     RRTConnect,
     RRTConnectSettings,
     random_state,
     search_space,
 )
-from robotdiffuse.problem import JointGoal, Problem
-from robotdiffuse.problem_files import load_motion_bench_maker
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, RopSettings
+from robotdiffuse.problems.files import load_motion_bench_maker
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.rop_problems import sample_problem
-from robotdiffuse.scenes.rop import ROP, ROP_DENSE, RopSettings
 
 SEED = 20261122
 

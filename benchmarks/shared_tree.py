@@ -21,16 +21,17 @@ from report import header, print_table
 from rich.progress import track
 from scipy.stats import wilcoxon
 
-from robotdiffuse.collision import CollisionChecker, lanes
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels import lanes
 from robotdiffuse.generation.problems import draw_problem
 from robotdiffuse.generation.settings import GenerationSettings
-from robotdiffuse.planners import rrt_connect_kernel as connect
-from robotdiffuse.planners.rrt_connect import random_state, search_space
-from robotdiffuse.planners.shared_tree import SharedTreeSearch, SharedTreeSettings
-from robotdiffuse.problem import JointGoal
+from robotdiffuse.planners.rrt_connect import kernel as connect
+from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
+from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.problem import JointGoal
+from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.rop_problems import sample_problem
-from robotdiffuse.scenes.rop import ROP
 
 SEED = 20261121
 PANDA = load_robot("panda")

@@ -17,7 +17,7 @@ def imports_numba(file: Path) -> bool:
     return any(
         (isinstance(node, ast.Import) and any(alias.name == "numba" for alias in node.names))
         or (isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "numba")
-        or (isinstance(node, ast.ImportFrom) and node.module == "robotdiffuse.collision.compiled")
+        or (isinstance(node, ast.ImportFrom) and node.module == "robotdiffuse.collision.kernels.compiled")
         for node in ast.walk(ast.parse(file.read_text()))
     )
 

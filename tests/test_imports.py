@@ -19,28 +19,27 @@ CHAIN = (
     "robots",
     "scenes",
     "collision",
-    "problem",
-    "problem_files",
-    "rop_problems",
+    "problems",
     "verify",
     "paths",
 )
 BELOW: dict[str, set[str]] = {room: set(CHAIN[: i + 1]) for i, room in enumerate(CHAIN)}
-BELOW["learning"] = {*CHAIN[: CHAIN.index("collision") + 1], "learning"}
-BELOW["planners"] = {*CHAIN, "learning", "planners"}
+BELOW["data"] = {*CHAIN[: CHAIN.index("problems") + 1], "data"}
+BELOW["learning"] = {*BELOW["data"], "learning"}
+BELOW["planners"] = {*CHAIN, "data", "learning", "planners"}
 BELOW["simulation"] = {*CHAIN, "simulation"}
 BELOW["viewer"] = {*CHAIN, "viewer"}
-BELOW["generation"] = {*CHAIN, "learning", "planners", "generation"}
-BELOW["evaluation"] = {*CHAIN, "learning", "planners", "simulation", "generation", "evaluation"}
-EXCEPTIONS = {("types", "paths"), ("problem", "problem_files")}
-"""Trajectory.save, PlanResult.save and Problem.load import writer and reader when they are called."""
+BELOW["generation"] = {*CHAIN, "data", "learning", "planners", "generation"}
+BELOW["evaluation"] = {*CHAIN, "data", "learning", "planners", "simulation", "generation", "evaluation"}
+EXCEPTIONS = {("types", "paths")}
+"""Trajectory.save and PlanResult.save import their writer when they are called."""
 
 EXTRAS = {
     "pybullet": {"simulation"},
     "pybullet_data": {"simulation"},
     "ompl": {"planners"},
     "ray": {"generation"},
-    "zarr": {"learning"},
+    "zarr": {"data"},
     "accelerate": {"learning"},
     "viser": {"viewer"},
     "matplotlib": {"evaluation"},

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from box_arm import box_arm
+from helpers.box_arm import box_arm
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.errors import InputError
-from robotdiffuse.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

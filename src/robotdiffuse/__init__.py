@@ -6,15 +6,15 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from robotdiffuse.data.dataset import RopDataset as RopDataset
     from robotdiffuse.errors import InputError as InputError
-    from robotdiffuse.learning.data.dataset import RopDataset as RopDataset
     from robotdiffuse.paths.export import load_result as load_result
     from robotdiffuse.planners import load_planner as load_planner
     from robotdiffuse.planners import plan as plan
-    from robotdiffuse.problem import JointGoal as JointGoal
-    from robotdiffuse.problem import PoseGoal as PoseGoal
-    from robotdiffuse.problem import Problem as Problem
-    from robotdiffuse.problem_files import load_problem as load_problem
+    from robotdiffuse.problems.files import load_problem as load_problem
+    from robotdiffuse.problems.problem import JointGoal as JointGoal
+    from robotdiffuse.problems.problem import PoseGoal as PoseGoal
+    from robotdiffuse.problems.problem import Problem as Problem
     from robotdiffuse.robots import load_robot as load_robot
     from robotdiffuse.scenes.scene import Scene as Scene
     from robotdiffuse.scenes.shapes import Box as Box
@@ -33,14 +33,14 @@ __version__ = "0.1.0"
 
 _HOME = {
     "InputError": "robotdiffuse.errors",
-    "RopDataset": "robotdiffuse.learning.data.dataset",
+    "RopDataset": "robotdiffuse.data.dataset",
     "load_result": "robotdiffuse.paths.export",
     "load_planner": "robotdiffuse.planners",
     "plan": "robotdiffuse.planners",
-    "JointGoal": "robotdiffuse.problem",
-    "PoseGoal": "robotdiffuse.problem",
-    "Problem": "robotdiffuse.problem",
-    "load_problem": "robotdiffuse.problem_files",
+    "JointGoal": "robotdiffuse.problems.problem",
+    "PoseGoal": "robotdiffuse.problems.problem",
+    "Problem": "robotdiffuse.problems.problem",
+    "load_problem": "robotdiffuse.problems.files",
     "load_robot": "robotdiffuse.robots",
     "Scene": "robotdiffuse.scenes.scene",
     "Box": "robotdiffuse.scenes.shapes",

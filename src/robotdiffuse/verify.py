@@ -13,7 +13,7 @@ from numpy import ndarray
 from robotdiffuse.collision.continuous import Contact, ContinuousCollision
 from robotdiffuse.collision.exact import describe_contact
 from robotdiffuse.errors import InputError
-from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.transforms import rotation_angle
 from robotdiffuse.types import Path, Trajectory

@@ -28,12 +28,12 @@ from llvmlite.binding import get_host_cpu_name
 from numpy import ndarray
 from safetensors.numpy import load_file
 
+from robotdiffuse.data.shards import read_shard
 from robotdiffuse.evaluation.bench.problem_sets import family_problem
-from robotdiffuse.learning.data.shards import read_shard
 from robotdiffuse.planners import load_planner
-from robotdiffuse.problem import Problem
-from robotdiffuse.problem_files import problem_record
-from robotdiffuse.scenes.families import FAMILIES
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.files import problem_record
+from robotdiffuse.problems.problem import Problem
 
 GOLDEN = Path(__file__).with_name("golden.json")
 DECIMALS = 6

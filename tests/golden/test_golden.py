@@ -5,8 +5,9 @@ import subprocess
 import sys
 
 import pytest
-from golden.golden import GOLDEN, SECTIONS
 from llvmlite.binding import get_host_cpu_name
+
+from golden.golden import GOLDEN, SECTIONS
 
 ANY_PROCESSOR = ("problems", "shard")
 

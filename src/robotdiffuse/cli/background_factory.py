@@ -56,7 +56,7 @@ def filled_meanwhile(folder: str, workers: int, robot: str) -> Iterator[None]:
 
 
 def _has_shard(folder: str) -> bool:
-    from robotdiffuse.learning.data.shards import shard_indices
+    from robotdiffuse.data.shards import shard_indices
 
     return bool(shard_indices(folder))
 
@@ -121,9 +121,9 @@ def _fill(folder: str, workers: int, robot: str, connection: Connection) -> None
 
 
 def _settings(folder: str, robot: str) -> "GenerationSettings":
+    from robotdiffuse.data.shards import MANIFEST, read_manifest
     from robotdiffuse.generation import GenerationSettings
-    from robotdiffuse.learning.data.shards import MANIFEST, read_manifest
-    from robotdiffuse.planners.shared_tree import SharedTreeSettings
+    from robotdiffuse.planners.shared_tree.planner import SharedTreeSettings
 
     if not (Path(folder) / MANIFEST).exists():
         return GenerationSettings(robot=robot)

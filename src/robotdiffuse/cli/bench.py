@@ -151,7 +151,7 @@ def run_report(arguments: argparse.Namespace) -> int:
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
     """The name of the file; None if there is nothing to replay."""
     from robotdiffuse.evaluation.bench.page import worth_showing
-    from robotdiffuse.problem_files import Robots
+    from robotdiffuse.problems.files import Robots
     from robotdiffuse.types import Path as Waypoints
     from robotdiffuse.viewer.gallery import Exhibit, write_gallery
 

@@ -214,7 +214,7 @@ def print_check(check: "DataCheck") -> None:
 
 def run_view(arguments: argparse.Namespace) -> int:
     from robotdiffuse.cli.draw import show
-    from robotdiffuse.learning.data.shards import read_manifest
+    from robotdiffuse.data.shards import read_manifest
     from robotdiffuse.paths.export import check_output
     from robotdiffuse.robots import load_robot
     from robotdiffuse.viewer.gallery import write_gallery
@@ -240,8 +240,8 @@ def run_view(arguments: argparse.Namespace) -> int:
 
 def _exhibits(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[Exhibit]":
     """Random rows, in the order of the shards."""
+    from robotdiffuse.data.shards import read_manifest
     from robotdiffuse.evaluation.data.rows import family_names, motion_of, random_rows, scene_of
-    from robotdiffuse.learning.data.shards import read_manifest
     from robotdiffuse.viewer.gallery import Exhibit
 
     manifest = read_manifest(folder)
@@ -256,7 +256,7 @@ def _exhibits(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator
 
 
 def run_export(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.learning.data.export import export_npz
+    from robotdiffuse.data.export import export_npz
 
     made = export_npz(arguments.folder, arguments.file)
     print(f"wrote {arguments.file}: {made:,} motions")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from robotdiffuse.problem import Problem
+    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.types import PlanResult
 
 ENDINGS = (".html", ".png")

@@ -10,7 +10,7 @@ from robotdiffuse.cli.console import print_result
 from robotdiffuse.cli.draw import ENDINGS, draw, show
 
 if TYPE_CHECKING:
-    from robotdiffuse.problem import Problem
+    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.types import PlanResult
 
 DEMO = "shelf.yaml"
@@ -65,7 +65,7 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
 def run_plan(arguments: argparse.Namespace) -> int:
     from robotdiffuse.paths.export import check_output, save_result
     from robotdiffuse.planners import DEFAULT_PLANNER, check_planner
-    from robotdiffuse.problem_files import load_problem, problem_record
+    from robotdiffuse.problems.files import load_problem, problem_record
 
     name = arguments.planner or DEFAULT_PLANNER
     check_planner(name)
@@ -93,7 +93,7 @@ def run_plan(arguments: argparse.Namespace) -> int:
 def run_demo(arguments: argparse.Namespace) -> int:
     from robotdiffuse.paths.export import check_output
     from robotdiffuse.planners import DEFAULT_PLANNER
-    from robotdiffuse.problem_files import load_problem
+    from robotdiffuse.problems.files import load_problem
 
     outputs = [check_output(file, ENDINGS) for file in ("demo.png", "demo.html")]
     with as_file(files("robotdiffuse") / "examples" / DEMO) as file:

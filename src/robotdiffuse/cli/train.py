@@ -150,7 +150,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
 
 
 def run_baseline(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.learning.baselines.training import baseline_training, train_baseline
+    from robotdiffuse.learning.networks.training import baseline_training, train_baseline
 
     given = _given(arguments, ("data", "robot", *SHARED))
     settings = baseline_training(arguments.name, given)

@@ -8,7 +8,7 @@ from robotdiffuse.cli.draw import ENDINGS, draw, show
 from robotdiffuse.errors import InputError
 
 if TYPE_CHECKING:
-    from robotdiffuse.problem import Problem
+    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.types import PlanResult
 
 
@@ -41,7 +41,7 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
 def read(file: str) -> "tuple[PlanResult, Problem]":
     """A solved result and its problem. Raises InputError where the file holds no motion or no problem."""
     from robotdiffuse.paths.export import load_result
-    from robotdiffuse.problem_files import problem_from_record
+    from robotdiffuse.problems.files import problem_from_record
 
     saved = load_result(file)
     if not saved.result.solved:

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.collision import clearance_gradients, distance, lane_clearance, lanes
 from robotdiffuse.collision.arrays import compile_robot, compile_scene_for, robot_groups
+from robotdiffuse.collision.kernels import clearance_gradients, distance, lane_clearance, lanes
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float, Float32, Int32
 from numpy import ndarray
 
-from robotdiffuse.collision.lane_clearance import pair_clearances
-from robotdiffuse.collision.lanes import HEAD, SIDE
+from robotdiffuse.collision.kernels.lane_clearance import pair_clearances
+from robotdiffuse.collision.kernels.lanes import HEAD, SIDE
 
 CELLS = SIDE - 2
 """Cells along each joint's range; around them is a ring that stands for values beyond it."""

@@ -7,9 +7,9 @@ from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision.arrays import RobotArrays, SceneArrays, compile_scene
-from robotdiffuse.collision.clearance_gradients import clearances_and_gradients_into
-from robotdiffuse.collision.compiled import allocation_free
-from robotdiffuse.collision.lane_clearance import clearances_into, make_clearance_workspace
+from robotdiffuse.collision.kernels.clearance_gradients import clearances_and_gradients_into
+from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.lane_clearance import clearances_into, make_clearance_workspace
 from robotdiffuse.scenes.scene import Scene
 
 SPHERE, BOX = 1, 2

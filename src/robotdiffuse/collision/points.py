@@ -7,7 +7,7 @@ from jaxtyping import Float, Float32, Int32
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
-from robotdiffuse.collision.point_grid import KEEP, splat
+from robotdiffuse.collision.kernels.point_grid import KEEP, splat
 
 MESH_SPACING = 0.02
 """Triangles of mesh obstacles are divided until no edge is longer [m]; each piece becomes a point."""

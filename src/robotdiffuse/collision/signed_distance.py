@@ -7,7 +7,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from robotdiffuse.collision.arrays import compile_robot, compile_scene_for, robot_groups
-from robotdiffuse.collision.point_grid import KEEP
+from robotdiffuse.collision.kernels.point_grid import KEEP
 from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.data.shards import read_manifest
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.evaluation.metrics import LinkPathLength
 from robotdiffuse.evaluation.trials import (
@@ -30,13 +31,12 @@ from robotdiffuse.evaluation.trials import (
 from robotdiffuse.files import alone_in
 from robotdiffuse.generation.workers import prepare_worker, stop_pool
 from robotdiffuse.learning.checkpoint import load_model
-from robotdiffuse.learning.data.shards import read_manifest
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.planners.robotdiffuse import RobotDiffuseSettings
-from robotdiffuse.problem import Problem
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"

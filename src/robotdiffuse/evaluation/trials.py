@@ -15,11 +15,11 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode, unlearned_starts
-from robotdiffuse.planners.rrt_connect import RRTConnect
-from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.rop_problems import sample_problem
-from robotdiffuse.scenes.rop import ROP
 from robotdiffuse.types import Path
 from robotdiffuse.verify import Verifier, VerifySettings
 

@@ -9,11 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.files import alone_in
-from robotdiffuse.generation.settings import GenerationSettings
-from robotdiffuse.generation.workers import CLUSTERS, on_this_machine, versions
-from robotdiffuse.learning.data.shards import (
+from robotdiffuse.data.shards import (
     MANIFEST,
     Manifest,
     read_manifest,
@@ -22,6 +18,10 @@ from robotdiffuse.learning.data.shards import (
     write_manifest,
     write_shard,
 )
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.files import alone_in
+from robotdiffuse.generation.settings import GenerationSettings
+from robotdiffuse.generation.workers import CLUSTERS, on_this_machine, versions
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 

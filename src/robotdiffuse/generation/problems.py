@@ -10,12 +10,17 @@ from numpy.random import Generator
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.generation.settings import GenerationSettings
+from robotdiffuse.problems.families.furniture import (
+    FurnitureSettings,
+    Region,
+    sample_furniture,
+    sample_target,
+)
+from robotdiffuse.problems.families.rop import RopSettings, sample_scene
+from robotdiffuse.problems.rop_problems import base_spheres, free_configuration
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.rop_problems import base_spheres, free_configuration
-from robotdiffuse.scenes.furniture import FurnitureSettings, Region, sample_furniture, sample_target
-from robotdiffuse.scenes.rop import RopSettings, sample_scene
 from robotdiffuse.scenes.scene import Scene
 
 SCENES = 100

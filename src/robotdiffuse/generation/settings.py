@@ -3,10 +3,10 @@
 from dataclasses import dataclass, field
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.planners.shared_tree import SharedTreeSettings
-from robotdiffuse.scenes.families import FAMILIES, most_obstacles
-from robotdiffuse.scenes.furniture import FurnitureSettings
-from robotdiffuse.scenes.rop import RopSettings
+from robotdiffuse.planners.shared_tree.planner import SharedTreeSettings
+from robotdiffuse.problems.families import FAMILIES, most_obstacles
+from robotdiffuse.problems.families.furniture import FurnitureSettings
+from robotdiffuse.problems.families.rop import RopSettings
 
 TARGETS = ("position", "pose")
 TIMINGS = ("arc", "time")

@@ -9,14 +9,14 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.generation.problems import TargetProblem, draw_problem
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.paths.timing import time_parameterize
-from robotdiffuse.planners import rrt_connect_kernel as connect
-from robotdiffuse.planners.rrt_connect import random_state, search_space
-from robotdiffuse.planners.shared_tree import SharedTreeSearch
-from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.planners.rrt_connect import kernel as connect
+from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
+from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch
+from robotdiffuse.problems.families import floor_of
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.families import floor_of
-from robotdiffuse.scenes.rop import pack_scene
+from robotdiffuse.scenes.packed import pack_scene
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.transforms import quaternion_from_rotation
 from robotdiffuse.types import Path
@@ -34,7 +34,7 @@ Counts = dict[str, int]
 
 
 def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts]:
-    """Arrays and counts of a shard, as `learning.data.shards` keeps them.
+    """Arrays and counts of a shard, as `data.shards` keeps them.
 
     Counts: `tried` problems; of those `solved` ones are in the shard, `thinned` ones are trivial and left
     out, of `unsolved` ones the search found no path, and `refused` ones did not pass the judge. Raises

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from numba import njit
 from numpy import ndarray
 
-from robotdiffuse.collision.compiled import allocation_free
-from robotdiffuse.collision.distance import CAP, cost_gradient_at
-from robotdiffuse.collision.lane_clearance import (
+from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.distance import CAP, cost_gradient_at
+from robotdiffuse.collision.kernels.lane_clearance import (
     clearances_into,
     count_obstacles,
     make_clearance_workspace,

@@ -16,12 +16,12 @@ from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, Transfo
 from robotdiffuse.learning.denoisers.layers import Linear
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings, PointAutoencoderSettings, make_encoder
-from robotdiffuse.learning.normalizer import JointNormalizer
 from robotdiffuse.learning.objectives import objective_for
 from robotdiffuse.learning.parametrization import parametrization
 from robotdiffuse.learning.representation import Between, TrajectoryRows
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.settings import check_kind, of_kind
+from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.robots.robot import Robot
 
 MAX_POINTS = 2048

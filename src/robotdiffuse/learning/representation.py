@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.learning.diffusion import noise_factor
-from robotdiffuse.learning.normalizer import JointNormalizer
 from robotdiffuse.learning.parametrization import Parametrization
+from robotdiffuse.robots.normalizer import JointNormalizer
 
 TARGETS = ("residual", "absolute")
 

@@ -8,7 +8,7 @@ from robotdiffuse.errors import InputError, unknown_name
 
 if TYPE_CHECKING:
     from robotdiffuse.planners.base import Planner
-    from robotdiffuse.problem import Problem
+    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.types import PlanResult
 
 
@@ -28,11 +28,11 @@ PLANNERS = {
         "RobotDiffuseSettings",
     ),
     "rrt_connect": Entry(
-        _ROOM + "rrt_connect:RRTConnect",
+        _ROOM + "rrt_connect.planner:RRTConnect",
         "two trees grown towards each other, then shortcuts",
     ),
     "shared_tree_rrt_star": Entry(
-        _ROOM + "shared_tree:SharedTreeRRTStar",
+        _ROOM + "shared_tree.planner:SharedTreeRRTStar",
         "the paper's planner for data: one tree, all goals, near-optimal, 5 cm away from obstacles",
     ),
     "mpnet": Entry(
@@ -55,9 +55,9 @@ PLANNERS = {
         "EDMP: such a prior, guided by an ensemble of costs",
         "EDMPSettings",
     ),
-    "a_star": Entry(_ROOM + "lattice_search:AStar", "A* on a lattice of joint values"),
+    "a_star": Entry(_ROOM + "lattice.planner:AStar", "A* on a lattice of joint values"),
     "d_star_lite": Entry(
-        _ROOM + "lattice_search:DStarLite",
+        _ROOM + "lattice.planner:DStarLite",
         "D* Lite on a lattice of joint values; mends its search when the scene changes",
     ),
     "ompl_rrt": Entry(_ROOM + "ompl_planners:OmplRRT", "OMPL's RRT, then its path simplifier"),

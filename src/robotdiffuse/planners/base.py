@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.timing import time_parameterize
-from robotdiffuse.problem import Problem
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.types import Path, PlanResult, Status, Trajectory
 from robotdiffuse.verify import Report, Verifier, VerifySettings, verifier
 

@@ -2,7 +2,7 @@
 
 No single cost and no single choice of its numbers fits all scenes. So a batch is split among an ensemble of
 guides; each guides its share, and the best of all samples is the plan. The prior is unconditional
-(`learning.baselines.trajectory_prior`).
+(`learning.networks.trajectory_prior`).
 
 Settings and the paper's values:
 
@@ -30,7 +30,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.baselines.trajectory_prior import TrajectoryPrior, quadratic_levels
+from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior, quadratic_levels
 from robotdiffuse.planners.guided_prior import GuidedPrior, collision_gradient, limited
 
 

@@ -7,7 +7,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import explain_collision
 from robotdiffuse.planners.base import Call
-from robotdiffuse.problem import JointGoal, PoseGoal
+from robotdiffuse.problems.problem import JointGoal, PoseGoal
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.types import PlanResult, Status
 

@@ -9,13 +9,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.baselines.checkpoint import check_weights, load_baseline
-from robotdiffuse.learning.baselines.trajectory_prior import TrajectoryPrior
-from robotdiffuse.planners import rrt_connect_kernel as kernel
+from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
+from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.planners.rrt_connect import search_space
-from robotdiffuse.problem import Problem
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import search_space
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import PlanResult
 

@@ -1,6 +1,6 @@
 """MPD: Motion Planning Diffusion (Carvalho et al., IROS 2023), a diffusion prior guided by cost gradients.
 
-The prior is unconditional (`learning.baselines.trajectory_prior`); planning draws from the posterior given
+The prior is unconditional (`learning.networks.trajectory_prior`); planning draws from the posterior given
 the costs: in the last part of the denoising steps the mean of each step goes some gradient steps down
 
     collision (scene and links) + joint limits + Gaussian process prior of constant velocity,
@@ -36,7 +36,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.baselines.trajectory_prior import TrajectoryPrior, exponential_levels
+from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior, exponential_levels
 from robotdiffuse.planners.guided_prior import GuidedPrior, collision_gradient, limited
 
 

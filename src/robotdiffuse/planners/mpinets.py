@@ -1,6 +1,6 @@
 """MPiNets: motions that a policy makes step by step (A. Fishman et al., "Motion Policy Networks", CoRL 2022).
 
-The policy (`learning.baselines.mpinets`) sees points of the scene, of the arm and of the goal, and is rolled
+The policy (`learning.networks.mpinets`) sees points of the scene, of the arm and of the goal, and is rolled
 out from the start, at most 150 steps, the paper's number. The first roll-out is the paper's planner: one
 cloud, no noise, nothing repeated. While there is time, others follow with new clouds and noise.
 
@@ -25,13 +25,13 @@ from torch import Tensor
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.baselines.checkpoint import check_weights, load_baseline
-from robotdiffuse.learning.baselines.mpinets import MPiNetsNetwork, RollOuts
-from robotdiffuse.planners import rrt_connect_kernel as kernel
+from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
+from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, RollOuts
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.planners.rrt_connect import search_space
-from robotdiffuse.problem import Problem
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import search_space
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.types import PlanResult

@@ -2,7 +2,7 @@
 proposed anew.
 
 A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
-Learning-based and Classical Motion Planners", T-RO 2020. The networks are in `learning.baselines.mpnet`. The
+Learning-based and Classical Motion Planners", T-RO 2020. The networks are in `learning.networks.mpnet`. The
 parts, by the paper's names:
 
 - *Bidirectional neural planning* (`MPNet._between`): both ends step towards each other, unchecked (the
@@ -30,13 +30,13 @@ from torch import Generator, Tensor
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.baselines.checkpoint import check_weights, load_baseline
-from robotdiffuse.learning.baselines.mpnet import MPNetNetwork
-from robotdiffuse.planners import rrt_connect_kernel as kernel
+from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
+from robotdiffuse.learning.networks.mpnet import MPNetNetwork
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.planners.rrt_connect import finer, random_state, search_space
-from robotdiffuse.problem import Problem
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import finer, random_state, search_space
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.types import PlanResult
 

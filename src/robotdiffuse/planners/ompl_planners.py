@@ -28,13 +28,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision import lanes
+from robotdiffuse.collision.kernels import lanes
 from robotdiffuse.errors import InputError
-from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.planners.rrt_connect import finer, search_space
-from robotdiffuse.problem import Problem
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import finer, search_space
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, PlanResult
 from robotdiffuse.verify import VerifySettings, verifier

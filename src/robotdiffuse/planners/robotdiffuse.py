@@ -21,11 +21,16 @@ from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.planners import rrt_connect_kernel as kernel
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.planners.rrt_connect import RRTConnect, RRTConnectSettings, random_state, search_space
-from robotdiffuse.problem import Problem
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import (
+    RRTConnect,
+    RRTConnectSettings,
+    random_state,
+    search_space,
+)
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.types import Path, PlanResult

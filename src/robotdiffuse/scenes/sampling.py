@@ -13,13 +13,11 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.scenes.packed import BOX, SPHERE
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.transforms import rotation_from_quaternion
 
-NONE, SPHERE, BOX = 0, 1, 2
-"""Kinds of packed shapes. Parameters of a sphere: center, radius; of a box: center, size, wxyz."""
-PARAMETERS = 10
 ROUNDS = 6
 """How often `sample_surface` draws before it repeats points that it has."""
 

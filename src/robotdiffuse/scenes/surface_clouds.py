@@ -16,7 +16,8 @@ import torch
 from jaxtyping import Bool, Float32, Int8
 from torch import Generator, Tensor
 
-from robotdiffuse.scenes.sampling import BOX, NONE, SPHERE, VisibleRegion
+from robotdiffuse.scenes.packed import BOX, NONE, SPHERE
+from robotdiffuse.scenes.sampling import VisibleRegion
 from robotdiffuse.scenes.surface_kernel import fill_clouds
 
 PART = 1 << 15

@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from robotdiffuse.scenes.sampling import BOX, SPHERE
+from robotdiffuse.scenes.packed import BOX, SPHERE
 
 _ONE, _TWO, _HALF = np.float32(1.0), np.float32(2.0), np.float32(0.5)
 _UNIT = np.float32(2.0**-24)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench.problem_sets import Case, read_cases
 from robotdiffuse.evaluation.bench.records import Record, read_records
-from robotdiffuse.problem_files import Robots
+from robotdiffuse.problems.files import Robots
 from robotdiffuse.simulation.oracle import OracleContact, PyBulletOracle
 from robotdiffuse.types import Path
 

@@ -21,8 +21,8 @@ from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED, Reco
 from robotdiffuse.evaluation.comscore import Indicators, comscores
 from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
 from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
-from robotdiffuse.scenes.families import FAMILIES
-from robotdiffuse.scenes.rop import RopSettings
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.families.rop import RopSettings
 from robotdiffuse.types import Status
 
 LIMITS = (0.1, 1.0, 10.0, 60.0)

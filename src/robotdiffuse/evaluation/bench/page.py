@@ -28,7 +28,7 @@ from robotdiffuse.evaluation.bench.report import TextTable
 from robotdiffuse.evaluation.look import STYLE
 from robotdiffuse.files import write_atomically
 from robotdiffuse.paths.export import check_output
-from robotdiffuse.problem import JointGoal
+from robotdiffuse.problems.problem import JointGoal
 
 OWN_STYLE = """
 [hidden] { display: none !important; }

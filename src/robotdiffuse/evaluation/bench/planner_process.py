@@ -26,8 +26,8 @@ from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.metrics import MotionMeasures
 from robotdiffuse.planners import check_planner, load_planner
 from robotdiffuse.planners.base import Planner
-from robotdiffuse.problem import JointGoal, Problem
-from robotdiffuse.problem_files import Robots, problem_from_record
+from robotdiffuse.problems.files import Robots, problem_from_record
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

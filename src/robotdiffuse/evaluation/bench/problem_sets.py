@@ -14,13 +14,13 @@ from robotdiffuse.evaluation.trials import SEARCH_TIME, SEED, problem_number
 from robotdiffuse.files import write_atomically
 from robotdiffuse.generation.problems import draw_problem
 from robotdiffuse.generation.settings import GenerationSettings
-from robotdiffuse.planners.rrt_connect import RRTConnect
-from robotdiffuse.problem import JointGoal, Problem
-from robotdiffuse.problem_files import Robots, load_problems, problem_from_record, problem_record
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.families.rop import RopSettings
+from robotdiffuse.problems.files import Robots, load_problems, problem_from_record, problem_record
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.rop_problems import sample_problem
-from robotdiffuse.scenes.families import FAMILIES
-from robotdiffuse.scenes.rop import RopSettings
 from robotdiffuse.types import Path
 from robotdiffuse.verify import Verifier, VerifySettings
 

@@ -16,10 +16,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data.rows import path_of, pick_rows, problem_of, scene_of
-from robotdiffuse.generation.workers import prepare_worker
-from robotdiffuse.learning.data.shards import (
+from robotdiffuse.data.shards import (
     Manifest,
     Shard,
     check_shard,
@@ -27,6 +24,9 @@ from robotdiffuse.learning.data.shards import (
     read_shard,
     shard_indices,
 )
+from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.data.rows import path_of, pick_rows, problem_of, scene_of
+from robotdiffuse.generation.workers import prepare_worker
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

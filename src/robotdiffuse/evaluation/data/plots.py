@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from robotdiffuse.evaluation.data.report import REASONS, DataColumns, DataSummary
 from robotdiffuse.evaluation.look import FAINT, INK, as_svg, make_figure
-from robotdiffuse.scenes.sampling import BOX, SPHERE
+from robotdiffuse.scenes.packed import BOX, SPHERE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,9 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data.rows import family_names
-from robotdiffuse.learning.data.shards import (
+from robotdiffuse.data.shards import (
     SPLITS,
     Manifest,
     read_manifest,
@@ -18,6 +16,8 @@ from robotdiffuse.learning.data.shards import (
     shard_path,
     split_of,
 )
+from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.data.rows import family_names
 
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 SAMPLE = 20_000

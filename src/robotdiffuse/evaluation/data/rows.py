@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Int
 from numpy import ndarray
 
+from robotdiffuse.data.shards import Manifest, Shard, read_shard, shard_indices
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.data.shards import Manifest, Shard, read_shard, shard_indices
-from robotdiffuse.problem import JointGoal, Problem
+from robotdiffuse.problems.families.furniture import FLOOR, FURNITURE
+from robotdiffuse.problems.families.rop import RopSettings, floor_box
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.furniture import FLOOR, FURNITURE
-from robotdiffuse.scenes.rop import RopSettings, floor_box, unpack_scene
+from robotdiffuse.scenes.packed import unpack_scene
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.types import Path, Trajectory

@@ -7,14 +7,14 @@ from numpy import ndarray
 from torch import Tensor
 
 from robotdiffuse.learning.checkpoint import save_encoder
-from robotdiffuse.learning.data.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.encoders import Autoencoder, Encoder, make_encoder
 from robotdiffuse.learning.settings import settings_to_json
+from robotdiffuse.learning.training.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.run import TrainingRun, Validation
 from robotdiffuse.learning.versions import versions
-from robotdiffuse.scenes.sampling import BOX, NONE
+from robotdiffuse.scenes.packed import BOX, NONE
 from robotdiffuse.transforms import rotation_from_quaternion
 
 READ, CHECKED = 2048, 512

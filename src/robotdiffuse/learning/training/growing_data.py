@@ -3,8 +3,8 @@
 import sys
 from collections.abc import Callable
 
-from robotdiffuse.learning.data.batches import TrajectoryData
-from robotdiffuse.learning.data.shards import read_manifest, shard_indices
+from robotdiffuse.data.shards import read_manifest, shard_indices
+from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.processes import Processes
 
 GROWTH = 1.25

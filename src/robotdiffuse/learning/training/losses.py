@@ -15,7 +15,7 @@ from torch import Tensor
 from robotdiffuse.collision.arrays import compile_robot
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.kinematics import ForwardKinematics
-from robotdiffuse.scenes.sampling import BOX, SPHERE
+from robotdiffuse.scenes.packed import BOX, SPHERE
 from robotdiffuse.transforms import rotation_from_quaternion
 
 POINT_UNIT = 0.1

@@ -11,11 +11,11 @@ from torch import Tensor
 from robotdiffuse.collision.arrays import robot_groups
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_model
 from robotdiffuse.learning.clearances import packed_clearances
-from robotdiffuse.learning.data.batches import Batch, Batches, TrajectoryData, load_data
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import Encoder, encoder_name, make_encoder
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.settings import settings_to_json
+from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData, load_data
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.growing_data import GrowingData
 from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge

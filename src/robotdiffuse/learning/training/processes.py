@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.data.batches import fast_bf16
+from robotdiffuse.learning.training.batches import fast_bf16
 
 DEVICES = ("cpu", "cuda")
 Value = TypeVar("Value")

@@ -9,10 +9,10 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.clearances import link_clearances
-from robotdiffuse.learning.data.batches import TrajectoryData, encode_scenes
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.training.batches import TrajectoryData, encode_scenes
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.rop import unpack_scene
+from robotdiffuse.scenes.packed import unpack_scene
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 

@@ -1,0 +1,331 @@
+"""Compiled clearances of links to the scene, 16 configurations at once; see `lanes.py` for the form."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.distance import cost_gradient_at
+from robotdiffuse.collision.kernels.lanes import W, place, place_frames
+from robotdiffuse.collision.kernels.point_grid import KEEP, points_distance, points_lower_bound
+
+_ZERO = np.float32(0.0)
+
+
+@allocation_free(fastmath=True)
+def _to_spheres(at, s, obstacles, near, n, mark, out):
+    """Signed distances of a point in 16 lanes to obstacles.
+
+    With `mark`, to row n + k of `out` for every obstacle k; otherwise `out[0]` becomes the least of itself
+    and the distances to the obstacles with near[n + k].
+    """
+    for k in range(len(obstacles)):
+        if not (mark or near[n + k]):
+            continue
+        x, y, z, radius = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2], obstacles[k, 3]
+        row = n + k if mark else 0
+        for i in range(W):
+            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
+            d = np.sqrt(dx * dx + dy * dy + dz * dz) - radius
+            out[row, i] = d if mark else min(out[row, i], d)
+
+
+@allocation_free(fastmath=True)
+def _to_boxes(at, s, obstacles, near, n, mark, out):
+    for k in range(len(obstacles)):
+        if not (mark or near[n + k]):
+            continue
+        x, y, z = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2]
+        a00, a01, a02 = obstacles[k, 3], obstacles[k, 4], obstacles[k, 5]
+        a10, a11, a12 = obstacles[k, 6], obstacles[k, 7], obstacles[k, 8]
+        a20, a21, a22 = obstacles[k, 9], obstacles[k, 10], obstacles[k, 11]
+        hx, hy, hz = obstacles[k, 12], obstacles[k, 13], obstacles[k, 14]
+        row = n + k if mark else 0
+        for i in range(W):
+            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
+            u = abs(a00 * dx + a01 * dy + a02 * dz) - hx
+            v = abs(a10 * dx + a11 * dy + a12 * dz) - hy
+            w = abs(a20 * dx + a21 * dy + a22 * dz) - hz
+            inside = min(max(max(u, v), w), _ZERO)
+            u, v, w = max(u, _ZERO), max(v, _ZERO), max(w, _ZERO)
+            d = np.sqrt(u * u + v * v + w * w) + inside
+            out[row, i] = d if mark else min(out[row, i], d)
+
+
+@allocation_free(fastmath=True)
+def _to_round(at, s, obstacles, flat_ends, near, n, mark, out):
+    """Cylinders (`flat_ends`) or capsules."""
+    for k in range(len(obstacles)):
+        if not (mark or near[n + k]):
+            continue
+        x, y, z = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2]
+        a00, a01, a02 = obstacles[k, 3], obstacles[k, 4], obstacles[k, 5]
+        a10, a11, a12 = obstacles[k, 6], obstacles[k, 7], obstacles[k, 8]
+        a20, a21, a22 = obstacles[k, 9], obstacles[k, 10], obstacles[k, 11]
+        wide, half = obstacles[k, 12], obstacles[k, 13]
+        row = n + k if mark else 0
+        for i in range(W):
+            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
+            u = a00 * dx + a01 * dy + a02 * dz
+            v = a10 * dx + a11 * dy + a12 * dz
+            w = abs(a20 * dx + a21 * dy + a22 * dz) - half
+            if flat_ends:
+                r = np.sqrt(u * u + v * v) - wide
+                inside = min(max(r, w), _ZERO)
+                r, w = max(r, _ZERO), max(w, _ZERO)
+                d = np.sqrt(r * r + w * w) + inside
+            else:
+                w = max(w, _ZERO)
+                d = np.sqrt(u * u + v * v + w * w) - wide
+            out[row, i] = d if mark else min(out[row, i], d)
+
+
+@allocation_free()
+def _bound_points(at, s, scene, radius, row, out):
+    """Lower bounds for a sphere's centre, to a row of `out`."""
+    for i in range(W):
+        d = points_lower_bound(scene, at[s, i], at[s, W + i], at[s, 2 * W + i])
+        out[row, i] = min(d, KEEP + radius)
+
+
+@allocation_free()
+def _to_points(at, s, scene, radius, out):
+    for i in range(W):
+        limit = min(out[0, i], KEEP + radius)
+        out[0, i] = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit)
+
+
+@allocation_free(inline="always")
+def _to_scene(at, s, scene, radius, near, mark, out):
+    n = 0
+    _to_spheres(at, s, scene.spheres, near, n, mark, out)
+    n += len(scene.spheres)
+    _to_boxes(at, s, scene.boxes, near, n, mark, out)
+    n += len(scene.boxes)
+    _to_round(at, s, scene.cylinders, True, near, n, mark, out)
+    n += len(scene.cylinders)
+    _to_round(at, s, scene.capsules, False, near, n, mark, out)
+    n += len(scene.capsules)
+    if len(scene.points):
+        if mark:
+            _bound_points(at, s, scene, radius, n, out)
+        elif near[n]:
+            _to_points(at, s, scene, radius, out)
+
+
+@allocation_free(fastmath=True)
+def _nearer(a, s, b, t, radii, best):
+    """How many lanes have spheres s of a and t of b nearer to each other than best[0]."""
+    total = 0
+    for i in range(W):
+        dx, dy, dz = a[s, i] - b[t, i], a[s, W + i] - b[t, W + i], a[s, 2 * W + i] - b[t, 2 * W + i]
+        total += np.int32(np.sqrt(dx * dx + dy * dy + dz * dz) - radii < best[0, i])
+    return total
+
+
+@allocation_free(fastmath=True)
+def _keep_least(a, s, b, first, last, spheres, radius, best):
+    """Lowers best[0] to the distances of sphere s of a to the spheres from `first` to `last` of b."""
+    for t in range(first, last):
+        radii = radius + spheres[t, 3]
+        for i in range(W):
+            dx, dy, dz = a[s, i] - b[t, i], a[s, W + i] - b[t, W + i], a[s, 2 * W + i] - b[t, 2 * W + i]
+            best[0, i] = min(best[0, i], np.sqrt(dx * dx + dy * dy + dz * dz) - radii)
+
+
+class ClearanceWorkspace(NamedTuple):
+    """Scratch memory of `block_clearances` and `block_pair_clearances`."""
+
+    frames: np.ndarray
+    """[dof + 1, 12 * W]"""
+    centres: np.ndarray
+    """[groups, 3 * W] centres of the bounding spheres."""
+    position: np.ndarray
+    """[1, 3 * W]"""
+    near: np.ndarray
+    """[obstacles]"""
+    bounds: np.ndarray
+    """[obstacles, W] distances of a bounding sphere's centre."""
+    least: np.ndarray
+    """[1, W]"""
+    positions: np.ndarray
+    """[spheres, 3 * W]"""
+    placed: np.ndarray
+    """[groups] whether the group's positions are those of this block."""
+
+
+@njit(cache=True)
+def make_clearance_workspace(robot, obstacles):
+    """Scratch memory for one thread and at most so many obstacles (all point clouds count as one)."""
+    frames = np.zeros((len(robot.offsets) + 1, 12 * W), np.float32)
+    for k in (0, 4, 8):
+        frames[0, k * W : (k + 1) * W] = 1.0
+    return ClearanceWorkspace(
+        frames,
+        np.empty((len(robot.frame), 3 * W), np.float32),
+        np.empty((1, 3 * W), np.float32),
+        np.empty(obstacles, np.bool_),
+        np.empty((obstacles, W), np.float32),
+        np.empty((1, W), np.float32),
+        np.empty((len(robot.spheres), 3 * W), np.float32),
+        np.empty(len(robot.frame), np.bool_),
+    )
+
+
+@allocation_free()
+def count_obstacles(scene):
+    """Rows that `make_clearance_workspace` needs."""
+    return len(scene.spheres) + len(scene.boxes) + len(scene.cylinders) + len(scene.capsules) + 1
+
+
+@allocation_free(fastmath=True)
+def _mark_near(solids, obstacles, radius, limit, near, bounds, least):
+    """Marks the obstacles that can be nearest to a group in any lane, from distances of its bounding sphere.
+
+    An obstacle at d from the centre is at least d - radius and at most d + radius away from the group. Of the
+    points, which come after the solid ones, `bounds` holds but a lower bound.
+    """
+    for i in range(W):
+        least[0, i] = limit
+    for k in range(solids):
+        for i in range(W):
+            least[0, i] = min(least[0, i], bounds[k, i] + radius)
+    count = 0
+    for k in range(obstacles):
+        total = 0
+        for i in range(W):
+            total += np.int32(bounds[k, i] - radius < least[0, i])
+        near[k] = total > 0
+        count += near[k]
+    return count
+
+
+@allocation_free(fastmath=True)
+def _write(least, radius, best):
+    for i in range(W):
+        best[0, i] = min(best[0, i], least[0, i] - radius)
+
+
+@allocation_free()
+def block_clearances(robot, scene, first, q, limit, work, best, out):
+    """Signed distances to the scene, at most `limit`, of the groups from `first` on: out[groups, 16].
+
+    q: [dof, 16].
+
+    `best` is scratch, [1, 16].
+    """
+    place_frames(robot, q, work.frames, work.centres)
+    solids = count_obstacles(scene) - 1
+    obstacles = solids + (len(scene.points) > 0)
+    for g in range(first, len(robot.frame)):
+        radius = robot.bounds[g, 3]
+        _to_scene(work.centres, g, scene, radius, work.near, True, work.bounds)
+        for i in range(W):
+            best[0, i] = limit
+        if _mark_near(solids, obstacles, radius, limit, work.near, work.bounds, work.least) > 0:
+            for s in range(robot.first[g], robot.first[g + 1]):
+                place(work.frames, robot.frame[g], robot.spheres, s, work.position, 0)
+                # what the spheres before have found limits what is looked for
+                for i in range(W):
+                    work.least[0, i] = best[0, i] + robot.spheres[s, 3]
+                _to_scene(work.position, 0, scene, robot.spheres[s, 3], work.near, False, work.least)
+                _write(work.least, robot.spheres[s, 3], best)
+        for i in range(W):
+            out[g - first, i] = best[0, i]
+
+
+@allocation_free(inline="always")
+def _place_group(robot, g, work):
+    if not work.placed[g]:
+        for s in range(robot.first[g], robot.first[g + 1]):
+            place(work.frames, robot.frame[g], robot.spheres, s, work.positions, s)
+        work.placed[g] = True
+
+
+@allocation_free()
+def block_pair_clearances(robot, q, limit, work, out):
+    """Distances between the links of the checked pairs, at most `limit`, of q[dof, 16]: out[pairs, 16]."""
+    place_frames(robot, q, work.frames, work.centres)
+    work.placed[:] = False
+    centres, positions, best = work.centres, work.positions, work.least
+    spheres, bounds, first = robot.spheres, robot.bounds, robot.first
+    for p in range(len(robot.pairs)):
+        a, b = robot.pairs[p, 0], robot.pairs[p, 1]
+        for i in range(W):
+            best[0, i] = limit
+        if _nearer(centres, a, centres, b, bounds[a, 3] + bounds[b, 3], best) > 0:
+            _place_group(robot, a, work)
+            _place_group(robot, b, work)
+            for s in range(first[a], first[a + 1]):
+                radius = spheres[s, 3]
+                if _nearer(positions, s, centres, b, radius + bounds[b, 3], best) > 0:
+                    _keep_least(positions, s, positions, first[b], first[b + 1], spheres, radius, best)
+        for i in range(W):
+            out[p, i] = best[0, i]
+
+
+@njit(cache=True)
+def pair_clearances_into(robot, q, limit, work, out):
+    """Clearances of the checked pairs for the rows of q[n, dof], into out[n, pairs]."""
+    n, dof = q.shape
+    block, found = np.empty((dof, W), np.float32), np.empty((out.shape[1], W), np.float32)
+    for start in range(0, n, W):
+        for i in range(W):
+            row = min(start + i, n - 1)
+            for j in range(dof):
+                block[j, i] = q[row, j]
+        block_pair_clearances(robot, block, limit, work, found)
+        for i in range(min(W, n - start)):
+            for p in range(out.shape[1]):
+                out[start + i, p] = found[p, i]
+
+
+@njit(cache=True, nogil=True)
+def pair_clearances(robot, q, limit):
+    """[n, pairs] distances between checked pairs of links, at most `limit`."""
+    out = np.empty((len(q), len(robot.pairs)), np.float32)
+    pair_clearances_into(robot, q, limit, make_clearance_workspace(robot, 1), out)
+    return out
+
+
+@njit(cache=True)
+def clearances_into(robot, scene, q, limit, work, out):
+    """Clearances of the moving groups for the rows of q[n, dof], into out[n, groups]."""
+    n, dof = q.shape
+    first = len(robot.frame) - out.shape[1]
+    block, found = np.empty((dof, W), np.float32), np.empty((out.shape[1], W), np.float32)
+    best = np.empty((1, W), np.float32)
+    for start in range(0, n, W):
+        for i in range(W):
+            row = min(start + i, n - 1)
+            for j in range(dof):
+                block[j, i] = q[row, j]
+        block_clearances(robot, scene, first, block, limit, work, best, found)
+        for i in range(min(W, n - start)):
+            for g in range(out.shape[1]):
+                out[start + i, g] = found[g, i]
+
+
+@njit(cache=True, nogil=True)
+def link_clearances(robot, scene, q, limit):
+    """[n, moving groups] signed distances to the scene, at most `limit`."""
+    moving = len(robot.frame) - np.searchsorted(robot.frame, 1)
+    out = np.empty((len(q), moving), np.float32)
+    work = make_clearance_workspace(robot, count_obstacles(scene))
+    clearances_into(robot, scene, q, limit, work, out)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def cost_gradients(robot, scene, q, margin, self_margin):
+    """Collision costs [n] of the rows of q[n, dof] and their gradients [n, dof]; see `cost_gradient_at`."""
+    n, dof = q.shape
+    costs, grads = np.empty(n, np.float32), np.zeros((n, dof), np.float32)
+    frames = np.empty((dof + 1, 12), np.float32)
+    links, pairs = link_clearances(robot, scene, q, margin), pair_clearances(robot, q, self_margin)
+    for i in range(n):
+        costs[i] = cost_gradient_at(
+            robot, scene, q[i], links[i], pairs[i], margin, self_margin, frames, grads[i]
+        )
+    return costs, grads

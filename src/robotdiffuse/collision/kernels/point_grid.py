@@ -1,0 +1,225 @@
+"""Compiled queries to point clouds: a grid of distances answers most of them, the points themselves the rest.
+
+The grid holds, for the centre of each voxel, the distance to the nearest point (its centre) and which one it
+is, exact within a band around the points and a lower bound of the distance beyond. A query that lies e from
+its voxel's centre knows the distance to within e. Where that does not decide, the points in the cells around
+are looked at. `points.py` builds the arrays, which are fields of SceneArrays.
+"""
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.collision.kernels.compiled import allocation_free
+
+W = 16
+"""Lanes: configurations per block."""
+KEEP = np.float32(0.3)
+"""Points are known this far beyond the robot's reach; clearances to points count as at most this [m]."""
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
+_HALF = np.float32(0.5)
+_TINY = np.float32(1e-9)
+_SLACK = np.float32(1e-5)
+"""More than what rounding does to a distance within the grid [m]."""
+
+
+@njit(fastmath=True, cache=True)
+def splat(points, low, voxel, shape, band):
+    """Nearest point to every voxel centre within `band` [m]: squared distances [nx ny nz], indices or -1."""
+    nx, ny, nz = shape
+    squares = np.full(nx * ny * nz, band * band, np.float32)
+    nearest = np.full(nx * ny * nz, -1, np.int32)
+    for p in range(len(points)):
+        px, py, pz = (
+            (points[p, 0] - low[0]) / voxel,
+            (points[p, 1] - low[1]) / voxel,
+            (points[p, 2] - low[2]) / voxel,
+        )
+        span = band / voxel
+        i0, i1 = max(int(px - span), 0), min(int(px + span) + 1, nx)
+        j0, j1 = max(int(py - span), 0), min(int(py + span) + 1, ny)
+        k0, k1 = max(int(pz - span), 0), min(int(pz + span) + 1, nz)
+        for i in range(i0, i1):
+            dx = (np.float32(i) + _HALF - px) * voxel
+            for j in range(j0, j1):
+                dy = (np.float32(j) + _HALF - py) * voxel
+                base = dx * dx + dy * dy
+                if base >= band * band:
+                    continue
+                row = (i * ny + j) * nz
+                for k in range(k0, k1):
+                    dz = (np.float32(k) + _HALF - pz) * voxel
+                    d = base + dz * dz
+                    closer = d < squares[row + k]
+                    squares[row + k] = d if closer else squares[row + k]
+                    nearest[row + k] = p if closer else nearest[row + k]
+    return squares, nearest
+
+
+@allocation_free(fastmath=True)
+def grid_states(at, s, radius, grid, frame, state):
+    """What the grid says of a sphere in 16 lanes: 0 free, 2 touches a point, 1 unknown. Returns their sum."""
+    nx, ny, nz = np.int32(frame[8]), np.int32(frame[9]), np.int32(frame[10])
+    band = frame[7]
+    lx, ly, lz, voxel = frame[0], frame[1], frame[2], frame[3]
+    inverse = _ONE / voxel
+    free = radius + frame[5] + _SLACK
+    hit = radius + frame[6] - _SLACK
+    mx, my, mz = np.float32(nx) - _HALF, np.float32(ny) - _HALF, np.float32(nz) - _HALF
+    total = 0
+    for i in range(W):
+        fx, fy, fz = (
+            (at[s, i] - lx) * inverse,
+            (at[s, W + i] - ly) * inverse,
+            (at[s, 2 * W + i] - lz) * inverse,
+        )
+        cx, cy, cz = min(max(fx, _ZERO), mx), min(max(fy, _ZERO), my), min(max(fz, _ZERO), mz)
+        ix, iy, iz = np.int32(cx), np.int32(cy), np.int32(cz)
+        g = grid[(ix * ny + iy) * nz + iz]
+        ex, ey, ez = cx - np.float32(ix) - _HALF, cy - np.float32(iy) - _HALF, cz - np.float32(iz) - _HALF
+        e = voxel * np.sqrt(ex * ex + ey * ey + ez * ez)
+        ox, oy, oz = fx - cx, fy - cy, fz - cz
+        out = voxel * voxel * (ox * ox + oy * oy + oz * oz)
+        inner = max(g - e, _ZERO)
+        near = np.int32(inner * inner + out < free * free)
+        inside = np.int32(g + e + np.sqrt(out) < hit) * np.int32(g < band)
+        state[i] = near + near * inside
+        total += near + near * inside
+    return total
+
+
+@allocation_free()
+def touch_points(at, s, radius, scene, mark, state, hits):
+    """Adds 1 to the lanes whose sphere touches a point; returns how many there are, with `mark` at least."""
+    near = grid_states(at, s, radius, scene.grid, scene.grid_frame, state)
+    if mark or near == 0:
+        return near
+    total = 0
+    for i in range(W):
+        if state[i] == 2 or (
+            state[i] == 1 and _touches(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], radius)
+        ):
+            hits[i] += 1
+            total += 1
+    return total
+
+
+@allocation_free()
+def _touches(scene, x, y, z, radius):
+    _, _, p = _look_up(scene, x, y, z)
+    if p >= 0:
+        point = scene.points[p]
+        dx, dy, dz, r = point[0] - x, point[1] - y, point[2] - z, radius + point[3]
+        if dx * dx + dy * dy + dz * dz < r * r:
+            return True
+    best, _ = _search(scene, x, y, z, radius, True)
+    return best < radius
+
+
+@allocation_free()
+def _look_up(scene, x, y, z):
+    """Lower bound of the distance to any point's surface, the squared distance from the grid, and a point."""
+    frame = scene.grid_frame
+    voxel = frame[3]
+    fx, fy, fz = (x - frame[0]) / voxel, (y - frame[1]) / voxel, (z - frame[2]) / voxel
+    cx = min(max(fx, _ZERO), frame[8] - _HALF)
+    cy = min(max(fy, _ZERO), frame[9] - _HALF)
+    cz = min(max(fz, _ZERO), frame[10] - _HALF)
+    ix, iy, iz = np.int32(cx), np.int32(cy), np.int32(cz)
+    index = (ix * np.int32(frame[9]) + iy) * np.int32(frame[10]) + iz
+    ex, ey, ez = cx - np.float32(ix) - _HALF, cy - np.float32(iy) - _HALF, cz - np.float32(iz) - _HALF
+    inner = max(scene.grid[index] - voxel * np.sqrt(ex * ex + ey * ey + ez * ez), _ZERO)
+    ox, oy, oz = fx - cx, fy - cy, fz - cz
+    out = voxel * voxel * (ox * ox + oy * oy + oz * oz)
+    return np.sqrt(inner * inner + out) - frame[5] - _SLACK, out, scene.nearest[index]
+
+
+@allocation_free(fastmath=True)
+def _search(scene, x, y, z, limit, any_hit):
+    """Distance to the surface of the nearest point (with `any_hit`: of any) below `limit`, else `limit`."""
+    points, first, frame = scene.points, scene.cell_first, scene.grid_frame
+    cell = frame[4]
+    mx, my, mz = int(frame[11]), int(frame[12]), int(frame[13])
+    reach = limit + frame[5] + _SLACK
+    best, where = limit, -1
+    if reach <= _ZERO:
+        return best, where
+    rx, ry, rz = x - frame[0], y - frame[1], z - frame[2]
+    i0, i1 = max(int((rx - reach) / cell), 0), min(int((rx + reach) / cell), mx - 1)
+    j0, j1 = max(int((ry - reach) / cell), 0), min(int((ry + reach) / cell), my - 1)
+    for i in range(i0, i1 + 1):
+        gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), _ZERO)
+        for j in range(j0, j1 + 1):
+            gy = max(max(np.float32(j) * cell - ry, ry - np.float32(j + 1) * cell), _ZERO)
+            rest = reach * reach - gx * gx - gy * gy
+            if rest <= _ZERO:
+                continue
+            half = np.sqrt(rest) + _SLACK
+            k0, k1 = max(int((rz - half) / cell), 0), min(int((rz + half) / cell), mz - 1)
+            if k0 > k1:
+                continue
+            row = (i * my + j) * mz
+            for p in range(first[row + k0], first[row + k1 + 1]):
+                dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                r = best + points[p, 3]
+                square = dx * dx + dy * dy + dz * dz
+                if r > _ZERO and square < r * r:
+                    best, where = np.sqrt(square) - points[p, 3], p
+                    if any_hit:
+                        return best, where
+            reach = best + frame[5] + _SLACK
+            if reach <= _ZERO:
+                return best, where
+    return best, where
+
+
+@allocation_free()
+def points_distance(scene, x, y, z, limit):
+    """Distance to the nearest of the scene's points, at most `limit`.
+
+    Exact within the grid's band, a lower bound beyond it.
+    """
+    lower, _, p = _look_up(scene, x, y, z)
+    if lower >= limit:
+        return limit
+    if p < 0:
+        return lower
+    point = scene.points[p]
+    dx, dy, dz = point[0] - x, point[1] - y, point[2] - z
+    best = min(np.sqrt(dx * dx + dy * dy + dz * dz) - point[3], limit)
+    found, _ = _search(scene, x, y, z, best, False)
+    return min(found, best)
+
+
+@allocation_free()
+def points_lower_bound(scene, x, y, z):
+    """A lower bound of the distance to the points, from the grid alone."""
+    return _look_up(scene, x, y, z)[0]
+
+
+@allocation_free()
+def near_point(scene, x, y, z, limit):
+    """Distance to a point that is nearest up to a few millimetres, if below `limit`, and its gradient.
+
+    The nearest of those that the eight voxels around know; for gradients, where a search would cost too much.
+    """
+    best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
+    lower, _, _ = _look_up(scene, x, y, z)
+    if lower >= limit:
+        return best, bx, by, bz
+    frame, points = scene.grid_frame, scene.points
+    nx, ny, nz = int(frame[8]), int(frame[9]), int(frame[10])
+    voxel = frame[3]
+    i = min(max(int(np.floor((x - frame[0]) / voxel - _HALF)), 0), nx - 2)
+    j = min(max(int(np.floor((y - frame[1]) / voxel - _HALF)), 0), ny - 2)
+    k = min(max(int(np.floor((z - frame[2]) / voxel - _HALF)), 0), nz - 2)
+    for corner in range(8):
+        a, b, c = corner >> 2, (corner >> 1) & 1, corner & 1
+        p = scene.nearest[((i + a) * ny + j + b) * nz + k + c]
+        if p < 0:
+            continue
+        dx, dy, dz = x - points[p, 0], y - points[p, 1], z - points[p, 2]
+        d = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
+        if d - points[p, 3] < best:
+            best, bx, by, bz = d - points[p, 3], dx / d, dy / d, dz / d
+    return best, bx, by, bz

@@ -1,0 +1,321 @@
+"""MPiNets: a policy that sees a labelled point cloud and moves the arm one step at a time.
+
+A. Fishman et al., "Motion Policy Networks", CoRL 2022. PointNet++ encodes one cloud of points of the scene,
+of the robot at its current configuration q_t and of the target; a few layers encode q_t; both together are
+decoded to a displacement, q_{t+1} = clamp(q_t + dq). Trained by behaviour cloning on the steps of planned
+motions, with the paper's two losses: the mean L1 and squared distances between points of the arm at the
+predicted and at the expert's next configuration, and a hinge on the signed distance to the scene.
+
+Settings as in the paper: displacements in units of the joint ranges, clamped at the limits; weights 1 and 5
+of point match and collision; hinge at 3 cm; noise of 0.015 rad on the input; LeakyReLU in encoder and
+decoder, group normalisation in the layers after PointNet++ and none within it; layers 32, 64, 128, 128, 64
+for the configuration and 512, 256, 128 for the decoder.
+
+Differences from the paper:
+
+- *Size*, for training on one core: a cloud of 256 + 12 + 6 per link points (for a Panda 256 scene, 120 robot,
+  60 target; paper 4,096, 2,048 and 128); set abstraction with 96 and 24 centres of 16 neighbours each and
+  balls of 0.2 and 0.6 m for the sparser cloud (512 and 128 of 128; 0.05 and 0.3 m); narrower layers (the
+  paper's end in 1,024, then 4,096, 2,048, 2,048 features); batches of 128 at a rate of 2e-3 (10 at 1e-4);
+  losses on the robot's points of the cloud (1,024).
+- *Target*: a configuration, as our problems demand it to 1e-4 rad, where the paper's is a pose of the hand.
+  So the target's points are those of the whole arm at the goal, the configuration encoder sees the direction
+  to the goal configuration too, and points are labelled by link, not only as scene, robot or target.
+- The floor, which is part of every scene, is in the collision loss but not in the cloud.
+- The collision loss is on the arm's covering spheres, which stick out a little, not on points.
+- The expert's motions are ours, of 48 frames (50), forwards or backwards, with a stand-still at the end.
+- Displacements are output in units of the experts' mean step, and weights begin as K. He et al. (ICCV 2015)
+  have them: with PyTorch's defaults, signals fade in so many layers, and learning takes many times as long.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, Int8
+from numpy import ndarray
+from torch import Tensor, nn
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.networks.base import BaselineNetwork, JointRanges
+from robotdiffuse.learning.networks.pointnet2 import GroupAll, SetAbstraction
+from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
+from robotdiffuse.learning.training.losses import ArmDistance, SurfacePoints, hinge
+from robotdiffuse.learning.training.validation import motions_free
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import ForwardKinematics
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.sampling import VisibleRegion
+from robotdiffuse.scenes.surface_clouds import surface_clouds
+
+SMOOTH = 0.1
+"""Added to the distance to the goal, in units of half the joint ranges, where it is made a direction."""
+LOSS_UNIT = 0.01
+"""[m], so that losses are not far from 1."""
+ROLL_OUTS = 40
+"""Held-out problems of `success`."""
+ROLL_OUT_STEPS = 80
+"""Most steps of each; the experts take 47."""
+
+
+@dataclass(frozen=True)
+class MPiNetsNetworkSettings:
+    scene_points: int = 256
+    """Points of the scene (paper: 4,096)."""
+    robot_points: int = 12
+    """Points of each moving link at the current configuration (paper: 2,048 in all)."""
+    target_points: int = 6
+    """The first so many of these at the goal (paper: 128 in all, of the gripper)."""
+    region: VisibleRegion = field(default_factory=VisibleRegion)
+    """Where points of the scene count."""
+    centres: tuple[int, int] = (96, 24)
+    """Of the two set abstractions (paper: 512, 128)."""
+    neighbours: tuple[int, int] = (16, 16)
+    """Most points around each centre (paper: 128, 128)."""
+    radii: tuple[float, float] = (0.2, 0.6)
+    """Of the balls [m] (paper: 0.05, 0.3)."""
+    first_widths: tuple[int, ...] = (32, 32, 64)
+    """Layers of the first set abstraction (paper: 64, 64, 64)."""
+    second_widths: tuple[int, ...] = (96, 128, 192)
+    """Of the second (paper: 128, 128, 256)."""
+    all_widths: tuple[int, ...] = (256, 512)
+    """Of all points together (paper: 512, 512, 1,024)."""
+    cloud_widths: tuple[int, int] = (512, 256)
+    """Layers after PointNet++, the last of which is its code (paper: 4,096, 2,048, 2,048)."""
+    joint_widths: tuple[int, ...] = (32, 64, 128, 128, 64)
+    """Layers of the configuration encoder (the paper's)."""
+    decoder_widths: tuple[int, ...] = (512, 256, 128)
+    """Layers of the decoder (the paper's)."""
+    point_match: float = 1.0
+    """Weight of the loss on points of the arm (the paper's)."""
+    collision: float = 5.0
+    """Weight of the loss on the distance to the scene (the paper's)."""
+    margin: float = 0.03
+    """Distance to the scene at which it sets in [m] (the paper's)."""
+    noise: float = 0.015
+    """Standard deviation of the noise on the input configuration [rad] (the paper's)."""
+    trivial_share: float = 0.3
+    """Share of the samples from motions whose straight line is free too."""
+    near: float = 0.3
+    """In `success`: largest distance of a joint at which the goal is reached by a straight edge [rad]."""
+
+    def __post_init__(self) -> None:
+        for name in ("scene_points", "robot_points", "target_points"):
+            if getattr(self, name) < 1:
+                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be at least 1")
+        if self.target_points > self.robot_points:
+            raise InputError(
+                f"mpinets.target_points is {self.target_points}; it must be at most robot_points, "
+                f"{self.robot_points}"
+            )
+        for name in ("centres", "neighbours", "radii"):
+            if len(getattr(self, name)) != 2 or not min(getattr(self, name)) > 0:
+                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be two positive numbers")
+        if self.centres[0] > self.scene_points or self.centres[1] > self.centres[0]:
+            raise InputError(
+                f"mpinets.centres is {self.centres}; it must fall, from at most scene_points, "
+                f"{self.scene_points}"
+            )
+        for name in ("first_widths", "second_widths", "all_widths", "cloud_widths", "joint_widths",
+                     "decoder_widths"):  # fmt: skip
+            if not getattr(self, name) or min(getattr(self, name)) < 1:
+                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be positive numbers")
+        if len(self.cloud_widths) != 2 or self.cloud_widths[0] % GROUPS:
+            raise InputError(
+                f"mpinets.cloud_widths is {self.cloud_widths}; it must be two numbers, the first a multiple "
+                f"of {GROUPS}"
+            )
+        for name in ("point_match", "collision", "margin", "noise", "near"):
+            if not getattr(self, name) >= 0:
+                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must not be negative")
+        if not 0 <= self.trivial_share <= 1:
+            raise InputError(f"mpinets.trivial_share is {self.trivial_share}; it must be between 0 and 1")
+
+
+GROUPS = 16
+"""Of the group normalisation (the paper's)."""
+
+
+class Steps(NamedTuple):
+    """Training samples: one step of a motion each."""
+
+    q: Float32[Tensor, "n dof"]
+    """Where the arm is, with noise [rad]."""
+    expert: Float32[Tensor, "n dof"]
+    """The next frame of the motion [rad]."""
+    goal: Float32[Tensor, "n dof"]
+    clouds: Float32[Tensor, "n points 3"]
+    """Of the scenes [m]."""
+    kinds: Int8[ndarray, "n k"]
+    params: Float32[ndarray, "n k 10"]
+
+
+class MPiNetsNetwork(BaselineNetwork):
+    """The policy. It loads the robot, bundled or from its URDF, for surface points and covering spheres."""
+
+    settings_class = MPiNetsNetworkSettings
+    training_defaults: ClassVar[dict[str, Any]] = {"batch": 128, "learning_rate": 2e-3}
+    settings: MPiNetsNetworkSettings
+
+    def __init__(self, ranges: JointRanges, settings: MPiNetsNetworkSettings) -> None:
+        super().__init__(ranges, settings)
+        s, kinematics = settings, ForwardKinematics(load_robot(ranges.robot))
+        # always the same points, so that a checkpoint needs no copy of them
+        self._surface = SurfacePoints(kinematics, s.robot_points, np.random.default_rng(0))
+        self._distance = ArmDistance(kinematics)
+        on_arm = self._surface(torch.zeros(self.dof)).shape[0]
+        links = on_arm // s.robot_points
+        at = torch.arange(on_arm).view(links, s.robot_points)
+        self._target = at[:, : s.target_points].reshape(-1)
+        labels = [torch.zeros(s.scene_points, dtype=torch.int64), 1 + at // s.robot_points]
+        labels.append(1 + links + self._target // s.robot_points)
+        label = torch.cat([part.reshape(-1) for part in labels])
+        self._labels = nn.functional.one_hot(label, 1 + 2 * links).float()
+        """One-hot: scene, each link of the robot, each link of the target."""
+        self.first = SetAbstraction(1 + 2 * links, s.first_widths, s.centres[0], s.neighbours[0], s.radii[0])
+        self.second = SetAbstraction(
+            s.first_widths[-1], s.second_widths, s.centres[1], s.neighbours[1], s.radii[1]
+        )
+        self.together = GroupAll(s.second_widths[-1], s.all_widths)
+        wide, code = s.cloud_widths
+        self.cloud_code = nn.Sequential(
+            nn.Linear(s.all_widths[-1], wide),
+            nn.GroupNorm(GROUPS, wide),
+            nn.LeakyReLU(),
+            nn.Linear(wide, code),
+        )
+        self.joint_code = _leaky(2 * self.dof, s.joint_widths)
+        last = nn.Linear(s.decoder_widths[-1], self.dof)
+        self.decoder = nn.Sequential(
+            _leaky(code + s.joint_widths[-1], s.decoder_widths), nn.LeakyReLU(), last
+        )
+        for layer in self.modules():
+            if isinstance(layer, nn.Linear):
+                nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+                nn.init.zeros_(layer.bias)
+        nn.init.normal_(last.weight, std=0.01)
+        self.register_buffer("step", torch.full((self.dof,), 0.02))
+        self.step: Tensor
+        """Size of an expert's step, in units of half the joint ranges."""
+
+    def fit_statistics(self, data: TrajectoryData) -> None:
+        """The size of the experts' steps."""
+        some = data.q[:20_000]
+        size = np.sqrt(np.square(self.normalized(some[:, 1:]) - self.normalized(some[:, :-1])).mean((0, 1)))
+        self.step.copy_(torch.from_numpy(np.maximum(size, 1e-4)))
+
+    def forward(
+        self,
+        clouds: Float32[Tensor, "n points 3"],
+        q: Float32[Tensor, "n dof"],
+        goal: Float32[Tensor, "n dof"],
+    ) -> Float32[Tensor, "n dof"]:
+        """The next configurations, within limits [rad]; clouds of the scenes [m], q and goal in [rad]."""
+        points = torch.cat([clouds, self._surface(q), self._surface(goal)[:, self._target]], 1).detach()
+        with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+            labels = self._labels.to(torch.bfloat16 if fast_bf16() else torch.float32)
+            at, features = self.first(points, labels.expand(len(q), *labels.shape))
+            seen = self.cloud_code(self.together(*self.second(at, features)))
+        # bf16 would round configurations to a hundredth of a radian
+        x = self.normalized(q)
+        way = self.normalized(goal) - x
+        direction = 2 * way / (way.norm(dim=-1, keepdim=True) + SMOOTH)
+        code = torch.cat([seen.float(), self.joint_code(torch.cat([x, direction], -1))], -1)
+        return self.joints((x + self.step * self.decoder(code)).clamp(-1, 1))
+
+    def loss(
+        self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
+    ) -> Float[Tensor, ""]:
+        """Point match and collision of one step each of `count` motions, in units of `LOSS_UNIT`."""
+        s, steps = self.settings, self.draw(data, count, rng)
+        q = self(steps.clouds, steps.q, steps.goal)
+        error = self._surface(q) - self._surface(steps.expert)
+        match = error.square().mean() + error.abs().mean()
+        close = hinge(self._distance(q[:, None], steps.kinds, steps.params), s.margin).mean()
+        return (s.point_match * match + s.collision * close) / LOSS_UNIT
+
+    def draw(self, data: TrajectoryData, count: int, rng: np.random.Generator) -> Steps:
+        """Random frames of random motions, forwards or backwards, and the frames that follow them."""
+        rows = data.draw(count, self.settings.trivial_share, rng)
+        last = data.q.shape[1] - 1
+        way = np.where(rng.random(count) < 0.5, 1, -1)
+        frame = rng.integers(0, last + 1, count)
+        frames = np.stack([frame, np.minimum(frame + 1, last), np.full(count, last)])
+        q, expert, goal = data.q[rows, np.where(way > 0, frames, last - frames)]
+        q = q + self.settings.noise * rng.standard_normal(q.shape, dtype=np.float32)
+        q = self.joints(np.clip(self.normalized(q), -1, 1))
+        kinds, params = data.kinds[rows], data.params[rows]
+        clouds = self.clouds(kinds, params, rng)
+        here, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
+        return Steps(here, after, end, clouds, kinds, params)
+
+    def clouds(
+        self, kinds: Int8[ndarray, "n k"], params: Float32[ndarray, "n k 10"], rng: np.random.Generator
+    ) -> Float32[Tensor, "n points 3"]:
+        """Random clouds of packed scenes as the network wants them [m]; zeros where nothing is in reach."""
+        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+        scenes = torch.from_numpy(kinds), torch.from_numpy(params)
+        return surface_clouds(*scenes, self.settings.scene_points, generator, region=self.settings.region)
+
+    def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
+        """Share of some motions that are not trivial that a single roll-out brings, free of collision, near
+        enough to the goal that a free straight edge leads to it."""
+        rows = np.flatnonzero(~data.trivial)[:ROLL_OUTS]
+        if not len(rows):
+            return None
+        kinds, params, q = data.kinds[rows], data.params[rows], data.q[rows].astype(np.float32)
+        roll_outs = RollOuts(self, self.clouds(kinds, params, rng), q[:, 0], q[:, -1])
+        for _ in range(ROLL_OUT_STEPS):
+            roll_outs.stop(roll_outs.distances() < self.settings.near)
+            if not roll_outs.running.any():
+                break
+            roll_outs.advance()
+        arrived = roll_outs.distances() < self.settings.near
+        motions = np.concatenate([np.stack(roll_outs.frames, 1), q[:, -1:]], 1)
+        return float((arrived & motions_free(robot, kinds, params, motions)).mean())
+
+
+class RollOuts:
+    """Motions that the policy makes step by step, several at once."""
+
+    def __init__(
+        self,
+        network: MPiNetsNetwork,
+        clouds: Float32[Tensor, "n points 3"],
+        start: Float32[ndarray, "n dof"],
+        goal: Float32[ndarray, "n dof"],
+    ) -> None:
+        """clouds of the scenes [m]; start and goal in [rad]."""
+        self.network, self._clouds, self._goal = network, clouds, goal
+        self.frames = [start]
+        """[n, dof] after each step [rad]; roll-outs that have stopped stay where they are."""
+        self.running = np.ones(len(start), bool)
+
+    def distances(self) -> Float[ndarray, "n"]:
+        """How far the joint farthest from its goal is [rad]."""
+        return np.abs(self.frames[-1] - self._goal).max(1)
+
+    def stop(self, which: Bool[ndarray, "n"]) -> None:
+        self.running &= ~which
+
+    def advance(self, noise: Float32[ndarray, "n dof"] | None = None) -> None:
+        """One step of those that run; `noise` [rad] is added to where the policy sees the arm."""
+        rows = np.flatnonzero(self.running)
+        seen = self.frames[-1] if noise is None else self.frames[-1] + noise
+        q = self.network.normalized(seen[rows]).clip(-1, 1)
+        with torch.inference_mode():
+            at, goal = (torch.from_numpy(part) for part in (self.network.joints(q), self._goal[rows]))
+            moved = self.network(self._clouds[torch.from_numpy(rows)], at, goal).numpy()
+        after = self.frames[-1].copy()
+        after[rows] = moved
+        self.frames.append(after)
+
+
+def _leaky(channels: int, widths: tuple[int, ...]) -> nn.Sequential:
+    """Linear layers with a LeakyReLU between them."""
+    layers: list[nn.Module] = []
+    for width in widths:
+        layers += [nn.Linear(channels, width), nn.LeakyReLU()]
+        channels = width
+    return nn.Sequential(*layers[:-1])

@@ -1,0 +1,320 @@
+"""MPNet's networks: Enet, which encodes the obstacles, and Pnet, which takes the next step to the goal.
+
+A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
+Learning-based and Classical Motion Planners", T-RO 2020. Enet is a contractive auto-encoder of the obstacles'
+point cloud. Pnet is a perceptron from (z, a configuration, the goal) to the next waypoint, learnt from the
+waypoints of planned paths in both directions. Its dropout stays on while it plans: that is where MPNet's
+randomness comes from. The planner around it is `planners.mpnet`.
+
+Differences from the paper:
+
+- Enet and Pnet are smaller, to be trained in an hour of one core; see the settings for the paper's sizes.
+- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here one run does both, one after
+  the other: z of an auto-encoder alone does not keep what decides about collisions, and end to end is cheap,
+  as the waypoints of a trajectory share their z.
+- The paper's clouds list the obstacles in a fixed order. A sensed cloud has none, so points are sorted along
+  a space-filling curve: neighbours in the list are neighbours in space, and a perceptron can average them.
+- The contractive penalty is that of S. Rifai et al., "Contractive auto-encoders", ICML 2011, which the paper
+  names; its equation has the squared weights in that place.
+- Pnet gives the step to the next waypoint, in units of the steps of the data, in place of the waypoint: so
+  dropout disturbs the step alone, not where the arm already is.
+- A quarter of Pnet's outputs is dropped, not half: of its narrower layers about as many are left as in the
+  paper. With half, Pnet learns far less in the training that it has here.
+- Waypoints are 0.7 rad apart on our demonstrations, from a random frame on; those of the paper are the
+  vertices of optimised RRT* paths. It is a sixth of a path on average, and the chords are 0.3 % shorter than
+  the paths; steps of one length leave no doubt about it, as steps of a share of the path would.
+- Half of the samples have a later waypoint for their goal, not the last one: such pairs are what
+  bidirectional planning and replanning ask for.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from torch import Generator, Tensor, nn
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.networks.base import BaselineNetwork, JointRanges
+from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
+from robotdiffuse.learning.training.validation import motions_free
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.sampling import PANDA_REGION, VisibleRegion
+from robotdiffuse.scenes.surface_clouds import surface_clouds
+
+BITS = 10
+"""Of each coordinate in the place of a point along the space-filling curve."""
+SUCCESS_PROBLEMS = 64
+SUCCESS_STEPS = 24
+"""Calls of Pnet in a motion of `success`."""
+
+
+@dataclass(frozen=True)
+class MPNetSettings:
+    points: int = 320
+    """Points of the cloud that Enet sees (paper: 1,400, of a plane)."""
+    encoder_layers: tuple[int, ...] = (384, 256, 128)
+    """Layers of Enet between the cloud and z (paper: 512, 256, 128)."""
+    decoder_layer: int = 128
+    """The one layer between z and the reconstruction, which is of no use after the training (paper: the
+    mirror image of Enet)."""
+    code: int = 60
+    """Size of z (paper: 28, for a plane)."""
+    contraction: float = 1e-3
+    """lambda, the weight of the contractive penalty [m^2]."""
+    pretraining: float = 0.1
+    """Share of the training, the first, in which Enet is trained as an auto-encoder."""
+    layers: tuple[int, ...] = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
+    """Layers of Pnet (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
+    dropout: float = 0.25
+    """Share of the outputs of Pnet's layers that is dropped, in planning as in training (paper: 0.5,
+    of wider layers)."""
+    steady_layers: int = 2
+    """So many of Pnet's layers, the last, have no dropout (paper: nearly all have it)."""
+    step: float = 0.7
+    """Way along the path from one waypoint to the next [rad, joint-space L2]."""
+    waypoints: int = 8
+    """Samples drawn of each trajectory; they share z."""
+    sub_goals: float = 0.5
+    """Share of the samples whose goal is a later frame of the trajectory than its last one."""
+    trivial_share: float = 0.15
+    """Share of the trajectories in training whose straight line is free as well."""
+
+    def __post_init__(self) -> None:
+        for name in ("points", "code", "decoder_layer", "waypoints"):
+            if getattr(self, name) < 1:
+                raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must be at least 1")
+        for name in ("encoder_layers", "layers"):
+            if not getattr(self, name) or min(getattr(self, name)) < 1:
+                raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must hold sizes of at least 1")
+        for name in ("dropout", "pretraining"):
+            if not 0 <= getattr(self, name) < 1:
+                raise InputError(
+                    f"mpnet.{name} is {getattr(self, name)}; it must be at least 0 and less than 1"
+                )
+        for name in ("sub_goals", "trivial_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must be between 0 and 1")
+        if not self.step > 0:
+            raise InputError(f"mpnet.step is {self.step}; it must be positive")
+        if not self.contraction >= 0:
+            raise InputError(f"mpnet.contraction is {self.contraction}; it must not be negative")
+        if not 0 <= self.steady_layers <= len(self.layers):
+            raise InputError(
+                f"mpnet.steady_layers is {self.steady_layers}; Pnet has {len(self.layers)} layers"
+            )
+
+
+class MPNetNetwork(BaselineNetwork):
+    """Enet with its decoder, and Pnet."""
+
+    settings_class: ClassVar[type] = MPNetSettings
+    training_defaults: ClassVar[dict[str, Any]] = {"batch": 1024}
+    settings: MPNetSettings
+    region: VisibleRegion = PANDA_REGION
+    """Where points on obstacles count."""
+
+    def __init__(self, ranges: JointRanges, settings: MPNetSettings | None = None) -> None:
+        super().__init__(ranges, settings or MPNetSettings())
+        of = self.settings
+        sizes = (3 * of.points, *of.encoder_layers, of.code)
+        self.encoder = Perceptron(sizes)
+        self.decoder = Perceptron((of.code, of.decoder_layer, sizes[0]))
+        self.policy = Perceptron(
+            (of.code + 2 * self.dof, *of.layers, self.dof), of.dropout, len(of.layers) - of.steady_layers
+        )
+        self.register_buffer("step_scale", torch.tensor(0.1))
+        self.step_scale: Tensor
+
+    def fit_statistics(self, data: TrajectoryData) -> None:
+        """The root mean square of the steps between waypoints, which Pnet's output is in units of."""
+        if len(data):
+            rng = np.random.default_rng(0)
+            rows = data.draw(5_000, self.settings.trivial_share, rng)
+            here, following, _ = self._samples(data.q[rows], rng)
+            step = self.normalized(following) - self.normalized(here)
+            self.step_scale.fill_(max(float(np.sqrt(np.mean(step**2))), 1e-3))
+
+    def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
+        """z of clouds of `settings.points` points, in any order [m]; all zeros: nothing is in the way."""
+        return self.encoder(arranged(cloud, self.region).flatten(1))
+
+    def next_states(
+        self,
+        z: Float[Tensor, "batch code"],
+        q: Float[Tensor, "batch dof"],
+        goal: Float[Tensor, "batch dof"],
+        generator: Generator | None,
+    ) -> Float[Tensor, "batch dof"]:
+        """The next waypoints from q to the goal, within the joint limits [rad].
+
+        Dropout is drawn from the generator, in training and evaluation mode alike; None: without dropout.
+        """
+        x, target = self.normalized(q), self.normalized(goal)
+        step = self.policy(torch.cat([z, x, target], 1), generator)
+        return self.joints((x + self.step_scale * step).clamp(-1, 1))
+
+    def loss(
+        self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
+    ) -> Float[Tensor, ""]:
+        """The auto-encoder's loss in the first part of the training [m^2], then Pnet's, through Enet.
+
+        Samples are `waypoints` to a scene. Pnet's is the mean squared error of the steps, in units of their
+        size in the data.
+        """
+        of = self.settings
+        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+        rows = data.draw(max(1, count // of.waypoints), of.trivial_share, rng)
+        cloud = self.clouds(data, rows, generator)
+        with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+            if fraction < of.pretraining:
+                return self.autoencoder_loss(cloud, generator)
+            z = self.encode(cloud).repeat_interleave(of.waypoints, 0)
+            q, following, goal = (torch.from_numpy(a) for a in self._samples(data.q[rows], rng))
+            x, target = self.normalized(q), self.normalized(goal)
+            step = self.policy(torch.cat([z, x.to(z), target.to(z)], 1), generator)
+        wanted = (self.normalized(following) - x) / self.step_scale
+        return (step.float() - wanted).square().mean()
+
+    def autoencoder_loss(
+        self, cloud: Float[Tensor, "batch points 3"], generator: Generator
+    ) -> Float[Tensor, ""]:
+        """The mean squared distance of points to their reconstructions, and lambda |dz / d cloud|^2 [m^2]."""
+        flat = arranged(cloud, self.region).flatten(1)
+        z, slopes = self.encoder.with_slopes(flat)
+        error = (self.decoder(z).float() - flat).view(len(cloud), -1, 3).square().sum(-1).mean()
+        signs = torch.empty_like(z).bernoulli_(0.5, generator=generator) * 2 - 1
+        return error + self.settings.contraction * squared_slope(self.encoder, slopes, signs).mean()
+
+    def clouds(
+        self, data: TrajectoryData, rows: Int[ndarray, "scenes"], generator: Generator
+    ) -> Float[Tensor, "scenes points 3"]:
+        """A random cloud of the obstacles of each of these trajectories [m]."""
+        scenes = torch.from_numpy(data.kinds[rows]), torch.from_numpy(data.params[rows])
+        return surface_clouds(*scenes, self.settings.points, generator, region=self.region)
+
+    def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
+        """Share of held-out problems solved by one run of bidirectional planning, without any replanning."""
+        rows = np.flatnonzero(~data.trivial)[:SUCCESS_PROBLEMS]
+        if not len(rows):
+            return None
+        generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
+        kinds, params, q = data.kinds[rows], data.params[rows], data.q[rows]
+        with torch.inference_mode():
+            z = self.encode(self.clouds(data, rows, generator))
+            forth, back = ([torch.from_numpy(np.ascontiguousarray(q[:, at]))] for at in (0, -1))
+            found, ended = np.zeros((2, len(rows)), np.bool_)
+            for _ in range(SUCCESS_STEPS):
+                forth.append(self.next_states(z, forth[-1], back[-1], generator))
+                path = torch.stack([*forth, *back[::-1]], 1).numpy()
+                gap = refined(path[:, len(forth) - 1 : len(forth) + 1], 8)
+                joined = np.flatnonzero(~ended)
+                joined = joined[motions_free(robot, kinds[joined], params[joined], gap[joined])]
+                fine = refined(path[joined], 3)
+                found[joined] = motions_free(robot, kinds[joined], params[joined], fine)
+                ended[joined] = True
+                forth, back = back, forth
+        return float(found.mean())
+
+    def _samples(
+        self, q: Float[ndarray, "scenes frames dof"], rng: np.random.Generator
+    ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
+        """Configurations, the waypoints that follow them, and goals, in random directions [rad]."""
+        of, last = self.settings, q.shape[1] - 1
+        spacing = np.linalg.norm(np.diff(q, axis=1), axis=2).mean(1)
+        stride = np.clip(np.rint(of.step / np.maximum(spacing, 1e-6)), 1, last).astype(np.int64)
+        rows = np.repeat(np.arange(len(q)), of.waypoints)
+        n = len(rows)
+        goal = np.full(n, last)
+        near = rng.random(n) < of.sub_goals
+        goal[near] = 1 + (rng.random(int(near.sum())) * last).astype(np.int64)
+        at = (rng.random(n) * goal).astype(np.int64)
+        places = at, np.minimum(at + stride[rows], goal), goal
+        back = rng.random(n) < 0.5
+        here, following, end = (q[rows, np.where(back, last - place, place)] for place in places)
+        return here, following, end
+
+
+def refined(path: Float[ndarray, "n frames dof"], parts: int) -> Float[ndarray, "n _ dof"]:
+    """The path with so many equal parts in place of each of its segments."""
+    n, frames, dof = path.shape
+    share = (np.arange(parts, dtype=path.dtype) / parts)[:, None]
+    dense = path[:, :-1, None] + share * np.diff(path, axis=1)[:, :, None]
+    return np.concatenate([dense.reshape(n, (frames - 1) * parts, dof), path[:, -1:]], 1)
+
+
+class Perceptron(nn.Module):
+    """Linear layers with a PReLU between each two."""
+
+    def __init__(self, sizes: Sequence[int], dropout: float = 0.0, dropped_layers: int = 0) -> None:
+        """Dropout follows the first `dropped_layers` activations."""
+        super().__init__()
+        self.dropout, self.dropped_layers = dropout, dropped_layers
+        linear = [nn.Linear(a, b) for a, b in pairwise(sizes)]
+        activations = [nn.PReLU() for _ in sizes[1:-1]]
+        self.linear, self.activations = nn.ModuleList(linear), nn.ModuleList(activations)
+        for layer in linear[:-1]:
+            nn.init.kaiming_normal_(layer.weight, a=0.25)
+            nn.init.zeros_(layer.bias)
+
+    def forward(
+        self, x: Float[Tensor, "batch inputs"], generator: Generator | None = None
+    ) -> Float[Tensor, "batch outputs"]:
+        """Dropout is drawn from the generator; None: there is none."""
+        for i, activation in enumerate(self.activations):
+            x = activation(self.linear[i](x))
+            if generator is not None and i < self.dropped_layers:
+                keep = torch.empty_like(x).bernoulli_(1 - self.dropout, generator=generator)
+                x = x * keep / (1 - self.dropout)
+        return self.linear[-1](x)
+
+    def weight(self, layer: int) -> Float[Tensor, "outputs inputs"]:
+        """Of the linear layer of this number."""
+        weight = self.linear[layer].weight
+        assert isinstance(weight, Tensor)
+        return weight
+
+    def with_slopes(
+        self, x: Float[Tensor, "batch inputs"]
+    ) -> tuple[Float[Tensor, "batch outputs"], list[Float[Tensor, "batch _"]]]:
+        """The output, and the slopes of the activations where they are, from the first layer on."""
+        slopes: list[Tensor] = []
+        for i, activation in enumerate(self.activations):
+            x = self.linear[i](x)
+            assert isinstance(activation, nn.PReLU)
+            slopes.append(torch.where(x > 0, torch.ones_like(x), activation.weight.to(x)))
+            x = activation(x)
+        return self.linear[-1](x), slopes
+
+
+def squared_slope(
+    network: Perceptron, slopes: list[Float[Tensor, "batch _"]], signs: Float[Tensor, "batch outputs"]
+) -> Float[Tensor, "batch"]:
+    """|J^T s|^2 of the Jacobian J at each input; with random signs s its mean is |J|^2, the sum of squares.
+
+    (M. Hutchinson 1990.) One step back through the layers, where all of J would take one for each output.
+    """
+    v = signs
+    for i in range(len(slopes), 0, -1):
+        v = (v @ network.weight(i)) * slopes[i - 1]
+    return (v @ network.weight(0)).float().square().sum(1)
+
+
+def arranged(
+    cloud: Float[Tensor, "batch points 3"], region: VisibleRegion
+) -> Float[Tensor, "batch points 3"]:
+    """The points in the order of a space-filling curve (G. Morton 1966), in the region's frame [m].
+
+    Positions are relative to the region's centre; those of an empty cloud, all zeros, are left at zero.
+    """
+    filled: Bool[Tensor, "batch 1 1"] = (cloud != 0).flatten(1).any(1)[:, None, None]
+    local = (cloud - torch.tensor(region.center).to(cloud)) * filled
+    cells = ((local / region.reach + 1) * 2 ** (BITS - 1)).long().clamp(0, 2**BITS - 1)
+    for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
+        cells = (cells | (cells << shift)) & mask
+    place = (cells[..., 0] << 2) | (cells[..., 1] << 1) | cells[..., 2]
+    return local.gather(1, place.argsort(1)[..., None].expand(-1, -1, 3))

@@ -1,0 +1,167 @@
+"""The memory of a search on a lattice: a hash table of nodes (open addressing) and a heap of those that wait,
+which knows where each of them is."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.collision.kernels.compiled import allocation_free
+
+INFINITE = 1 << 60
+"""Cost of what is not reached."""
+UNKNOWN, FREE, BLOCKED, CLOSED = 0, 1, 2, 3
+"""States of nodes and edges; CLOSED is a free node that A* has expanded."""
+NODES, QUEUED, EXPANSIONS, GOAL = 0, 1, 2, 3
+"""Places in `Table.count`."""
+AT_GOAL = 0
+"""The node that stands for the goals."""
+NO_ROOM = -2
+"""In place of a node."""
+_FACTOR_1, _FACTOR_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+
+
+class Table(NamedTuple):
+    """The nodes seen so far, and the queue. Node AT_GOAL stands for the goals and is in no slot."""
+
+    slots: np.ndarray
+    """[a power of two] node + 1 at the place of its key or after it, 0 where empty."""
+    keys: np.ndarray
+    """[capacity]"""
+    g: np.ndarray
+    """[capacity] A*: cost from the start; D* Lite: to the goal, by the last expansion [units]."""
+    rhs: np.ndarray
+    """[capacity] D* Lite: cost to the goal, by the neighbours' g [units]."""
+    parent: np.ndarray
+    """[capacity] A*: the node before."""
+    state: np.ndarray
+    """[capacity]"""
+    edges: np.ndarray
+    """[capacity, moves / 2] D* Lite: state of the motion of each move of the first half."""
+    heap: np.ndarray
+    """[capacity] queued nodes."""
+    place: np.ndarray
+    """[capacity] place in the heap + 1, 0 if not queued."""
+    first: np.ndarray
+    second: np.ndarray
+    """[capacity] the keys by which the queue is sorted."""
+    count: np.ndarray
+    """[4] see NODES and what follows."""
+
+
+@njit(cache=True)
+def make_table(lattice, max_nodes, incremental):
+    """Room for `max_nodes`; the system hands out the memory as it is used."""
+    capacity, slots = max_nodes + 1, 1
+    while slots < 2 * capacity:
+        slots *= 2
+    cached = capacity if incremental else 1
+    table = Table(
+        np.zeros(slots, np.int32),
+        np.empty(capacity, np.int64),
+        np.empty(capacity, np.int64),
+        np.empty(cached, np.int64),
+        np.empty(capacity, np.int32),
+        np.zeros(capacity, np.uint8),
+        np.zeros((cached, len(lattice.moves) // 2), np.uint8),
+        np.empty(capacity, np.int32),
+        np.zeros(capacity, np.int32),
+        np.empty(capacity, np.int64),
+        np.empty(capacity, np.int64),
+        np.zeros(4, np.int64),
+    )
+    table.count[NODES] = 1
+    table.keys[AT_GOAL], table.g[AT_GOAL] = -1, INFINITE
+    return table
+
+
+@allocation_free()
+def _slot(table, key):
+    """The slot of a key, or the empty one where it belongs (splitmix64, S. Vigna 2015)."""
+    x = np.uint64(key)
+    x = (x ^ (x >> np.uint64(30))) * _FACTOR_1
+    x = (x ^ (x >> np.uint64(27))) * _FACTOR_2
+    x ^= x >> np.uint64(31)
+    mask = len(table.slots) - 1
+    i = np.int64(x) & mask
+    while table.slots[i] != 0 and table.keys[table.slots[i] - 1] != key:
+        i = (i + 1) & mask
+    return i
+
+
+@allocation_free()
+def find(table, key):
+    """The node of a key; -1 if it was not seen yet."""
+    return np.int64(table.slots[_slot(table, key)]) - 1
+
+
+@allocation_free()
+def find_or_add(table, key):
+    """The node of a key; -1 if it is new and there is no room for it."""
+    i = _slot(table, key)
+    if table.slots[i] != 0:
+        return np.int64(table.slots[i]) - 1
+    node = table.count[NODES]
+    if node == len(table.keys):
+        return np.int64(-1)
+    table.count[NODES] += 1
+    table.slots[i] = node + 1
+    table.keys[node], table.g[node] = key, INFINITE
+    if len(table.rhs) > 1:
+        table.rhs[node] = INFINITE
+    return node
+
+
+@allocation_free()
+def _before(table, a, b):
+    return table.first[a] < table.first[b] or (
+        table.first[a] == table.first[b] and table.second[a] < table.second[b]
+    )
+
+
+@allocation_free()
+def _settle(table, i):
+    """Moves the node at place i of the heap up or down to where its keys belong."""
+    heap, place, node = table.heap, table.place, np.int64(table.heap[i])
+    while i > 0 and _before(table, node, heap[(i - 1) // 2]):
+        heap[i] = heap[(i - 1) // 2]
+        place[heap[i]] = i + 1
+        i = (i - 1) // 2
+    queued = table.count[QUEUED]
+    while 2 * i + 1 < queued:
+        child = 2 * i + 1
+        if child + 1 < queued and _before(table, heap[child + 1], heap[child]):
+            child += 1
+        if not _before(table, heap[child], node):
+            break
+        heap[i] = heap[child]
+        place[heap[i]] = i + 1
+        i = child
+    heap[i] = node
+    place[node] = i + 1
+
+
+@allocation_free()
+def put(table, node, first, second):
+    """Queues a node, or changes its keys if it is queued."""
+    table.first[node], table.second[node] = first, second
+    if table.place[node] == 0:
+        table.heap[table.count[QUEUED]] = node
+        table.place[node] = table.count[QUEUED] + 1
+        table.count[QUEUED] += 1
+    _settle(table, np.int64(table.place[node]) - 1)
+
+
+@allocation_free()
+def take(table, node):
+    """Takes a node out of the queue, if it is there."""
+    i = np.int64(table.place[node]) - 1
+    if i < 0:
+        return
+    table.place[node] = 0
+    table.count[QUEUED] -= 1
+    last = np.int64(table.heap[table.count[QUEUED]])
+    if last != node:
+        table.heap[i] = last
+        table.place[last] = i + 1
+        _settle(table, i)

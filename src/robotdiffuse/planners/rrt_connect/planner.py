@@ -1,0 +1,177 @@
+"""RRT-Connect with shortcutting: the fast classical planner, and the one that answers when learning fails."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.reach import motion_radii
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.types import Path, PlanResult
+from robotdiffuse.verify import VerifySettings, verifier
+
+FINEST = 0.002
+"""Least distance between two checks of a motion that is searched with [m]."""
+ITERATIONS = 2_000
+"""Iterations between two looks at the clock."""
+
+
+@dataclass(frozen=True)
+class RRTConnectSettings:
+    reach: float = 1.0
+    """Longest extension of a tree [rad, joint-space L2]."""
+    resolution: float = 0.05
+    """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
+    covers the rest, and a path that it refuses is searched again at half the distance."""
+    clearance: float = 0.002
+    """Distance to obstacles that paths keep where start and goal allow it [m]."""
+    searches: int = 2
+    """Paths found, the shortest of which is shortened: a search costs less than the shortcuts it saves."""
+    shortcuts: int = 25
+    """Attempts to shorten a path."""
+    optimize_time: float = 0.0
+    """Time spent on restarts and more shortcuts after the first path [s]; the shortest path is kept."""
+    capacity: int = 20_000
+    """Most nodes of a tree; a full pair of trees is started anew."""
+
+    def __post_init__(self) -> None:
+        for name in ("reach", "resolution", "capacity", "searches"):
+            if not getattr(self, name) > 0:
+                raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must be positive")
+        for name in ("clearance", "shortcuts", "optimize_time"):
+            if getattr(self, name) < 0:
+                raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must not be negative")
+
+
+def search_space(
+    checker: CollisionChecker,
+    resolution: float,
+    padding: float = 0.0,
+    near_ends: Float[ndarray, "m columns"] | None = None,
+) -> kernel.Space:
+    """What the compiled search needs; `resolution`, `padding` [m] and `near_ends` as in its docstring."""
+    robot = checker.robot
+    ends = np.zeros((0, robot.dof + 1)) if near_ends is None else near_ends.copy()
+    ends[:, -1] += checker.padding
+    return kernel.Space(
+        checker.robot_arrays,
+        checker.scene_arrays,
+        robot.lower.astype(np.float32),
+        robot.upper.astype(np.float32),
+        levers(robot),
+        np.float32(resolution),
+        checker.padding + np.float32(padding),
+        ends.astype(np.float32),
+    )
+
+
+def finer(resolution: float) -> float:
+    """For after a path that the judge refused: it found contact between two checks, so look twice as closely
+    [m]."""
+    return max(resolution / 2, FINEST)
+
+
+def levers(robot: Robot) -> Float[ndarray, "dof"]:
+    """Largest distance of any point of the arm from each joint's axis [m]."""
+    return motion_radii(robot).max(axis=0, initial=0.0).astype(np.float32)
+
+
+def random_state(seed: int, attempt: int = 0) -> ndarray:
+    """State of the compiled random numbers, well mixed."""
+    return np.random.SeedSequence([seed, attempt]).generate_state(1, np.uint64) | np.uint64(1)
+
+
+class RRTConnect:
+    """Two trees grown towards each other (Kuffner and LaValle, 2000), then shortcuts."""
+
+    name = "rrt_connect"
+
+    def __init__(self, settings: RRTConnectSettings | None = None) -> None:
+        self.settings = settings or RRTConnectSettings()
+
+    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+        """See `planners.base.Planner`."""
+        call = Call(self.name, problem, time_limit, seed)
+        ends = usable_ends(call, np.random.default_rng(seed))
+        return ends if isinstance(ends, PlanResult) else self.search(call, ends)
+
+    def first(self, call: Call, ends: Ends) -> Path | None:
+        """A path that passes the judge, its motion not yet timed.
+
+        None if ITERATIONS iterations find none, or the judge refuses it.
+        """
+        found = _Search(call, ends, self.settings, 0).shortened(call.elapsed)
+        if found is None:
+            return None
+        path = Path(call.problem.robot.joint_names, ends.complete(found))
+        return path if verifier(call.problem, VerifySettings()).path(path).valid else None
+
+    def search(self, call: Call, ends: Ends) -> PlanResult:
+        """Search until a path passes the judge or time runs out; for planners that have begun a call."""
+        settings = self.settings
+        attempt = 0
+        while attempt == 0 or call.remaining > 0:
+            path = _Search(call, ends, settings, attempt).best()
+            if path is None:
+                break
+            result = call.finish(ends.complete(path), self.name)
+            if result is not None:
+                return result
+            settings = replace(settings, resolution=finer(settings.resolution))
+            attempt += 1
+        return call.timeout()
+
+
+class _Search:
+    """Paths between the ends of a call, not yet judged."""
+
+    def __init__(self, call: Call, ends: Ends, settings: RRTConnectSettings, attempt: int) -> None:
+        self.call, self.settings = call, settings
+        self.space = search_space(ends.checker, settings.resolution, ends.kept_clearance(settings.clearance))
+        self.state = random_state(call.seed, attempt)
+        self.start, self.goals = ends.rows()
+
+    def best(self) -> Float[ndarray, "n dof"] | None:
+        """The first path, or the shortest after restarts for as long as the settings say."""
+        best = self.shortened(self.call.time_limit)
+        if best is None:
+            return None
+        until = min(self.call.elapsed + self.settings.optimize_time, self.call.time_limit)
+        while self.call.elapsed < until:
+            other = self.shortened(until)
+            if other is not None:
+                if kernel.path_length(other) < kernel.path_length(best):
+                    best = other
+                best = kernel.shortcut(self.space, best, self.settings.shortcuts, self.state)
+        return best
+
+    def shortened(self, until: float) -> Float[ndarray, "n dof"] | None:
+        """The shortest of some paths, shortened; None if the first of them takes until `until` [s]."""
+        best: ndarray | None = None
+        for _ in range(self.settings.searches):
+            path = self._path(until)
+            if path is None:
+                break
+            if best is None or kernel.path_length(path) < kernel.path_length(best):
+                best = path
+        return (
+            None if best is None else kernel.shortcut(self.space, best, self.settings.shortcuts, self.state)
+        )
+
+    def _path(self, until: float) -> Float[ndarray, "n dof"] | None:
+        reach, capacity = np.float32(self.settings.reach), self.settings.capacity + len(self.goals)
+        while True:
+            trees = kernel.make_trees(self.start, self.goals, capacity)
+            while trees.sizes.max() < capacity:
+                path = kernel.search(self.space, trees, reach, ITERATIONS, self.state)
+                if len(path):
+                    return path
+                if self.call.elapsed > until:
+                    return None

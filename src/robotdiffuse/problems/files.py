@@ -1,0 +1,294 @@
+"""Problem files: one problem in YAML or JSON, many in JSON lines or a MotionBenchMaker folder."""
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.problems.moveit import MoveItRequest, moveit_frames, moveit_request, moveit_scene
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.scenes.files import check_fields, read_scene, read_text, read_yaml, scene_entries
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import numbers, shown, unit_quaternion, vector
+from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+
+FIELDS = ("robot", "scene", "start", "goal")
+GOALS = ("joints", "joint_set", "pose")
+
+Robots = dict[tuple[str, tuple[tuple[str, float], ...]], Robot]
+"""Robots already read, by name or file and locked values: what is cached in one serves all its problems."""
+
+
+@dataclass(frozen=True, eq=False)
+class ProblemEntry:
+    """One of many problems: the problem, or what is wrong with it."""
+
+    name: str
+    problem: Problem | None
+    error: str = ""
+
+    def load(self) -> Problem:
+        """The problem; InputError if it is not usable."""
+        if self.problem is None:
+            raise InputError(self.error)
+        return self.problem
+
+
+def load_problem(file: str | Path, index: int = 0) -> Problem:
+    """The problem in a .yaml, .yml or .json file, or the one at `index` (from 0) in a .jsonl file.
+
+    Files named in it are looked up from its folder. `scene` may name a MoveIt planning scene, and `request` a
+    MoveIt motion plan request in place of start and goal. Raises InputError, one line that names the file
+    and the field: unknown or missing fields and shapes, wrong kinds of values, all that `Problem` refuses.
+    """
+    file = Path(file)
+    if file.suffix.lower() not in WRITERS:
+        raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
+    text = read_text(file)
+    if file.suffix.lower() == ".jsonl":
+        lines = _lines(text)
+        if not 0 <= index < len(lines):
+            raise InputError(f"index is {index}; {file} holds {len(lines)} problems, counted from 0")
+        number, line = lines[index]
+        return _problem(f"{file}, line {number}", _json(f"{file}, line {number}", line), file.parent, {})
+    if index != 0:
+        raise InputError(f"index is {index}; {file} holds one problem, and only .jsonl files hold more")
+    data = _json(str(file), text) if file.suffix.lower() == ".json" else read_yaml(file)
+    return _problem(str(file), data, file.parent, {})
+
+
+def load_problems(file: str | Path) -> list[ProblemEntry]:
+    """All problems of a .jsonl file, of a MotionBenchMaker folder, or the one of any other problem file.
+
+    In a .jsonl file, each line is a problem as in `load_problem`, named after the file and its line; the
+    first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`.
+    """
+    file = Path(file)
+    if file.is_dir():
+        return load_motion_bench_maker(file)
+    if file.suffix.lower() != ".jsonl":
+        return [ProblemEntry(file.stem, load_problem(file))]
+    robots: Robots = {}
+    entries = []
+    for number, line in _lines(read_text(file)):
+        where = f"{file}, line {number}"
+        problem = _problem(where, _json(where, line), file.parent, robots)
+        entries.append(ProblemEntry(f"{file.stem}:{number}", problem))
+    return entries
+
+
+def _lines(text: str) -> list[tuple[int, str]]:
+    """The lines that are not blank, with their numbers from 1."""
+    return [(i, line) for i, line in enumerate(text.split("\n"), start=1) if line.strip()]
+
+
+def problem_record(
+    problem: Problem, folder: str | Path | None = None, robot: str | None = None
+) -> dict[str, object]:
+    """The problem as the plain data of a problem file; numbers are kept exactly.
+
+    `robot` is what stands for the robot: a bundled name or a path to its URDF; by default where it was read
+    from. Files are named relative to `folder` if they are in it or below, otherwise by their full path.
+    Raises InputError for a robot that could not be found again.
+    """
+    if robot is None:
+        robot = problem.robot.source or problem.robot.name
+        if problem.robot.source is None and robot not in ROBOTS:
+            raise InputError(
+                f"robot {robot!r} is neither bundled nor read from a file; give the path of its URDF as robot"
+            )
+    folder = None if folder is None else Path(folder)
+    goal = problem.goal
+    if isinstance(goal, JointGoal):
+        rows = goal.positions.tolist()
+        asked: dict[str, object] = {"joints": rows[0]} if len(rows) == 1 else {"joint_set": rows}
+    else:
+        wxyz = quaternion_from_rotation(goal.T_base_frame[:3, :3]).tolist()
+        asked = {"pose": {"frame": goal.frame, "xyz": goal.T_base_frame[:3, 3].tolist(), "wxyz": wxyz}}
+    return {
+        "robot": robot,
+        "locked": problem.robot.locked,
+        "scene": scene_entries(problem.scene, folder),
+        "start": problem.start.tolist(),
+        "goal": asked,
+    }
+
+
+def problem_from_record(record: object, robots: Robots | None = None) -> Problem:
+    """The problem of `problem_record`; InputError as in `load_problem`.
+
+    `robots`: those that were read before; what is read now is added.
+    """
+    return _problem("problem", record, Path(), {} if robots is None else robots)
+
+
+def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -> None:
+    """Write a problem to .yaml, .yml or .json (atomically), or append it as a line to .jsonl.
+
+    `robot` as in `problem_record`. Raises InputError for a place that cannot be written to.
+    """
+    file = Path(file)
+    ending = file.suffix.lower()
+    if ending not in WRITERS:
+        raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
+    text = WRITERS[ending](problem_record(problem, file.parent, robot))
+    try:
+        if ending == ".jsonl":
+            with file.open("a", encoding="utf-8") as stream:
+                stream.write(text + "\n")
+        else:
+            part = file.with_name(f".{file.name}.{os.getpid()}.part")
+            part.write_text(text, encoding="utf-8")
+            part.replace(file)
+    except OSError as error:
+        raise InputError(f"{file} cannot be written: {error.strerror}") from None
+
+
+def _yaml(data: dict[str, object]) -> str:
+    return yaml.dump(data, Dumper=yaml.CSafeDumper, sort_keys=False, default_flow_style=None, width=110)
+
+
+WRITERS: dict[str, Callable[[dict[str, object]], str]] = {
+    ".yaml": _yaml,
+    ".yml": _yaml,
+    ".json": lambda data: json.dumps(data, indent=1),
+    ".jsonl": json.dumps,
+}
+
+
+def load_motion_bench_maker(folder: str | Path, robot: Robot | None = None) -> list[ProblemEntry]:
+    """The problems of a folder with pairs of files sceneNNNN.yaml and requestNNNN.yaml, in their order.
+
+    The robot is the bundled one named by the scenes' robot_model_name, unless one is given. Its joints that
+    are not planned (fingers) are held at the values of the request's start state. A problem that is wrong,
+    e.g. its goal is out of limits, becomes an entry with an error. Raises InputError if there is no pair.
+    """
+    folder = Path(folder)
+    scenes = sorted(folder.glob("scene*.yaml"))
+    if not scenes:
+        raise InputError(
+            f"{folder} has no files scene*.yaml; it must be a folder as MotionBenchMaker writes it"
+        )
+    robots: Robots = {}
+    entries = []
+    for scene_file in scenes:
+        name = f"{folder.resolve().name}/{scene_file.stem.removeprefix('scene')}"
+        try:
+            problem = _moveit_problem(scene_file, robot, robots)
+        except InputError as error:
+            entries.append(ProblemEntry(name, None, str(error)))
+        else:
+            entries.append(ProblemEntry(name, problem))
+    return entries
+
+
+def _moveit_problem(scene_file: Path, robot: Robot | None, robots: Robots) -> Problem:
+    request_file = scene_file.with_name(scene_file.name.replace("scene", "request", 1))
+    where = scene_file
+    try:
+        data = read_yaml(scene_file)
+        if robot is None:
+            robot_name = data.get("robot_model_name") if isinstance(data, dict) else None
+            robot = _robot(robot_name, {}, scene_file.parent, robots)
+        frames = moveit_frames(data, robot)
+        scene = moveit_scene(data, frames, scene_file.parent)
+        where = request_file
+        return _requested(robot, scene, moveit_request(read_yaml(request_file), frames), robots)
+    except InputError as error:
+        prefix = "" if str(error).startswith(str(where)) else f"{where}: "
+        raise InputError(f"{prefix}{error}") from None
+
+
+def _requested(robot: Robot, scene: Scene, request: MoveItRequest, robots: Robots) -> Problem:
+    held = {j.name for j in robot.joints if j.kind in MOVING_KINDS} - {*robot.joint_names}
+    locked = {name: value for name, value in request.start.items() if name in held}
+    key = (robot.name, tuple(sorted(locked.items())))
+    robot = robots.setdefault(key, robot.with_locked(locked))
+
+    def values(where: str, positions: dict[str, float]) -> list[float]:
+        missing = [name for name in robot.joint_names if name not in positions]
+        if missing:
+            raise InputError(f"{where} has no value for {', '.join(missing)}")
+        return [positions[name] for name in robot.joint_names]
+
+    start = values("start_state", request.start)
+    if request.pose_goal is not None:
+        return Problem(robot, scene, start, PoseGoal(*request.pose_goal))
+    goals = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
+    return Problem(robot, scene, start, JointGoal(goals))
+
+
+def _json(where: str, text: str) -> object:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        at = f"line {error.lineno}, column {error.colno}"
+        raise InputError(f"{where} is not valid JSON: {error.msg} at {at}") from None
+
+
+def _problem(where: str, data: object, folder: Path, robots: Robots) -> Problem:
+    try:
+        requested = isinstance(data, dict) and "request" in data
+        values = check_fields(
+            "problem", data, ("robot", "scene", "request") if requested else FIELDS, ("locked",)
+        )
+        robot = _robot(values["robot"], values.get("locked", {}), folder, robots)
+        frames, notes = moveit_frames({}, robot), ()
+        if isinstance(values["scene"], str):
+            file = folder / values["scene"]
+            content = read_yaml(file)
+            frames = moveit_frames(content, robot)
+            scene = moveit_scene(content, frames, file.parent)
+        else:
+            scene, notes = read_scene(values["scene"], folder)
+        if requested:
+            request = moveit_request(read_yaml(folder / str(values["request"])), frames)
+            return _requested(robot, scene, request, robots)
+        return Problem(robot, scene, values["start"], _goal(values["goal"]), notes)
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def _robot(name: object, locked: object, folder: Path, robots: Robots) -> Robot:
+    if not isinstance(name, str) or not name:
+        raise InputError(
+            f"robot is {shown(name)}; it must be a bundled name ({', '.join(ROBOTS)}) or a URDF file"
+        )
+    if name not in ROBOTS and (name.endswith((".urdf", ".xml")) or "/" in name):
+        name = str((folder / name).absolute())
+    if not isinstance(locked, dict):
+        raise InputError(f"locked is {shown(locked)}; it must map names of joints to values")
+    values = {}
+    for joint, value in locked.items():
+        array = numbers(value)
+        if not isinstance(joint, str) or array is None or array.ndim != 0:
+            raise InputError(f"locked: {shown(joint)} is {shown(value)}; it must be a number")
+        values[joint] = float(array)
+    key = (name, tuple(sorted(values.items())))
+    if key not in robots:
+        robots[key] = load_robot(name, locked=values)
+    return robots[key]
+
+
+def _goal(data: object) -> JointGoal | PoseGoal:
+    if not isinstance(data, dict) or len(data) != 1:
+        raise InputError(f"goal is {shown(data)}; it must be one of joints, joint_set and pose")
+    [(kind, value)] = data.items()
+    if kind not in GOALS:
+        raise unknown_name("field of goal:", kind, GOALS)
+    if kind == "pose":
+        pose = check_fields("goal.pose", value, ("frame", "xyz", "wxyz"))
+        xyz = vector("goal.pose", "xyz", pose["xyz"], 3)
+        rotation = rotation_from_quaternion(unit_quaternion("goal.pose", pose["wxyz"]))
+        return PoseGoal(pose["frame"], transform(xyz, rotation))  # type: ignore[arg-type]
+    array = numbers(value)
+    if array is None or array.ndim != (1 if kind == "joints" else 2):
+        form = "a list of numbers" if kind == "joints" else "a list of configurations of one length"
+        raise InputError(f"goal.{kind} is {shown(value)}; it must be {form}")
+    return JointGoal(array)

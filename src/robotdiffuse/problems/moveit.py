@@ -1,0 +1,270 @@
+"""MoveIt's planning scenes and motion plan requests in YAML, as MotionBenchMaker and robowflex write them.
+
+Vectors may be lists or mappings (x, y, z), quaternions are xyzw there. Message definitions:
+https://docs.ros.org/en/noetic/api/moveit_msgs/html/msg/PlanningScene.html and MotionPlanRequest.html.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.files import read_mesh, read_yaml
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Shape, Sphere, shown, unit_quaternion, vector
+from robotdiffuse.transforms import inverse, quaternion_from_rotation, rotation_from_quaternion, transform
+
+PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shape]]] = {
+    "box": (3, lambda size, xyz, wxyz, name: Box(xyz, size, wxyz, name)),
+    "sphere": (1, lambda size, xyz, wxyz, name: Sphere(xyz, size[0], name)),
+    "cylinder": (2, lambda size, xyz, wxyz, name: Cylinder(xyz, size[1], size[0], wxyz, name)),
+}
+"""By type: how many dimensions it has, and the shape (a cylinder's dimensions are height and radius)."""
+TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
+"""Types as the messages number them (shape_msgs/SolidPrimitive)."""
+NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
+
+
+@dataclass(frozen=True, eq=False)
+class MoveItRequest:
+    """What a motion plan request asks for. Either `joint_goals` is not empty or `pose_goal` is not None."""
+
+    start: dict[str, float]
+    """Joint values by name [rad] or [m], fingers included."""
+    joint_goals: tuple[dict[str, float], ...] = ()
+    """Each a goal of its own."""
+    pose_goal: tuple[str, Float[ndarray, "4 4"]] | None = None
+    """A link and T_base_link."""
+
+
+def read_moveit_scene(file: str | Path, robot: Robot | None = None) -> Scene:
+    """The collision objects of a planning scene, in the frame of the robot's base.
+
+    Where the root of the robot's URDF stands is taken from robot_state.multi_dof_joint_state, where its base
+    is from there from the robot (None: base and root are one), frames from fixed_frame_transforms. The
+    allowed collision matrix is not used: the robot brings its own. Raises InputError, naming file and
+    object, for a missing or damaged file, unknown frames, and shapes without a counterpart (cone, plane,
+    octomap).
+    """
+    data = read_yaml(file)
+    try:
+        return moveit_scene(data, moveit_frames(data, robot), Path(file).parent)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+
+
+class MoveItFrames(dict[str, ndarray]):
+    """T_base_frame of the frames that objects of a planning scene may be given in; '' is the scene's own.
+
+    A frame that is not there raises InputError, which says what is known, or why the place of the robot's
+    base in the scene is not.
+    """
+
+    def __init__(self, robot: Robot | None, T_world_root: Float[ndarray, "4 4"]) -> None:
+        super().__init__({} if robot is None else robot.above | {robot.base: np.eye(4)})
+        T_base_root = np.eye(4) if robot is None else robot.T_base_root
+        self.lost = ""
+        """Why the scene's own frame is not known; empty if it is."""
+        if T_base_root is not None:
+            self[""] = self["world"] = T_base_root @ inverse(T_world_root)
+        elif robot is not None:
+            self.lost = f"a joint moves {robot.base} in {robot.root}"
+
+    def of(self, where: str, entry: dict[str, Any]) -> Float[ndarray, "4 4"]:
+        """T_base_frame of the frame that the header of an entry names."""
+        name = _mapping(f"{where}.header", entry.get("header")).get("frame_id") or ""
+        if name in self:
+            return self[name]
+        known = [frame for frame in self if frame]
+        if self.lost:
+            raise InputError(
+                f"frame_id of {where} is {name!r}, and where the robot's base is in it cannot be known: "
+                f"{self.lost}; known frames: {', '.join(known)}"
+            )
+        raise unknown_name(f"frame_id of {where}:", name, known)
+
+
+def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
+    """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`."""
+    state = _mapping("robot_state", _mapping("a planning scene", data).get("robot_state"))
+    _refuse_attached(state)
+    floating = _mapping("multi_dof_joint_state", state.get("multi_dof_joint_state"))
+    transforms = _list("multi_dof_joint_state.transforms", floating.get("transforms"))
+    T_world_root = np.eye(4)
+    if transforms:
+        T_world_root = _pose("multi_dof_joint_state.transforms[0]", transforms[0], "translation", "rotation")
+    frames = MoveItFrames(robot, T_world_root)
+    fixed = _list("fixed_frame_transforms", _mapping("a planning scene", data).get("fixed_frame_transforms"))
+    for i, entry in enumerate(fixed):
+        where = f"fixed_frame_transforms[{i}]"
+        entry = _mapping(where, entry)
+        child = str(entry.get("child_frame_id", ""))
+        T = _pose(f"{where}.transform", entry.get("transform"), "translation", "rotation")
+        if not frames.lost and (robot is None or child != robot.base):
+            frames[child] = frames.of(where, entry) @ T
+    return frames
+
+
+def moveit_scene(data: object, frames: MoveItFrames, folder: Path) -> Scene:
+    """`read_moveit_scene` for a parsed file; `folder` is where mesh files are looked up."""
+    world = _mapping("world", _mapping("a planning scene", data).get("world"))
+    octomap = _mapping("octomap", _mapping("octomap", world.get("octomap")).get("octomap"))
+    if octomap.get("data"):
+        raise InputError("world.octomap is not supported; give the points as a point cloud")
+    shapes: list[Shape] = []
+    for i, entry in enumerate(_list("world.collision_objects", world.get("collision_objects"))):
+        shown_id = _mapping(f"collision object {i}", entry).get("id", i)
+        try:
+            shapes.extend(_object(_mapping("it", entry), frames, folder))
+        except InputError as error:
+            raise InputError(f"collision object {shown_id}: {error}") from None
+    return Scene(shapes)
+
+
+def _object(entry: dict[str, Any], frames: MoveItFrames, folder: Path) -> list[Shape]:
+    if _list("planes", entry.get("planes")):
+        raise InputError("planes are not supported; use a large box")
+    T_base_object = frames.of("header", entry) @ _pose("pose", entry.get("pose") or NO_POSE)
+    name = str(entry.get("id") or "object")
+    shapes: list[Shape] = []
+    for key, build in (("primitive", _primitive), ("mesh", _mesh)):
+        plural = "meshes" if key == "mesh" else "primitives"
+        parts = _list(plural, entry.get(plural))
+        poses = _list(f"{key}_poses", entry.get(f"{key}_poses"))
+        if not poses and entry.get("pose"):
+            poses = [NO_POSE] * len(parts)
+        if len(poses) != len(parts):
+            raise InputError(
+                f"has {len(parts)} {plural} and {len(poses)} {key}_poses; it must be one for each"
+            )
+        for i, (part, pose) in enumerate(zip(parts, poses, strict=True)):
+            T = T_base_object @ _pose(f"{key}_poses[{i}]", pose)
+            where = f"{plural}[{i}]"
+            wxyz = quaternion_from_rotation(T[:3, :3])
+            shapes.append(build(where, _mapping(where, part), T[:3, 3], wxyz, name, folder))
+    return shapes
+
+
+def _primitive(
+    where: str, part: dict[str, Any], xyz: ndarray, wxyz: ndarray, name: str, _folder: Path
+) -> Shape:
+    kind = part.get("type")
+    kind = TYPE_NUMBERS.get(kind, kind) if isinstance(kind, int) else kind
+    if kind not in PRIMITIVES:
+        raise unknown_name(f"type of {where}:", kind, PRIMITIVES)
+    count, build = PRIMITIVES[kind]
+    return build(vector(where, "dimensions", part.get("dimensions"), count), xyz, wxyz, name)
+
+
+def _mesh(where: str, part: dict[str, Any], xyz: ndarray, wxyz: ndarray, name: str, folder: Path) -> Shape:
+    if "resource" in part:
+        file = str(part["resource"]).removeprefix("file://")
+        if "://" in file:
+            raise InputError(f"{where}.resource is {file}; it must be a file, or the vertices be given")
+        vertices, faces = read_mesh(folder / file)
+        vertices = vertices * vector(where, "dimensions", part.get("dimensions", [1, 1, 1]), 3)
+    else:
+        rows = _list(f"{where}.vertices", part.get("vertices"))
+        vertices = np.array([_xyz(f"{where}.vertices", row) for row in rows]).reshape(-1, 3)
+        triangles = _list(f"{where}.triangles", part.get("triangles"))
+        indices = [t.get("vertex_indices") if isinstance(t, dict) else t for t in triangles]
+        faces = np.array([vector(where, "triangles", triangle, 3) for triangle in indices])
+    return Mesh(vertices, faces, xyz, wxyz, name=name)
+
+
+def moveit_request(data: object, frames: MoveItFrames) -> MoveItRequest:
+    """Start and goals of a parsed request; `frames` as of its scene.
+
+    Several goal constraints of joints are a set of goals. A position and an orientation constraint of one
+    link are a pose: the centre of the region; its size and the tolerances are not used. Raises InputError for
+    anything else, and for path constraints and attached objects, which would change the problem if ignored.
+    """
+    data = _mapping("a motion plan request", data)
+    for name in ("path_constraints", "trajectory_constraints"):
+        if any(_mapping(name, data.get(name)).values()):
+            raise InputError(f"{name} are not supported")
+    state = _mapping("start_state", data.get("start_state"))
+    _refuse_attached(state)
+    joints = _mapping("start_state.joint_state", state.get("joint_state"))
+    names = _list("start_state.joint_state.name", joints.get("name"))
+    positions = _list("start_state.joint_state.position", joints.get("position"))
+    values = vector("start_state.joint_state", "position", positions, len(names)).tolist()
+    goals = _list("goal_constraints", data.get("goal_constraints"))
+    if not goals:
+        raise InputError("goal_constraints is empty; it must hold at least one goal")
+    start = dict(zip(map(str, names), values, strict=True))
+    if len(goals) == 1 and _mapping("goal_constraints[0]", goals[0]).get("position_constraints"):
+        return MoveItRequest(start, pose_goal=_pose_goal(goals[0], frames))
+    return MoveItRequest(start, tuple(_joint_goal(f"goal_constraints[{i}]", g) for i, g in enumerate(goals)))
+
+
+def _joint_goal(where: str, goal: object) -> dict[str, float]:
+    goal = _mapping(where, goal)
+    if any(goal.get(f"{kind}_constraints") for kind in ("position", "orientation", "visibility")):
+        raise InputError(f"{where} must have joint_constraints alone, or be the only goal and a pose")
+    values: dict[str, float] = {}
+    for i, entry in enumerate(_list(f"{where}.joint_constraints", goal.get("joint_constraints"))):
+        at = f"{where}.joint_constraints[{i}]"
+        entry = _mapping(at, entry)
+        values[str(entry.get("joint_name"))] = float(vector(at, "position", [entry.get("position")], 1)[0])
+    return values
+
+
+def _pose_goal(goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray]:
+    where = "goal_constraints[0]"
+    places = _list(f"{where}.position_constraints", goal.get("position_constraints"))
+    turns = _list(f"{where}.orientation_constraints", goal.get("orientation_constraints"))
+    if len(places) != 1 or len(turns) != 1 or goal.get("joint_constraints"):
+        raise InputError(f"{where} must have one position and one orientation constraint, and no others")
+    place, turn = (_mapping(where, entry) for entry in (places[0], turns[0]))
+    link = place.get("link_name")
+    if link != turn.get("link_name"):
+        raise InputError(f"{where} constrains {link} and {turn.get('link_name')}; it must be one link")
+    if _xyz("target_point_offset", place.get("target_point_offset") or [0, 0, 0]).any():
+        raise InputError(f"{where}.position_constraints[0].target_point_offset must be zero")
+    region = _mapping("constraint_region", place.get("constraint_region"))
+    poses = _list("constraint_region.primitive_poses", region.get("primitive_poses"))
+    if len(poses) != 1:
+        raise InputError(f"{where}: constraint_region has {len(poses)} primitive_poses; it must have one")
+    T_base_region = frames.of("header", place) @ _pose("constraint_region.primitive_poses[0]", poses[0])
+    turned = _pose(where, {"position": [0, 0, 0], "orientation": turn.get("orientation")})
+    rotation = (frames.of("header", turn) @ turned)[:3, :3]
+    return str(link), transform(T_base_region[:3, 3], rotation)
+
+
+def _refuse_attached(state: dict[str, Any]) -> None:
+    if state.get("attached_collision_objects"):
+        raise InputError("attached_collision_objects are not supported")
+
+
+def _mapping(where: str, value: object) -> dict[str, Any]:
+    """A mapping; what is absent counts as empty, as in the messages."""
+    if value is not None and not isinstance(value, dict):
+        raise InputError(f"{where} is {shown(value)}; it must be a mapping")
+    return value or {}
+
+
+def _list(where: str, value: object) -> list[Any]:
+    if value is not None and not isinstance(value, list):
+        raise InputError(f"{where} is {shown(value)}; it must be a list")
+    return value or []
+
+
+def _xyz(where: str, value: object) -> ndarray:
+    value = [value.get(axis) for axis in "xyz"] if isinstance(value, dict) else value
+    return vector(where, "xyz", value, 3)
+
+
+def _pose(where: str, value: object, position: str = "position", orientation: str = "orientation") -> ndarray:
+    value = _mapping(where, value)
+    turn = value.get(orientation)
+    xyzw = [turn.get(axis) for axis in "xyzw"] if isinstance(turn, dict) else turn
+    x, y, z, w = unit_quaternion(where, xyzw, orientation)
+    rotation = rotation_from_quaternion(np.array([w, x, y, z]))
+    return transform(_xyz(f"{where}.{position}", value.get(position)), rotation)

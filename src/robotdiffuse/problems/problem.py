@@ -1,0 +1,167 @@
+"""Problem: a robot, a scene, a start and a goal.
+
+As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, no_type_check
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from numpy.typing import ArrayLike
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import numbers, shown
+
+LIMIT_SLACK = 1e-5
+"""Configurations that exceed a joint limit by no more than this are clamped, with a note [rad]."""
+RIGID_SLACK = 1e-4
+"""How far the rotation part of a pose may be from orthonormal, by entry."""
+
+
+@no_type_check
+@dataclass(frozen=True, eq=False)
+class JointGoal:
+    """Any of these configurations (one row each)."""
+
+    positions: Float[ndarray, "n dof"]
+
+    def __post_init__(self) -> None:
+        positions = numbers(self.positions)
+        if positions is None or positions.ndim not in (1, 2) or positions.size == 0:
+            raise InputError(
+                f"goal is {shown(self.positions)}; it must be a configuration or a list of them of one length"
+            )
+        object.__setattr__(self, "positions", np.atleast_2d(positions))
+
+    if TYPE_CHECKING:
+
+        def __init__(self, positions: ArrayLike) -> None: ...
+
+
+@no_type_check
+@dataclass(frozen=True, eq=False)
+class PoseGoal:
+    """A pose of a link; the path must end within 1 cm and 15 degrees of it (the paper's tolerances)."""
+
+    frame: str
+    """Name of the link."""
+    T_base_frame: Float[ndarray, "4 4"]
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.frame, str):
+            raise InputError(f"goal.frame is {shown(self.frame)}; it must be the name of a link")
+        T = numbers(self.T_base_frame)
+        if T is None or T.shape != (4, 4) or not np.isfinite(T).all():
+            raise InputError(
+                f"goal.T_base_frame is {shown(self.T_base_frame)}; it must be 4 x 4 finite numbers"
+            )
+        rotation = T[:3, :3]
+        orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
+        if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():
+            raise InputError(
+                f"goal.T_base_frame is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1"
+            )
+        object.__setattr__(self, "T_base_frame", T)
+
+    if TYPE_CHECKING:
+
+        def __init__(self, frame: str, T_base_frame: ArrayLike) -> None: ...
+
+
+@no_type_check
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """`goal` may be given as a configuration, a list of them, a JointGoal or a PoseGoal.
+
+    Values up to `LIMIT_SLACK` beyond a joint limit are clamped and continuous joints are wrapped into
+    [-pi, pi], each with a note. Raises InputError for everything else that no planner could work with:
+    wrong lengths, values that are not finite or out of limits, a goal frame that the robot does not move.
+    Collisions of start and goal are found by the planners.
+    """
+
+    robot: Robot
+    scene: Scene
+    start: Float[ndarray, "dof"]
+    goal: JointGoal | PoseGoal
+    notes: tuple[str, ...] = ()
+    """What was changed in the input, e.g. a start clamped to a limit."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.robot, Robot):
+            raise InputError(f"robot is {shown(self.robot)}; it must be a Robot, e.g. rd.load_robot('panda')")
+        if not isinstance(self.scene, Scene):
+            raise InputError(f"scene is {shown(self.scene)}; it must be a Scene, e.g. rd.Scene([shape, ...])")
+        notes = list(self.notes)
+        start = _configuration(self.robot, "start", self.start, notes)
+        goal = self.goal
+        if isinstance(goal, PoseGoal):
+            moved = [link for link in self.robot.link_names if self.robot.link_frame(link) > 0]
+            if goal.frame not in self.robot.link_names:
+                raise unknown_name("link in goal.frame:", goal.frame, moved)
+            if goal.frame not in moved:
+                raise InputError(
+                    f"goal.frame {goal.frame!r} is moved by no planned joint; these are: {', '.join(moved)}"
+                )
+        else:
+            rows = goal.positions if isinstance(goal, JointGoal) else JointGoal(goal).positions
+            fields = ["goal"] if len(rows) == 1 else [f"goal[{i}]" for i in range(len(rows))]
+            goal = JointGoal(
+                np.stack([_configuration(self.robot, *row, notes) for row in zip(fields, rows, strict=True)])
+            )
+        for key, value in {"start": start, "goal": goal, "notes": tuple(notes)}.items():
+            object.__setattr__(self, key, value)
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            robot: Robot,
+            scene: Scene,
+            start: ArrayLike,
+            goal: ArrayLike | JointGoal | PoseGoal,
+            notes: tuple[str, ...] = (),
+        ) -> None: ...
+
+    @classmethod
+    def load(cls, file: str | Path) -> "Problem":
+        """The problem in a .yaml, .yml or .json file; InputError for anything wrong in it."""
+        from robotdiffuse.problems.files import load_problem
+
+        return load_problem(file)
+
+
+def _configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:
+    """The configuration within limits; appends to `notes` what was changed."""
+    q = numbers(value)
+    names = ", ".join(robot.joint_names)
+    if q is None or q.ndim != 1:
+        raise InputError(f"{field} is {shown(value)}; it must be a list of {robot.dof} numbers: {names}")
+    if len(q) != robot.dof:
+        raise InputError(f"{field} has {len(q)} values; {robot.name} has {robot.dof} planned joints: {names}")
+    return np.array([_position(field, *pair, notes) for pair in zip(robot.planned_joints, q, strict=True)])
+
+
+def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float:
+    unit = "m" if joint.kind == "prismatic" else "rad"
+    if not np.isfinite(value):
+        raise InputError(f"{field}: {joint.name} is {value}; it must be a finite number [{unit}]")
+    if joint.kind == "continuous":
+        if abs(value) <= np.pi:
+            return float(value)
+        wrapped = math.remainder(value, 2 * math.pi)
+        notes.append(f"{field}: {joint.name} wrapped from {float(value)!r} to {wrapped!r} rad")
+        return wrapped
+    within = float(np.clip(value, joint.lower, joint.upper))
+    if abs(value - within) > LIMIT_SLACK:
+        raise InputError(
+            f"{field}: {joint.name} is {value:g} {unit}; its limits are {joint.lower:g} to {joint.upper:g}"
+        )
+    if value != within:
+        notes.append(f"{field}: {joint.name} clamped from {float(value)!r} to its limit {within!r} {unit}")
+    return within

@@ -1,0 +1,179 @@
+"""What the denoiser is told of obstacles: the same for training and planning, gradients by differences."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.arrays import compile_robot
+from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
+from robotdiffuse.collision.signed_distance import SignedDistance
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import load_model, save_model
+from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.denoisers import TransformerSettings
+from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
+from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.training.planner import moving_links
+from robotdiffuse.learning.training.validation import FLOOR
+from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, sample_scene
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.packed import pack_scene
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+
+PANDA = load_robot("panda")
+LIMIT, MARGIN = 0.4, 0.1
+SHAPES = Scene(
+    [
+        Sphere((0.5, 0.3, 0.6), 0.2),
+        Box((0.0, 0.6, 0.4), (0.2, 0.3, 0.2), (0.9, 0.1, 0.3, 0.1)),
+        Cylinder((0.4, -0.4, 0.3), 0.08, 0.5, (0.9, 0.3, 0.0, 0.1)),
+        Capsule((-0.4, -0.3, 0.5), 0.06, 0.5, (0.9, 0.3, 0.5, 0.1)),
+    ]
+)
+
+
+def configurations(*shape: int, seed: int = 0) -> np.ndarray:
+    q = np.random.default_rng(seed).uniform(PANDA.lower, PANDA.upper, (*shape, PANDA.dof))
+    return q.astype(np.float32)
+
+
+def model_config(robot: Robot, **changes) -> MotionModelConfig:
+    return MotionModelConfig(
+        robot=robot.name,
+        joint_names=robot.joint_names,
+        lower=tuple(robot.lower.tolist()),
+        upper=tuple(robot.upper.tolist()),
+        frame_offsets=tuple(tuple(tuple(row) for row in T) for T in robot.frame_offsets.tolist()),
+        links=moving_links(robot),
+        denoiser_settings=TransformerSettings(width=32, layers=1, heads=2, hidden=48, patch=8),
+        **changes,
+    )
+
+
+def test_training_is_told_what_planning_is() -> None:
+    """In scenes of different size at once; clearances are those that are told without gradients."""
+    rng = np.random.default_rng(1)
+    scenes = [Scene(sample_scene(family, rng).shapes[1:]) for family in (ROP, ROP_DENSE, ROP_DENSE)]
+    packed = [pack_scene(scene, 12) for scene in [*scenes, Scene([])]]
+    kinds, params = (np.stack(part) for part in zip(*packed, strict=True))
+    q, config = configurations(len(packed), 60), model_config(PANDA, sees_gradients=True)
+    given = compile_robot(PANDA), kinds, params, q, FLOOR, config.clearance_high
+    clearances, gradients = packed_clearances_and_gradients(*given, config.gradient_margin)
+    np.testing.assert_array_equal(clearances, packed_link_clearances(*given))
+    told = np.concatenate([clearances, gradients], axis=-1)
+    for i, scene in enumerate([*scenes, Scene([])]):
+        checker = CollisionChecker(PANDA, Scene([*FLOOR.shapes, *scene.shapes]))
+        np.testing.assert_allclose(link_clearances(checker, config)(q[i : i + 1])[0], told[i], atol=1e-4)
+        assert (gradients[i].any(axis=1) <= (clearances[i].min(axis=1) < config.gradient_margin)).all()
+    assert 0.3 < gradients.any(axis=-1).mean() < 0.9
+
+
+def test_gradients_are_those_of_the_clearances() -> None:
+    """Of a robot with one sphere for each link, whose clearances say all: against automatic differentiation
+    of the signed distance, and finite differences of it."""
+    robot = replace(PANDA, spheres={link: balls[:1] for link, balls in PANDA.spheres.items()})
+    q = configurations(400).astype(np.float64)
+    checker, distance = CollisionChecker(robot, SHAPES), SignedDistance(robot, SHAPES, torch.float64)
+
+    def too_close(at: torch.Tensor) -> torch.Tensor:
+        return torch.relu(MARGIN - distance(at)).square().sum(-1).sqrt()
+
+    clearances, found = checker.clearances_and_gradients(q, LIMIT, MARGIN)
+    at = torch.from_numpy(q).requires_grad_()
+    too_close(at).sum().backward()
+    assert at.grad is not None
+    # where two obstacles are as near, or a margin is just touched, rounding decides
+    near, far = too_close(at.detach()).numpy() > 1e-3, clearances.min(axis=1) >= MARGIN
+    assert near.sum() > 50 and far.sum() > 50
+    same = np.isclose(found[near], at.grad.numpy()[near], atol=2e-3).all(axis=1)
+    assert same.mean() > 0.98
+    assert (found[far] == 0).all()
+    step = 1e-5 * np.random.default_rng(2).standard_normal(q.shape)
+    rise = (too_close(torch.from_numpy(q + step)) - too_close(torch.from_numpy(q - step))).numpy() / 2
+    np.testing.assert_allclose(np.sum(found[near] * step[near], axis=1)[same], rise[near][same], atol=1e-7)
+
+
+@pytest.mark.parametrize("padding", [0.0, 0.03])
+def test_gradients_are_differences_over_all_spheres(padding: float) -> None:
+    """Of the whole robot: of the root of the cost that guidance descends, links against links left out."""
+    checker, q = CollisionChecker(PANDA, SHAPES, padding), configurations(300).astype(np.float64)
+    clearances, found = checker.clearances_and_gradients(q, LIMIT, MARGIN)
+    np.testing.assert_array_equal(clearances, checker.link_clearances(q, LIMIT))
+
+    def too_close(at: np.ndarray) -> np.ndarray:
+        costs, _ = checker.cost_gradients(at, MARGIN, self_margin=-1.0)
+        return np.sqrt(2 * costs.astype(np.float64))
+
+    near = too_close(q) > 0.02
+    direction = np.random.default_rng(3).standard_normal(q.shape)
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    # costs are of single precision; where the nearest face changes within the step they bend
+    slope = (too_close(q + 2e-3 * direction) - too_close(q - 2e-3 * direction)) / 4e-3
+    close = np.isclose(np.sum(found * direction, axis=1)[near], slope[near], atol=0.02, rtol=0.02)
+    assert near.sum() > 50 and close.mean() > 0.95
+    assert (found[too_close(q) == 0] == 0).all()
+
+
+def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
+    rng = np.random.default_rng(4)
+    directions = rng.standard_normal((20_000, 3))
+    surface = np.array([0.5, 0.1, 0.5]) + 0.195 * directions / np.linalg.norm(
+        directions, axis=1, keepdims=True
+    )
+    solid = CollisionChecker(PANDA, Scene([Sphere((0.5, 0.1, 0.5), 0.2)]))
+    cloud = CollisionChecker(PANDA, Scene([PointCloud(surface, 0.005)]))
+    q = configurations(600).astype(np.float64)
+    right, found = (checker.clearances_and_gradients(q, LIMIT, MARGIN) for checker in (solid, cloud))
+    # deep inside, the surface's points push elsewhere than the solid does
+    touched = (right[0].min(axis=1) > 0.0) & (right[0].min(axis=1) < 0.09)
+    assert touched.sum() > 50
+    close = np.isclose(found[1][touched], right[1][touched], atol=0.1).all(axis=1)
+    assert close.mean() > 0.9
+
+
+def test_what_the_denoiser_sees() -> None:
+    """Rows, joints, clearances, and then gradients of order 1, whose sign tells the way into the obstacle."""
+    scene, rng = Scene([Box((0.5, 0.0, 0.5), (0.4, 0.4, 0.4))]), np.random.default_rng(5)
+    seen = {}
+    q = configurations(2, 16, seed=6).astype(np.float64)
+    for sees in (False, True):
+        torch.manual_seed(0)
+        model = MotionModel(model_config(PANDA, frames=16, sees_gradients=sees))
+        between = model.between(q[:, 0], q[:, -1])
+        told = link_clearances(CollisionChecker(PANDA, scene), model.config)
+        seen[sees] = model.features(model.to_rows(q.astype(np.float32), between), between, told)
+    np.testing.assert_array_equal(seen[True][..., : seen[False].shape[-1]], seen[False])
+    gradients = seen[True][..., seen[False].shape[-1] :]
+    assert gradients.shape == q.shape and gradients.dtype == np.float32
+    assert np.abs(gradients).max() <= 1 and 0 < gradients.any(axis=-1).mean() < 1
+    checker = CollisionChecker(PANDA, scene)
+    hit = checker.link_clearances(q.reshape(-1, 7)).min(axis=1) < 0.05
+    inwards = q.reshape(-1, 7)[hit] + 0.01 * gradients.reshape(-1, 7)[hit]
+    costs = [
+        checker.cost_gradients(at, MARGIN, self_margin=-1.0)[0] for at in (q.reshape(-1, 7)[hit], inwards)
+    ]
+    assert hit.sum() > 3 and (costs[1] > costs[0]).all()
+    sampled = model.sample(np.zeros(model.config.encoder_settings.code), q[0, 0], q[0, -1], 2, rng, told, 2)
+    assert sampled.shape == (2, 16, 7)
+
+
+def test_gradients_need_clearances() -> None:
+    with pytest.raises(InputError, match="sees_gradients is True and sees_clearances is False"):
+        PlannerTraining(data="data", encoder="encoder", sees_clearances=False, sees_gradients=True)
+    with pytest.raises(InputError, match="sees_gradients"):
+        model_config(PANDA, sees_clearances=False, sees_gradients=True)
+
+
+def test_models_from_before_see_none(tmp_path) -> None:
+    save_model(MotionModel(model_config(PANDA)), tmp_path, {})
+    about = json.loads((tmp_path / "model.json").read_text())
+    for name in ("sees_gradients", "gradient_margin", "gradient_unit"):
+        del about["model"][name]
+    (tmp_path / "model.json").write_text(json.dumps(about))
+    assert load_model(tmp_path, PANDA).config == model_config(PANDA)

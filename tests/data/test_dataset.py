@@ -1,0 +1,197 @@
+"""RopDataset and the authors' layout: every row once, scaled by the limits, with clouds on its obstacles."""
+
+import pickle
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+import robotdiffuse as rd
+from helpers.box_arm import box_arm
+from helpers.stores import manifest_of, random_arrays, write_store
+from robotdiffuse.data.dataset import RopBatch, RopDataset
+from robotdiffuse.data.export import export_npz
+from robotdiffuse.data.shards import (
+    SPLITS,
+    read_shard,
+    shard_path,
+    split_of,
+    write_manifest,
+    write_shard,
+)
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.packed import BOX, SPHERE
+
+ARM, FRAMES, SIZES = box_arm(), 20, (150, 0, 130, 40)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rop")
+    write_store(folder, ARM, SIZES, FRAMES)
+    return folder
+
+
+def joined(batches) -> RopBatch:
+    parts = list(batches)
+    return RopBatch(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(RopBatch)))
+
+
+def stored(store, name):
+    return np.concatenate([read_shard(store, i)[name] for i in range(len(SIZES))])
+
+
+def test_every_row_of_a_split_once(store):
+    split = split_of(stored(store, "obstacle_kinds"), stored(store, "obstacle_params"))
+    q, pose = stored(store, "trajectories"), stored(store, "target_pose")
+    scaled = (q - (ARM.upper + ARM.lower) / 2) / ((ARM.upper - ARM.lower) / 2)
+    for i, name in enumerate(SPLITS):
+        data = RopDataset(store, name, points=8)
+        batch = joined(data.batches(32, shuffle=False))
+        assert len(data) == (split == i).sum() == len(batch) > 0
+        np.testing.assert_allclose(batch.trajectories, scaled[split == i], atol=1e-6)
+        np.testing.assert_array_equal(batch.target_pose, pose[split == i])
+        torch.testing.assert_close(batch.start, batch.trajectories[:, 0], atol=0, rtol=0)
+        goals, index = stored(store, "goals")[split == i], stored(store, "goal_index")[split == i]
+        goal = data.normalizer.to_unit(goals[np.arange(len(goals)), index])
+        np.testing.assert_allclose(batch.goal, goal, atol=1e-6)
+        shuffled = joined(data.batches(32))
+        assert not torch.equal(shuffled.target_pose, batch.target_pose)
+        ours, theirs = (np.lexsort(part.target_pose.numpy().T) for part in (shuffled, batch))
+        for field in fields(RopBatch)[:-1]:
+            a, b = getattr(shuffled, field.name)[ours], getattr(batch, field.name)[theirs]
+            torch.testing.assert_close(a, b, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("view", ["full", "partial"])
+@pytest.mark.parametrize("sort_points", [False, True])
+def test_clouds_lie_on_the_obstacles(store, view, sort_points):
+    batch = joined(RopDataset(store, points=50, view=view, sort_points=sort_points).batches(64))
+    assert batch.points.shape == (len(batch), 50, 3)
+    local = batch.points[:, :, None] - batch.obstacle_params[:, None, :, :3]  # boxes in stores are not turned
+    sphere = (local.norm(dim=-1) - batch.obstacle_params[:, None, :, 3]).abs()
+    box = (local.abs() - batch.obstacle_params[:, None, :, 3:6] / 2).amax(-1).abs()
+    kinds = batch.obstacle_kinds[:, None]
+    far = torch.where(kinds == SPHERE, sphere, torch.where(kinds == BOX, box, torch.inf)).amin(-1)
+    drawn = batch.points.any(-1)
+    assert far[drawn].max() < 1e-5
+    assert drawn.float().mean() > 0.95
+    if view == "partial":
+        assert batch.points[..., 2].min() >= 0
+    if sort_points:
+        assert (batch.points[:, 1:, 0] >= batch.points[:, :-1, 0]).all()
+
+
+def test_the_same_epoch_from_the_same_generator(store):
+    data, threads = RopDataset(store, points=16), torch.get_num_threads()
+
+    def epoch(seed):
+        return joined(data.batches(50, generator=torch.Generator().manual_seed(seed)))
+
+    first = epoch(0)
+    torch.set_num_threads(3)
+    try:
+        second = epoch(0)
+        assert torch.get_num_threads() == 3, "the threads that make batches have numbers of their own"
+    finally:
+        torch.set_num_threads(threads)
+    for field in fields(RopBatch):
+        torch.testing.assert_close(getattr(first, field.name), getattr(second, field.name), atol=0, rtol=0)
+    other = epoch(1)
+    assert not torch.equal(first.target_pose, other.target_pose)
+    generator = torch.Generator().manual_seed(0)
+    epochs = [joined(data.batches(50, generator=generator)) for _ in range(2)]
+    assert not torch.equal(epochs[0].points, epochs[1].points)
+    stopped = data.batches(10)
+    next(stopped)
+    stopped.close()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_standard_loader(store, workers):
+    data = RopDataset(store, "validation", points=12)
+    batches = list(DataLoader(data, batch_size=5, num_workers=workers))
+    q = torch.cat([batch["trajectories"] for batch in batches])
+    expected = joined(data.batches(5, shuffle=False))
+    torch.testing.assert_close(q, expected.trajectories, atol=0, rtol=0)
+    assert batches[0]["points"].shape == (5, 12, 3)
+    assert data[-1].keys() == {field.name for field in fields(RopBatch)}
+    torch.testing.assert_close(data[-1]["trajectories"], q[-1], atol=0, rtol=0)
+    with pytest.raises(IndexError, match=f"there are {len(data)} items"):
+        data[len(data)]
+
+
+def test_pickled_without_the_trajectories(store):
+    data = RopDataset(store, points=4)
+    content = pickle.dumps(data)
+    assert len(content) < 2000
+    again = joined(pickle.loads(content).batches(50))
+    torch.testing.assert_close(again.points, joined(data.batches(50)).points, atol=0, rtol=0)
+
+
+def test_one_line():
+    assert rd.RopDataset is RopDataset
+
+
+def test_bad_input(store, tmp_path):
+    for arguments, message in [
+        ({"split": "tests"}, "unknown split 'tests'; known: test, train, validation"),
+        ({"view": "half"}, "unknown view 'half'; known: full, partial"),
+        ({"points": 0}, "points is 0; it must be at least 1"),
+        ({"robot": replace(ARM, spheres={})}, "use the robot of the data"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            RopDataset(store, **arguments)
+    assert len(RopDataset(store, robot=ARM)) > 0
+    with pytest.raises(InputError, match="batch_size is 0"):
+        RopDataset(store).batches(0)
+    with pytest.raises(InputError, match="no data set"):
+        RopDataset(tmp_path)
+    write_manifest(tmp_path, manifest_of(ARM, FRAMES))
+    with pytest.raises(InputError, match="holds no shard"):
+        RopDataset(tmp_path)
+    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), FRAMES + 1), {})
+    with pytest.raises(InputError, match=r"shard_00000\.zarr, array trajectories has rows of shape"):
+        RopDataset(tmp_path)
+    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), FRAMES), {})
+    file = next(p for p in (shard_path(tmp_path, 0) / "trajectories" / "c").rglob("*") if p.is_file())
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match=r"shard_00000\.zarr, array trajectories is damaged"):
+        RopDataset(tmp_path)
+
+
+def test_export_for_the_authors(tmp_path):
+    panda = load_robot("panda")
+    write_store(tmp_path, panda, (30, 20))
+    arrays = random_arrays(panda, 3, np.random.default_rng(1))
+    arrays["obstacle_kinds"][:] = [SPHERE, SPHERE, SPHERE, 0]  # one too many
+    arrays["obstacle_kinds"][0] = [SPHERE, 0, 0, SPHERE]
+    arrays["obstacle_params"][0, 3, :3] = [1, 2, 3]
+    write_shard(tmp_path, 2, arrays, {})
+    count = export_npz(tmp_path, tmp_path / "robot.npz")
+    with np.load(tmp_path / "robot.npz") as file:
+        x, y = file["x_train"], file["y_train"]
+    kinds = np.concatenate([read_shard(tmp_path, i)["obstacle_kinds"] for i in (0, 1)])
+    assert count == len(x) == ((kinds == SPHERE).sum(1) == 2).sum() + 1
+    assert x.shape[1:] == (254, 7) and y.shape[1:] == (23,)
+    assert x.dtype == y.dtype == np.float32
+    np.testing.assert_array_equal(x[-1], arrays["trajectories"][0])
+    centers = arrays["obstacle_params"][0, [0, 3], :3].reshape(-1)
+    goal = arrays["goals"][0, arrays["goal_index"][0]]
+    expected = np.concatenate([arrays["start"][0], goal, centers, arrays["target_pose"][0, 4:]])
+    np.testing.assert_array_equal(y[-1], expected)
+    np.testing.assert_array_equal(y[:, :14], np.concatenate([x[:, 0], x[:, -1]], 1))
+    with pytest.raises(InputError, match=r"cannot write .*nothing.robot\.npz"):
+        export_npz(tmp_path, tmp_path / "nothing" / "robot.npz")
+
+
+def test_what_cannot_be_exported(store, tmp_path):
+    with pytest.raises(InputError, match=r"20 frames of 3 joints; robot\.npz holds 254 frames of 7 joints"):
+        export_npz(store, tmp_path / "robot.npz")
+    write_store(tmp_path, load_robot("panda"), ())
+    with pytest.raises(InputError, match="no scene of exactly two spheres"):
+        export_npz(tmp_path, tmp_path / "robot.npz")
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]

@@ -1,0 +1,109 @@
+"""Configs by name, metrics of motions, and the runner of Table 2."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.example_robots import planar_arm
+from robotdiffuse.cli import main
+from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation import ablation
+from robotdiffuse.evaluation.metrics import LinkPathLength
+from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.evaluation.trials import Tried, goal_of, held_out_problems
+from robotdiffuse.learning.denoisers import DENOISERS, Transformer
+from robotdiffuse.learning.encoders import ENCODERS
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.training.configs import CONFIGS, planner_training
+from robotdiffuse.learning.training.planner import _model_config
+from robotdiffuse.robots import load_robot
+from robotdiffuse.types import Path as Motion
+from robotdiffuse.verify import Verifier, VerifySettings
+
+PANDA = load_robot("panda")
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_every_config_makes_a_model(name: str) -> None:
+    given = {"data": "data"} if "encoder" in CONFIGS[name].changes else {"data": "data", "encoder": "folder"}
+    settings = planner_training(name, given)
+    encoder = settings.encoder if settings.jointly else "compression_autoencoder"
+    network, kind = ENCODERS[encoder]
+    model = MotionModel(_model_config(settings, PANDA, network(kind())))
+    assert isinstance(model.denoiser, DENOISERS[settings.denoiser][0])
+    assert (settings.minutes is None) != (settings.samples is None)
+
+
+def test_the_papers_config_has_its_figures() -> None:
+    settings = planner_training("paper", {"data": "data", "encoder": "folder"})
+    assert settings.samples == 64 * 25_000 and settings.batch == 64 and settings.learning_rate == 3e-4
+    assert settings.schedule.steps == 200 and settings.frames == 254 and settings.objective == "clean"
+    model = MotionModel(_model_config(settings, PANDA, ENCODERS["compression_autoencoder"][0](
+        ENCODERS["compression_autoencoder"][1]())))  # fmt: skip
+    assert isinstance(model.denoiser, Transformer)
+    assert (model.denoiser.settings.width, model.denoiser.settings.layers) == (512, 8)
+    assert model.config.encoder_settings.code == 60
+
+
+def test_what_is_given_beside_a_config_wins() -> None:
+    settings = planner_training("paper", {"data": "d", "encoder": "e", "minutes": 3.0, "batch": 8})
+    assert (settings.minutes, settings.samples, settings.batch) == (3.0, None, 8)
+    with pytest.raises(InputError, match="table2_unet"):
+        planner_training("papr", {"data": "d", "encoder": "e"})
+    with pytest.raises(InputError, match="config compact needs an encoder"):
+        planner_training("compact", {"data": "d"})
+
+
+def test_every_row_has_its_config() -> None:
+    assert len(ablation.ROWS) == 10
+    assert {row.config for row in ablation.ROWS.values()} == {c for c in CONFIGS if c.startswith("table2_")}
+
+
+def test_link_path_length_by_hand() -> None:
+    """A two-link arm that turns as a whole about its base: arcs of the origins of its links and its tip."""
+    arm = planar_arm(0.5, 0.4)
+    turn = np.linspace(0.0, 1.0, 2001)
+    q = np.stack([turn, 0 * turn], axis=1)
+    # l1 turns in place; l2's origin is 0.5 m from the axis, the tip's 0.9 m
+    np.testing.assert_allclose(LinkPathLength(arm)(np.stack([q, q[::-1]])), 0.5 + 0.9, rtol=1e-6)
+
+
+def test_bootstrap_covers_the_mean() -> None:
+    rng = np.random.default_rng(0)
+    covered = 0
+    for i in range(60):
+        low, high = bootstrap_interval(rng.normal(1.0, 2.0, 80), seed=i)
+        covered += low < 1.0 < high
+    assert 50 <= covered <= 60
+
+
+def test_held_out_problems_are_not_trivial_and_kept(tmp_path: Path) -> None:
+    file = tmp_path / "out" / "problems.json"
+    first, more, anew = (held_out_problems(n, f) for n, f in ((2, file), (3, file), (3, tmp_path / "b.json")))
+    assert [len(problems) for problems in (first, more, anew)] == [2, 3, 3]
+    for problem, other in zip(more, anew, strict=True):
+        assert np.array_equal(problem.start, other.start)
+        line = Motion(problem.robot.joint_names, np.stack([problem.start, goal_of(problem)]))
+        assert not Verifier(problem, VerifySettings()).path(line).valid
+
+
+def test_a_trial_is_kept_for_what_it_was_of(tmp_path: Path) -> None:
+    figures = Tried(*(np.random.default_rng(0).random((5, 4)).round(3)))
+    figures.save(tmp_path / "tried.json", {"weights": "a", "problems": 4})
+    found = Tried.load(tmp_path / "tried.json", {"problems": 4, "weights": "a"})
+    assert found is not None and np.array_equal(found.length, figures.length)
+    assert Tried.load(tmp_path / "tried.json", {"problems": 4, "weights": "b"}) is None
+    assert Tried.load(tmp_path / "other.json", {"problems": 4, "weights": "a"}) is None
+
+
+def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    base = ["bench", "ablation", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
+    assert main([*base, "--rows", "Ourz"]) == 2
+    assert "known: " in capsys.readouterr().err
+    assert main(base) == 2 and "no data set" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*base, "--samples", "0"])
+    command = ["train", "planner", "--config", "papr", "--data", "d", "--encoder", "e", "--out", "o"]
+    assert main(command) == 2
+    assert "table2_jpc" in capsys.readouterr().err

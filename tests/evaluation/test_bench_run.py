@@ -1,0 +1,210 @@
+"""bench run: every call is a record; crashes, overruns and exceptions are failures; killed runs go on."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers import faulty_planner
+from robotdiffuse.cli import main
+from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.bench import planner_process
+from robotdiffuse.evaluation.bench.problem_sets import family_problem, gather_cases, line_solves
+from robotdiffuse.evaluation.bench.records import Record, RecordFile, read_records
+from robotdiffuse.evaluation.bench.runner import BenchSettings, open_tasks, run_bench
+from robotdiffuse.planners import PLANNERS
+from robotdiffuse.problems.files import problem_record
+from robotdiffuse.types import Path as Motion
+from robotdiffuse.verify import verify
+
+RECORD = Record(
+    "rrt_connect", "rop", "rop/0", "rop", False, 0, 1.0, "solved", "", 0.01, progress=((0.01, 2.0),)
+)
+
+
+def quiet(*_: object) -> None: ...
+
+
+def settings(
+    out: Path, planners: str = "rrt_connect", problems: str = "rop", count: int = 3
+) -> BenchSettings:
+    return BenchSettings(
+        tuple(planners.split(",")), tuple(problems.split(",")), out, time_limit=2.0, count=count
+    )
+
+
+def keys(records: list[Record]) -> Counter:
+    return Counter(record.key for record in records)
+
+
+def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -> None:
+    asked = replace(settings(tmp_path), seeds=2)
+    assert run_bench(asked, quiet, quiet) == 6
+    assert run_bench(asked, quiet, quiet) == 0
+    records = read_records(tmp_path / "records" / "rrt_connect.jsonl")
+    assert keys(records) == {("rop", f"rop/{i}", seed, 2.0): 1 for i in range(3) for seed in range(2)}
+    solved = [record for record in records if record.solved]
+    assert solved
+    for record in solved:
+        problem = family_problem("rop", int(record.name.partition("/")[2]))
+        path = Motion(problem.robot.joint_names, record.waypoints)
+        assert verify(problem, path).valid
+        assert record.joint_length == pytest.approx(path.length, rel=1e-6)
+        assert record.progress[-1][1] == pytest.approx(path.length, rel=1e-5)
+        assert record.memory is not None and record.memory > 50
+        assert record.trivial == line_solves(problem)
+    assert run_bench(replace(asked, count=4), quiet, quiet) == 2
+    assert len(json.loads((tmp_path / "runs.jsonl").read_text().splitlines()[0])["versions"]) > 3
+
+
+@pytest.fixture
+def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
+    far_side = sys.executable, str(Path(faulty_planner.__file__))
+    monkeypatch.setattr(planner_process, "FAR_SIDE", far_side)
+    monkeypatch.setattr(planner_process, "PATIENCE", 20.0)
+    monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
+
+
+@pytest.mark.usefixtures("faulty")
+def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) -> None:
+    asked = replace(settings(tmp_path, "faulty", count=1), seeds=5, time_limit=0.5)
+    assert run_bench(asked, quiet, quiet) == 5
+    found = {record.seed: record for record in read_records(tmp_path / "records" / "faulty.jsonl")}
+    assert found[faulty_planner.SOLVES].solved and found[faulty_planner.TALKS].solved
+    assert found[faulty_planner.RAISES].status == "exception"
+    assert found[faulty_planner.RAISES].reason == "ValueError: no such thing"
+    assert found[faulty_planner.DIES].status == "crashed" and "SIGKILL" in found[faulty_planner.DIES].reason
+    assert found[faulty_planner.HANGS].status == "overran"
+    log = (tmp_path / "logs" / "faulty.log").read_text()
+    assert "about to die" in log and "this is no answer" in log and "ValueError" in log
+    assert run_bench(asked, quiet, quiet) == 0
+
+
+def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An answer right behind the warm-up's line was taken for it, and then waited for in vain."""
+    answers = "import sys\nprint(flush=True)\nfor _ in sys.stdin: print('\\n{\"time\": 0.1}', flush=True)"
+    monkeypatch.setattr(planner_process, "FAR_SIDE", (sys.executable, "-c", answers))
+    monkeypatch.setattr(planner_process, "PATIENCE", 5.0)
+    process = planner_process.PlannerProcess(planner_process.Contestant.of("rrt_connect"), tmp_path / "log")
+    assert [process.plan({}, seed=0, time_limit=1.0) for _ in range(2)] == [{"time": 0.1}] * 2
+    process.close()
+
+
+def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Path) -> None:
+    arguments = ["bench", "run", "--planners", "rrt_connect,shared_tree_rrt_star", "--problems", "rop"]
+    arguments += ["--count", "4", "--time-limit", "2", "--workers", "2", "--out", str(tmp_path)]
+    command = [sys.executable, "-m", "robotdiffuse", *arguments]
+    run = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
+    first = tmp_path / "records" / "rrt_connect.jsonl"
+    until = time.monotonic() + 400
+    while not (first.is_file() and first.read_text().count("\n") >= 2):
+        assert run.poll() is None and time.monotonic() < until
+        time.sleep(0.02)
+    os.kill(run.pid, signal.SIGKILL)
+    run.wait()
+    before = {file: file.read_text() for file in (tmp_path / "records").iterdir()}
+    assert main(arguments) == 0
+    for file in (tmp_path / "records").iterdir():
+        assert file.read_text().startswith(before[file].rpartition("\n")[0])
+        assert keys(read_records(file)) == {("rop", f"rop/{i}", 0, 2.0): 1 for i in range(4)}
+
+
+def test_what_ended_by_itself_is_not_asked_again_with_more_time(tmp_path: Path) -> None:
+    cases = gather_cases(["rop"], 3, tmp_path, quiet)
+    ran_out = replace(RECORD, name="rop/1", status="timeout", time=1.0, progress=())
+    crashed = replace(RECORD, name="rop/2", status="crashed", time=0.0, progress=())
+    records = [RECORD, ran_out, crashed]
+
+    def left(time_limit: float, seeds: int = 1) -> list[tuple[str, int]]:
+        asked = replace(settings(tmp_path), time_limit=time_limit, seeds=seeds)
+        return [(task.case.name, task.seed) for task in open_tasks(records, cases, asked)]
+
+    assert left(1.0) == []
+    assert left(10.0) == [("rop/1", 0), ("rop/2", 0)]
+    assert left(0.5) == [("rop/0", 0), ("rop/1", 0), ("rop/2", 0)]
+    assert left(1.0, seeds=2) == [("rop/0", 1), ("rop/1", 1), ("rop/2", 1)]
+
+
+@pytest.mark.parametrize("cut", [1, 20, 100])
+def test_line_that_was_cut_off_is_made_again(tmp_path: Path, cut: int) -> None:
+    file = tmp_path / "a.jsonl"
+    file.write_text((RECORD.line() + replace(RECORD, seed=1).line())[:-cut])
+    expected = [RECORD, replace(RECORD, seed=1)][: 2 if cut == 1 else 1]  # 1: only the line's end is missing
+    assert read_records(file) == expected
+    appended = RecordFile(file)
+    appended.append(replace(RECORD, seed=2))
+    appended.close()
+    assert read_records(file) == [*expected, replace(RECORD, seed=2)]
+
+
+def test_damaged_line_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "a.jsonl"
+    file.write_text(RECORD.line() + '{"planner": 1}\n' + RECORD.line())
+    with pytest.raises(InputError, match="line 2 is no record"):
+        read_records(file)
+
+
+def test_nontrivial_problems_are_not_solved_by_the_line(tmp_path: Path) -> None:
+    cases = gather_cases(["rop_nontrivial", "rop"], 2, tmp_path, quiet)
+    hard = [case for case in cases if case.problem_set == "rop_nontrivial"]
+    assert len(hard) == 2 and not any(case.trivial or line_solves(case.load()) for case in hard)
+    assert cases == gather_cases(["rop_nontrivial", "rop"], 2, tmp_path, quiet)
+    more = gather_cases(["rop"], 5, tmp_path, quiet)
+    assert more[:2] == cases[2:] and [case.name for case in more] == [f"rop/{i}" for i in range(5)]
+    kept, drawn = cases[2].load(), family_problem("rop", 0)
+    np.testing.assert_array_equal(kept.start, drawn.start)
+
+
+def test_problems_of_files_and_folders(tmp_path: Path) -> None:
+    lines = [json.dumps(problem_record(family_problem("rop", i))) for i in range(3)]
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    (folder / "a.jsonl").write_text("\n".join(lines[:2]))
+    (folder / "b.json").write_text(lines[2])
+    (folder / "readme.txt").write_text("not a problem")
+    cases = gather_cases([str(folder)], None, tmp_path / "out", quiet)
+    assert [(case.problem_set, case.family) for case in cases] == [
+        ("mine", "a"),
+        ("mine", "b"),
+        ("mine", "a"),
+    ]
+    assert len(gather_cases([str(folder)], 2, tmp_path / "out", quiet)) == 2
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no usable problem"):
+        gather_cases([str(tmp_path / "empty")], None, tmp_path / "out", quiet)
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"planners": ("rrt",)}, "unknown planner 'rrt'; known:"),
+        ({"planners": ("rrt_connect", "rrt_connect")}, "called the same"),
+        ({"planners": ("rrt_connect@.",)}, "rrt_connect has no weights"),
+        ({"planners": ("robotdiffuse@nowhere",)}, "model.json is missing"),
+        ({"planners": ("mpnet@nowhere",)}, "nowhere holds no mpnet"),
+        ({"problems": ("rop", "rop")}, "none twice"),
+        ({"problems": ("ropp",)}, "neither a file or folder nor a family"),
+        ({"time_limit": 0.0}, "time_limit is 0.0"),
+        ({"count": 0}, "count is 0"),
+        ({"cluster": "slurm"}, "known: ray"),
+    ],
+)
+def test_bad_settings_are_told_before_anything_is_made(tmp_path: Path, change: dict, match: str) -> None:
+    with pytest.raises(InputError, match=match):
+        run_bench(replace(settings(tmp_path / "out"), **change), quiet, quiet)
+    assert not (tmp_path / "out" / "records").exists()
+
+
+def test_command_with_bad_input(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    asked = ["bench", "run", "--problems", "rop", "--out", str(tmp_path)]
+    assert main([*asked, "--planners", "nonsense"]) == 2
+    assert "unknown planner 'nonsense'" in capfd.readouterr().err
+    assert main([*asked, "--planners", "rrt_connect", "--workers", "2", "--cluster", "ray"]) == 2

@@ -1,0 +1,51 @@
+"""A planar arm of boxes with known geometry, for the tests of collision and of the judge."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy import ndarray
+from scipy.spatial import ConvexHull
+
+from helpers.example_robots import planar_arm
+from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
+
+HALF_WIDTH = 0.03
+
+
+def box_mesh(low: ndarray, high: ndarray) -> ConvexMesh:
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (high - low) + low
+    hull = ConvexHull(corners)
+    outward = np.linalg.det(np.stack([corners[f] - corners.mean(0) for f in hull.simplices])) > 0
+    faces = np.where(outward[:, None], hull.simplices, hull.simplices[:, ::-1])
+    return ConvexMesh(corners, faces.astype(np.int64))
+
+
+def _with_limits(joint: Joint) -> Joint:
+    rates = {"velocity": 2.0, "acceleration": 8.0, "jerk": 80.0}
+    return joint if joint.kind == "fixed" else replace(joint, lower=-2.8, upper=2.8, **rates)
+
+
+@cache
+def box_arm(spheres: bool = True) -> Robot:
+    """Three boxes of 0.5, 0.4 and 0.3 m that turn about z, 6 cm wide and high, covered by spheres.
+
+    The base has no geometry. The first and the third box are checked against each other.
+    """
+    lengths = (0.5, 0.4, 0.3)
+    robot = planar_arm(*lengths)
+    meshes, covers, w = {}, {}, HALF_WIDTH
+    for i, length in enumerate(lengths, 1):
+        low, high = np.array([0.0, -w, -w]), np.array([length, w, w])
+        cells = int(length / 0.05)
+        xs = (np.arange(cells) + 0.5) * length / cells
+        radius = float(np.linalg.norm([length / cells / 2, w, w]))
+        meshes[f"l{i}"] = (box_mesh(low, high),)
+        covers[f"l{i}"] = np.column_stack([xs, np.zeros((cells, 2)), np.full(cells, radius)])
+    return replace(
+        robot,
+        joints=tuple(map(_with_limits, robot.joints)),
+        meshes=meshes,
+        spheres=covers if spheres else {},
+        allowed_collisions=frozenset({frozenset(("l1", "l2")), frozenset(("l2", "l3"))}),
+    )

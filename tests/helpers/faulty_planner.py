@@ -1,0 +1,36 @@
+"""A planner that fails in every way that one can, by its seed; and the far side of a process that has it."""
+
+import os
+import signal
+import time
+
+from robotdiffuse.evaluation.bench import planner_process
+from robotdiffuse.planners import PLANNERS, Entry
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.types import PlanResult
+
+SOLVES, RAISES, DIES, HANGS, TALKS = range(5)
+
+
+class Faulty:
+    name = "faulty"
+
+    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+        if seed == RAISES:
+            raise ValueError("no such\nthing")
+        if seed == DIES:
+            print("about to die", flush=True)
+            os.kill(os.getpid(), signal.SIGKILL)
+        while seed == HANGS:
+            time.sleep(1.0)
+        if seed == TALKS:
+            print("this is no answer", flush=True)
+        return RRTConnect().plan(problem, time_limit, seed)
+
+
+ENTRY = Entry("faulty_planner:Faulty", "for tests")
+
+if __name__ == "__main__":
+    PLANNERS["faulty"] = ENTRY
+    planner_process.main()

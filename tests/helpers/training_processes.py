@@ -1,0 +1,98 @@
+"""Trainings in processes of their own, for tests that kill them or start several by torchrun.
+
+python training_processes.py slow SETTINGS.json OUT        a training whose steps take a while
+torchrun ... training_processes.py two SETTINGS.json OUT   trainings that two processes share
+"""
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from helpers.box_arm import box_arm
+from robotdiffuse.learning.checkpoint import write_tensors
+from robotdiffuse.learning.settings import settings_from_json
+from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.run import TrainingRun, Validation
+
+STEP_SECONDS = 0.3
+STOP_AFTER = 3
+
+
+def slow(settings: PlannerTraining, out: Path) -> None:
+    original = TrainingRun.step
+
+    def step(self, loss):
+        time.sleep(STEP_SECONDS)
+        original(self, loss)
+
+    TrainingRun.step = step
+    training.train_planner(settings, str(out))
+
+
+def two(settings: PlannerTraining, out: Path) -> None:
+    """A run undisturbed, one that is cut in two, and a toy whose second process meets what is not finite."""
+    original = TrainingRun.step
+
+    def first_step_kept(self, loss):
+        original(self, loss)
+        if self.at.step == 1 and self.processes.first:
+            gradients = {name: p.grad for name, p in self.parameters.items() if p.grad is not None}
+            write_tensors(out / "first_step.safetensors", gradients, {})
+
+    def cut(self, loss):
+        original(self, loss)
+        if self.at.step == STOP_AFTER:
+            self.save()
+            raise KeyboardInterrupt
+
+    TrainingRun.step = first_step_kept
+    report = training.train_planner(settings, str(out / "whole"))
+    TrainingRun.step = cut
+    try:
+        training.train_planner(settings, str(out / "parts"))
+    except KeyboardInterrupt:
+        TrainingRun.step = original
+    again = training.train_planner(settings, str(out / "parts"))
+    seen = {"report": report, "again": again} | bad_step_in_one(str(out / "toy"))
+    processes = Processes("cpu")
+    found = processes.gather(seen)
+    if processes.first:
+        (out / "seen.json").write_text(json.dumps(found))
+
+
+def bad_step_in_one(out: str) -> dict[str, float]:
+    torch.manual_seed(0)
+    module, processes = torch.nn.Linear(2, 1), Processes("cpu")
+    run = TrainingRun(
+        module,
+        out,
+        EncoderTraining(minutes=None, samples=20, batch=2),
+        average=0.9,
+        weight_decay=0.0,
+        gradient_norm=1.0,
+        bad_steps=3,
+        identity={},
+        processes=processes,
+    )
+
+    def loss(rng):
+        bad = run.at.step == 2 and not processes.first
+        return (module.weight * (float("nan") if bad else 1.0 + processes.index)).square().sum()
+
+    run.loop(loss, lambda: Validation(0.0), "toy")
+    return {"skipped": run.at.skipped, "samples": run.at.samples, "weight": module.weight.sum().item()}
+
+
+if __name__ == "__main__":
+    kind, values, folder = sys.argv[1:]
+    arm = box_arm()
+    training.load_robot = lambda name: arm
+    given = settings_from_json(PlannerTraining, json.loads(Path(values).read_text()), "settings")
+    {"slow": slow, "two": two}[kind](given, Path(folder))

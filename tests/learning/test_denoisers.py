@@ -1,0 +1,359 @@
+"""Every denoiser of the table: what it sees, what it learns, its files; classifier-free guidance."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from test_learning import small_model
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import load_model, save_model
+from robotdiffuse.learning.denoisers import (
+    DENOISERS,
+    PAPER_SIZE,
+    DecoderOnlySettings,
+    Denoiser,
+    EncoderDecoderSettings,
+    TransformerSettings,
+    UNetSettings,
+)
+from robotdiffuse.learning.denoisers.layers import DENSE_TOKENS, Linear, attend
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.settings import settings_from_json, settings_to_json
+from robotdiffuse.learning.training.config import PlannerTraining
+
+DOF, FEATURES, CODE = 3, 9, 8
+CONDITION = CODE + 2 * DOF
+SMALL = {
+    "transformer": TransformerSettings(32, 2, 2, 48, patch=1),
+    "encoder_decoder": EncoderDecoderSettings(32, 1, 2, 2, 48, patch=1),
+    "decoder_only": DecoderOnlySettings(32, 2, 2, 48, patch=1),
+    "unet": UNetSettings(16, (1, 2, 2), 3, 32),
+}
+LENGTHS = (12, 48, 254)
+
+
+def denoiser(name: str, frames: int = 12, settings: object = None) -> Denoiser:
+    """A small one, with random weights in the last layer too."""
+    torch.manual_seed(0)
+    network = DENOISERS[name][0](settings or SMALL[name], frames, DOF, FEATURES, CONDITION)
+    torch.nn.init.normal_(network.out.weight, std=0.2)
+    return network
+
+
+def inputs(frames: int = 12, batch: int = 2, seed: int = 1) -> tuple[torch.Tensor, ...]:
+    random = torch.Generator().manual_seed(seed)
+    return (
+        torch.randn(batch, frames, FEATURES, generator=random),
+        torch.rand(batch, generator=random),
+        torch.randn(batch, CONDITION, generator=random),
+    )
+
+
+def test_every_denoiser_is_tested():
+    assert set(SMALL) == set(PAPER_SIZE) == set(DENOISERS)
+
+
+@pytest.mark.parametrize("frames", LENGTHS)
+@pytest.mark.parametrize("name", DENOISERS)
+def test_shapes(name, frames):
+    network = denoiser(name, frames)
+    out = network(*inputs(frames))
+    assert out.shape == (2, frames, DOF)
+    assert out.dtype == torch.float32
+    assert out.isfinite().all()
+    assert network(*inputs(frames, batch=1)).shape == (1, frames, DOF)
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_untrained_network_predicts_the_mean_trajectory(name):
+    network = DENOISERS[name][0](DENOISERS[name][1](), 12, DOF, FEATURES, CONDITION)
+    assert not network(*inputs()).any()
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_gradients_reach_every_parameter(name):
+    network = denoiser(name)
+    network(*inputs()).square().sum().backward()
+    for parameter, values in network.named_parameters():
+        assert values.grad is not None and values.grad.abs().max() > 1e-9, parameter
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_output_depends_on_level_and_on_every_number_of_the_condition(name):
+    network = denoiser(name)
+    features, level, condition = inputs()
+    level.requires_grad_()
+    condition.requires_grad_()
+    loss = network(features, level, condition).square().sum()
+    for slopes in torch.autograd.grad(loss, (level, condition)):
+        assert (slopes.abs() > 1e-9).all()
+
+
+def seen_by(name: str, frames: int = 12) -> np.ndarray:
+    """[frames, frames]: whether the output of one frame (row) depends on the input of another (column)."""
+    network = denoiser(name, frames)
+    features, level, condition = inputs(frames, batch=1)
+    features.requires_grad_()
+    out = network(features, level, condition).square().sum((0, 2))
+    rows = [torch.autograd.grad(frame, features, retain_graph=True)[0][0] for frame in out]
+    return (torch.stack(rows).abs().sum(-1) > 0).numpy()
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_frames_see_each_other(name):
+    wanted = np.ones((12, 12), bool)
+    np.testing.assert_array_equal(seen_by(name), np.tril(wanted) if name == "decoder_only" else wanted)
+
+
+def test_samples_of_a_batch_do_not_mix():
+    for name in DENOISERS:
+        network, (features, level, condition) = denoiser(name), inputs(batch=3)
+        alone = network(features[1:2], level[1:2], condition[1:2])
+        torch.testing.assert_close(network(features, level, condition)[1:2], alone, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_bf16_is_close(name):
+    network = denoiser(name)
+    with torch.inference_mode():
+        exact = network(*inputs(batch=8))
+        for module in network.modules():
+            if isinstance(module, Linear):
+                module.to(torch.bfloat16)
+        close = network(*inputs(batch=8))
+    assert close.dtype == torch.float32
+    assert (close - exact).norm() < 0.02 * exact.norm()  # bf16 rounds to 1/256; a few layers of it
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_all_matrices_may_be_kept_in_bf16(name):
+    network = denoiser(name)
+    matrices = [values for values in network.parameters() if values.ndim > 1]
+    assert len(matrices) == sum(isinstance(module, Linear) for module in network.modules())
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_learns_a_small_batch_by_heart(name):
+    network = denoiser(name)
+    batch = inputs(batch=8)
+    wanted = torch.randn(8, 12, DOF, generator=torch.Generator().manual_seed(2))
+    optimizer = torch.optim.AdamW(network.parameters(), lr=4e-3, weight_decay=0.0)
+    losses = []
+    for _ in range(250):
+        loss = (network(*batch) - wanted).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+        if losses[-1] < losses[0] / 20:
+            break
+    assert losses[-1] < losses[0] / 10
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_sizes(name):
+    """The defaults are comparable; so are the networks of the paper's size, 8 layers of width 512."""
+    for settings, frames, low, high in (
+        (DENOISERS[name][1](), 48, 1.6e6, 1.8e6),
+        (PAPER_SIZE[name], 254, 16e6, 19e6),
+    ):
+        with torch.device("meta"):
+            network = DENOISERS[name][0](settings, frames, 7, 23, 60 + 14)
+        assert low < sum(values.numel() for values in network.parameters()) < high
+
+
+def test_z_tk_as_a_token_only():
+    plain = replace(SMALL["transformer"], add_z_tk=False)
+    network, added = denoiser("transformer", settings=plain), denoiser("transformer")
+    added.load_state_dict(network.state_dict())
+    assert not torch.allclose(network(*inputs()), added(*inputs()))
+    for parameter, values in network.named_parameters():
+        if parameter.endswith("merge.weight"):  # attention is the only way from the token to the frames
+            torch.nn.init.zeros_(values)
+    features, level, condition = inputs()
+    torch.testing.assert_close(network(features, level, condition), network(features, level, 2 * condition))
+
+
+@pytest.mark.parametrize("causal", [False, True])
+def test_fused_and_written_out_attention_agree(monkeypatch, causal):
+    q, k, v = torch.randn(3, 2, 4, DENSE_TOKENS, 8, generator=torch.Generator().manual_seed(0)).unbind(0)
+    written_out = attend(q, k, v, causal)
+    monkeypatch.setattr("robotdiffuse.learning.denoisers.layers.DENSE_TOKENS", 0)
+    torch.testing.assert_close(attend(q, k, v, causal), written_out, atol=1e-6, rtol=1e-5)
+
+
+def test_unet_pads_and_crops():
+    """Of a length that can be halved, nothing is added; of another, what is added is the last frame again."""
+    for frames, padding in ((12, 0), (13, 3), (254, 2), (1, 3)):
+        network = denoiser("unet", frames)
+        assert network.padding == padding
+        features, level, condition = inputs(frames)
+        longer = denoiser("unet", frames + padding)
+        longer.load_state_dict(network.state_dict())
+        added = torch.cat([features, features[:, -1:].expand(-1, padding, -1)], 1)
+        torch.testing.assert_close(
+            network(features, level, condition), longer(added, level, condition)[:, :frames]
+        )
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "message"),
+    [
+        (TransformerSettings, {"width": 30, "heads": 4}, "transformer.heads is 4"),
+        (TransformerSettings, {"width": 15, "heads": 5}, "transformer.width is 15"),
+        (DecoderOnlySettings, {"heads": 7}, "decoder_only.heads is 7"),
+        (EncoderDecoderSettings, {"heads": 0}, "encoder_decoder.heads is 0"),
+        (UNetSettings, {"kernel": 4}, "unet.kernel is 4"),
+        (UNetSettings, {"multiples": ()}, "unet.multiples is"),
+        (UNetSettings, {"width": 7}, "unet.width is 7"),
+    ],
+)
+def test_bad_settings(kind, values, message):
+    with pytest.raises(InputError, match=message):
+        kind(**values)
+
+
+@pytest.mark.parametrize("name", ["transformer", "encoder_decoder", "decoder_only"])
+def test_frames_must_fill_the_patches(name):
+    with pytest.raises(InputError, match=f"{name}.patch is 5; it must divide the 12 frames"):
+        denoiser(name, 12, replace(SMALL[name], patch=5))
+
+
+def model_with(name: str, null_condition: bool = False) -> MotionModel:
+    torch.manual_seed(0)
+    config = replace(
+        small_model().config,
+        denoiser=name,
+        denoiser_settings=SMALL[name],
+        frames=12,
+        null_condition=null_condition,
+    )
+    model = MotionModel(config)
+    torch.nn.init.normal_(model.denoiser.out.weight, std=0.2)
+    if model.null_condition is not None:
+        torch.nn.init.normal_(model.null_condition)
+    return model
+
+
+def sample(model: MotionModel, scale: float = 1.0) -> np.ndarray:
+    code = np.ones(model.config.encoder_settings.code, np.float32)
+    start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
+
+    def clearances(q: np.ndarray) -> np.ndarray:
+        return np.full((*q.shape[:-1], len(model.config.links)), 0.1, np.float32)
+
+    rng = np.random.default_rng(0)
+    return model.sample(code, start, goal, 3, rng, clearances, steps=3, guidance_scale=scale)
+
+
+@pytest.mark.parametrize("null_condition", [False, True])
+@pytest.mark.parametrize("name", DENOISERS)
+def test_files(tmp_path, name, null_condition):
+    model = model_with(name, null_condition)
+    for module in model.modules():
+        if isinstance(module, torch.nn.Linear):
+            module.weight.data = module.weight.data.half().float()  # as they are stored
+    save_model(model, tmp_path, {})
+    loaded = load_model(tmp_path)
+    assert loaded.config == model.config
+    assert type(loaded.denoiser) is DENOISERS[name][0]
+    scale = 2.0 if null_condition else 1.0
+    np.testing.assert_array_equal(sample(loaded, scale), sample(model.for_inference(), scale))
+
+
+def test_files_from_before_there_was_a_choice(tmp_path):
+    model = model_with("transformer")
+    save_model(model, tmp_path, {})
+    file = tmp_path / "model.json"
+    about = json.loads(file.read_text())
+    del about["model"]["null_condition"], about["model"]["denoiser"]
+    del about["model"]["denoiser_settings"]["add_z_tk"]
+    file.write_text(json.dumps(about))
+    assert load_model(tmp_path).config == model.config
+    assert load_model("panda").config.denoiser == "transformer"
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_settings_of_a_run_as_json(name):
+    settings = PlannerTraining("data", "encoder", denoiser=name, denoiser_settings=SMALL[name])
+    text = json.dumps(settings_to_json(settings))
+    assert settings_from_json(PlannerTraining, json.loads(text), "x") == settings
+    kind = DENOISERS[name][1]
+    other = next(s for s in SMALL.values() if type(s) is not kind)
+    with pytest.raises(InputError, match=f"denoiser is {name}, .* must be {kind.__name__}"):
+        PlannerTraining("data", "encoder", denoiser=name, denoiser_settings=other)
+
+
+def test_unknown_names_list_the_known():
+    values = settings_to_json(PlannerTraining("data", "encoder", denoiser_settings=SMALL["transformer"]))
+    known = "'gpt'; known: decoder_only, encoder_decoder, transformer, unet"
+    for settings in (None, values["denoiser_settings"]):
+        with pytest.raises(InputError, match=known):
+            given = {"denoiser": "gpt", "denoiser_settings": settings}
+            settings_from_json(PlannerTraining, values | given, "x")
+    with pytest.raises(InputError, match=known):
+        PlannerTraining("data", "encoder", denoiser="gpt")
+    for bad in (3, ["unet"], None):
+        with pytest.raises(InputError, match=r"x\.denoiser is .*; it must be of type str"):
+            settings_from_json(PlannerTraining, values | {"denoiser": bad}, "x")
+
+
+@pytest.mark.parametrize("field", ["width", "wings"])
+def test_bad_settings_in_a_file_are_named(field):
+    values = settings_to_json(PlannerTraining("d", "e", denoiser="unet", denoiser_settings=SMALL["unet"]))
+    values["denoiser_settings"][field] = "wide"
+    with pytest.raises(InputError, match=f"x.denoiser_settings.{field}"):
+        settings_from_json(PlannerTraining, values, "x")
+
+
+@pytest.mark.parametrize("share", [-0.1, 1.0])
+def test_share_of_dropped_conditions_is_checked(share):
+    with pytest.raises(InputError, match="condition_drop"):
+        PlannerTraining("data", "encoder", condition_drop=share)
+
+
+@pytest.mark.parametrize("name", DENOISERS)
+def test_dropped_conditions_are_not_seen(name):
+    model = model_with(name, null_condition=True)
+    dropped = torch.tensor([True, False, True])
+    features, level, condition = inputs(batch=3)
+    before = model.denoise(features, level, condition, dropped)
+    after = model.denoise(features, level, condition + 1.0, dropped)
+    assert [torch.equal(a, b) for a, b in zip(before, after, strict=True)] == dropped.tolist()
+    (before * dropped[:, None, None]).square().sum().backward()
+    assert model.null_condition is not None and model.null_condition.grad is not None
+    assert (model.null_condition.grad != 0).all()
+
+
+def test_scale_of_classifier_free_guidance(monkeypatch):
+    model = model_with("transformer", null_condition=True).for_inference()
+    features, level, condition = inputs(batch=3)
+    c = model.denoise(features, level, condition)
+    u = model.denoise(features, level, condition, torch.ones(3, dtype=torch.bool))
+    for scale in (0.0, 1.0, 2.5):
+        guided = model.denoise_guided(features, level, condition, scale)
+        torch.testing.assert_close(guided, u + scale * (c - u), atol=1e-4, rtol=1e-4)
+    assert not np.array_equal(sample(model, 2.0), sample(model))
+    batches: list[int] = []
+    denoise = model.denoiser.forward
+
+    def counted(features, level, condition):
+        batches.append(len(features))
+        return denoise(features, level, condition)
+
+    monkeypatch.setattr(model.denoiser, "forward", counted)
+    sample(model)
+    sample(model, 2.0)
+    assert batches == [3, 3, 3, 6, 6, 6]
+
+
+def test_a_model_that_always_had_its_condition_has_no_guidance_scale():
+    model = model_with("unet").for_inference()
+    with pytest.raises(InputError, match="guidance_scale is 2"):
+        sample(model, 2.0)
+    features, level, condition = inputs()
+    with pytest.raises(InputError, match="null_condition"):
+        model.denoise(features, level, condition, torch.tensor([True, False]))

@@ -1,0 +1,429 @@
+"""Encoders of the scene: what all promise, what each learns, and training along with the planner."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from helpers.box_arm import box_arm
+from helpers.stores import manifest_of, random_arrays
+from robotdiffuse.cli import main
+from robotdiffuse.data.shards import write_manifest, write_shard
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
+from robotdiffuse.learning.denoisers import TransformerSettings
+from robotdiffuse.learning.encoders import (
+    ENCODERS,
+    PAPER_SIZE,
+    CompressionAutoencoder,
+    CompressionAutoencoderSettings,
+    DGCNNSettings,
+    PointAutoencoderSettings,
+    PointNetSettings,
+    encoder_name,
+    make_encoder,
+)
+from robotdiffuse.learning.encoders.base import Autoencoder
+from robotdiffuse.learning.encoders.dgcnn import EdgeConvolution, neighbours
+from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
+from robotdiffuse.learning.settings import settings_from_json, settings_to_json
+from robotdiffuse.learning.training import encoder as encoder_training
+from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training.batches import Batches, load_data, random_scenes, scene_clouds
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.training.encoder import linear_readout, scene_distances, train_encoder
+from robotdiffuse.learning.training.planner import train_planner
+from robotdiffuse.scenes.packed import BOX, SPHERE
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.scenes.surface_clouds import surface_clouds
+
+SMALL_CAE = CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16))
+SMALL = {
+    "compression_autoencoder": SMALL_CAE,
+    "point_autoencoder": PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12),
+    "pointnet": PointNetSettings(
+        code=8, cloud=32, first=(8, 12), second=(12, 24), transform=(8, 8), transform_head=(8,), head=(16,)
+    ),
+    "dgcnn": DGCNNSettings(code=8, cloud=32, neighbours=4, edges=(8, 12), embedding=16, head=(16,)),
+}
+ALONE = [name for name, (network, _) in ENCODERS.items() if network.trained == "alone"]
+JOINTLY = [name for name in ENCODERS if name not in ALONE]
+every_encoder = pytest.mark.parametrize("name", ENCODERS)
+
+
+def small(name, seed=0):
+    torch.manual_seed(seed)
+    return make_encoder(name, SMALL[name])
+
+
+def cloud(n, batch=1, seed=0):
+    """Points in the region."""
+    generator = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor([-0.5, -0.5, 0.1]), torch.tensor([0.5, 0.5, 0.9])
+    return low + (high - low) * torch.rand(batch, n, 3, generator=generator)
+
+
+def test_every_encoder_is_tested():
+    assert set(SMALL) == set(ENCODERS)
+    assert {encoder_name(small(name)) for name in ENCODERS} == set(ENCODERS)
+
+
+@every_encoder
+@pytest.mark.parametrize("n", [0, 1, 2, 31, 40, 300])
+def test_any_number_of_points(name, n):
+    encoder = small(name)
+    z = encoder(cloud(n, 3))
+    assert z.shape == (3, 8)
+    assert z.dtype == torch.float32
+    assert z.isfinite().all()
+    assert torch.equal(encoder(cloud(n, 3)), z), "the same cloud has the same code"
+
+
+@every_encoder
+def test_any_number_of_obstacles(name):
+    encoder = small(name)
+    kinds, params = random_scenes(13, 12, np.random.default_rng(0))
+    kinds[:] = np.where(np.arange(12) < np.arange(13)[:, None], SPHERE, 0)
+    params[..., :3] = np.random.default_rng(1).uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 1.2], (13, 12, 3))
+    params[..., 3] = 0.1
+    clouds = scene_clouds(encoder, kinds, params, np.random.default_rng(0))
+    assert clouds.shape == (13, encoder.settings.cloud, 3)
+    z = encoder(clouds)
+    assert z.isfinite().all()
+    torch.testing.assert_close(z[0], encoder(torch.zeros(1, 0, 3))[0], msg="no obstacle is no point")
+    assert len(z.detach().round(decimals=6).unique(dim=0)) == 13
+
+
+@every_encoder
+@settings(max_examples=10, deadline=None)
+@given(n=st.integers(1, 90), seed=st.integers(0, 1000))
+def test_order_does_not_matter(name, n, seed):
+    encoder, points = small(name), cloud(n, 2, seed)
+    order = torch.randperm(n, generator=torch.Generator().manual_seed(seed))
+    torch.testing.assert_close(encoder(points[:, order]), encoder(points), atol=2e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", [name for name in ENCODERS if name != "dgcnn"])
+@pytest.mark.parametrize("n", [1, 2, 20])
+def test_repetition_does_not_matter(name, n):
+    """Not so for DGCNN: repeated points are each other's nearest neighbours."""
+    encoder, points = small(name), cloud(n)
+    torch.testing.assert_close(encoder(points.repeat(1, 3, 1)), encoder(points), atol=1e-5, rtol=1e-5)
+
+
+@every_encoder
+def test_points_out_of_the_region_do_not_count(name):
+    encoder, points = small(name), cloud(20)
+    out = torch.tensor([[[3.0, 0.0, 0.5], [0.3, 0.0, -0.2], [0.0, 0.0, 0.0]]])
+    torch.testing.assert_close(encoder(torch.cat([out, points], 1)), encoder(points), atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(encoder(out), encoder(torch.zeros(1, 0, 3)))
+    assert not torch.allclose(encoder(points), encoder(out))
+
+
+@every_encoder
+def test_gradients_reach_every_parameter(name):
+    """Some clouds are empty, and one has fewer points than neighbours: no gradient may be NaN there."""
+    encoder = small(name)
+    clouds = torch.cat([cloud(40, 6), torch.zeros(2, 40, 3)])
+    clouds[5, 2:] = 0.0
+    loss = encoder(clouds).square().sum() + encoder(clouds[:, :0]).square().sum()
+    if isinstance(encoder, Autoencoder):
+        loss = loss + encoder.loss(clouds, np.random.default_rng(0))[0]
+    loss.backward()
+    for parameter, p in encoder.named_parameters():
+        assert p.grad is not None, parameter
+        assert p.grad.isfinite().all() and p.grad.abs().max() > 0, parameter
+
+
+@every_encoder
+def test_files(name, tmp_path):
+    encoder = small(name)
+    if isinstance(encoder, Autoencoder):
+        with torch.no_grad():
+            encoder.standardize(encoder.encode(cloud(40, 30)))
+    save_encoder(encoder, tmp_path, {})
+    loaded = load_encoder(tmp_path)
+    assert type(loaded) is ENCODERS[name][0]
+    assert loaded.settings == encoder.settings
+    assert not any(p.requires_grad for p in loaded.parameters())
+    points = cloud(40)
+    torch.testing.assert_close(loaded(points), encoder(points), atol=0.02, rtol=0)  # stored in fp16
+    save_encoder(loaded, tmp_path / "again", {})
+    assert fingerprint(load_encoder(tmp_path / "again")) == fingerprint(loaded)
+
+
+@every_encoder
+def test_settings_are_read_by_name(name):
+    config = MotionModelConfig(
+        robot="r", joint_names=("a", "b"), lower=(-1.0, -1.0), upper=(1.0, 1.0), frame_offsets=(),
+        links=("l",), encoder=name, encoder_settings=SMALL[name],
+    )  # fmt: skip
+    assert settings_from_json(MotionModelConfig, settings_to_json(config), "x") == config
+    z = MotionModel(config).encode(cloud(3000)[0].numpy().astype(np.float64))
+    assert z.shape == (8,)
+    other = next(settings for settings in SMALL.values() if settings is not SMALL[name])
+    with pytest.raises(InputError, match=f"encoder is {name}, but its settings are {type(other).__name__}"):
+        replace(config, encoder_settings=other)
+
+
+@pytest.mark.parametrize("name", PAPER_SIZE)
+def test_sizes_of_the_papers(name):
+    encoder = make_encoder(name, PAPER_SIZE[name])
+    assert encoder.settings.code == 60
+    weights = sum(p.numel() for p in encoder.parameters())
+    # PointNet 3.5 million, of which the head to 40 classes is small; DGCNN 1.8 million
+    least, most = {"pointnet": (3.0e6, 3.6e6), "dgcnn": (1.2e6, 1.9e6)}.get(name, (7e6, 8e6))
+    assert least < weights < most
+
+
+@pytest.mark.parametrize(
+    ("kind", "changes", "message"),
+    [
+        (PointAutoencoderSettings, {"points": ()}, "encoder.points is ()"),
+        (PointNetSettings, {"second": (8, 0)}, "encoder.second is"),
+        (DGCNNSettings, {"neighbours": 0}, "encoder.neighbours is 0"),
+        (CompressionAutoencoderSettings, {"code": 0}, "encoder.code is 0"),
+    ],
+)
+def test_bad_settings(kind, changes, message):
+    with pytest.raises(InputError) as caught:
+        kind(**changes)
+    assert message in str(caught.value)
+
+
+def test_compression_autoencoder_has_the_papers_layers():
+    encoder = make_encoder("compression_autoencoder")
+    assert isinstance(encoder, CompressionAutoencoder)
+    sizes = [4200, 786, 512, 256, 60]
+    for network, wanted in ((encoder.encoder, sizes), (encoder.decoder, sizes[::-1])):
+        linear = [layer for layer in network if isinstance(layer, torch.nn.Linear)]
+        assert [linear[0].in_features, *(layer.out_features for layer in linear)] == wanted
+    assert [tuple(w.shape) for w in encoder.penalised()] == [(786, 4200), (512, 786), (256, 512), (60, 256)]
+
+
+def test_arranged_clouds():
+    """Sorted as the ordered clouds of `surface_clouds` are already, and thinned or repeated evenly."""
+    encoder = CompressionAutoencoder(SMALL_CAE)
+    scenes = [torch.from_numpy(a) for a in random_scenes(20, 12, np.random.default_rng(0))]
+    clouds = partial(surface_clouds, *scenes, region=encoder.settings.region)
+    ordered = clouds(40, torch.Generator().manual_seed(0), ordered=True)
+    loose = clouds(40, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(encoder.arrange(ordered), ordered, atol=1e-6, rtol=0)
+    torch.testing.assert_close(encoder.arrange(loose), ordered, atol=1e-6, rtol=0)
+    every = ordered[:, 1::4]  # of 40 for 10, the middle one of each four
+    few = CompressionAutoencoder(replace(SMALL_CAE, cloud=10))
+    torch.testing.assert_close(few.arrange(loose)[:, :, 0], ordered[:, 2::4, 0], atol=1e-6, rtol=0)
+    repeated = encoder.arrange(every)
+    torch.testing.assert_close(repeated, every.repeat_interleave(4, 1), atol=1e-6, rtol=0)
+
+
+def test_compression_autoencoder_reconstructs_a_small_set():
+    torch.manual_seed(0)
+    encoder = CompressionAutoencoder(SMALL_CAE)
+    clouds = cloud(40, 6)
+    rng = np.random.default_rng(0)
+    optimizer = torch.optim.Adam(encoder.parameters(), lr=3e-3)
+    reached = []
+    for _ in range(400):
+        optimizer.zero_grad()
+        loss, errors = encoder.loss(clouds, rng)
+        loss.backward()
+        optimizer.step()
+        reached.append(errors["reconstruction"])
+    assert reached[0] > 0.5
+    assert reached[-1] < 0.02
+    difference = encoder.decode(encoder.encode(clouds)) - encoder.arrange(clouds)
+    assert abs(difference.square().sum(-1).mean().sqrt().item() - reached[-1]) < 0.01
+
+
+def test_edge_convolution_is_the_maximum_over_edges():
+    """The layer as it is written in the paper, edge by edge."""
+    torch.manual_seed(0)
+    layer, x = EdgeConvolution(5, 7, 4), torch.randn(2, 12, 5)
+    near = torch.ones(2, 12, dtype=torch.bool)
+    index = neighbours(x, near, 4)
+    for b in range(2):
+        apart = torch.cdist(x[b], x[b])
+        for i in range(12):
+            assert set(index[b, i].tolist()) == set(apart[i].argsort()[:4].tolist())
+    # h(x_i, x_j - x_i) = own x_i + other (x_i + (x_j - x_i))
+    edges = torch.stack([x[b][index[b]] for b in range(2)])
+    h = layer.own(x)[:, :, None] + layer.other(x[:, :, None] + (edges - x[:, :, None]))
+    wanted = torch.nn.functional.leaky_relu(layer.norm(h.amax(2)), 0.2)
+    torch.testing.assert_close(layer(x, near), wanted, atol=1e-5, rtol=1e-5)
+
+
+def test_neighbours_count():
+    x = torch.tensor([[[0.0], [1.0], [3.0], [1.1]]])
+    near = torch.tensor([[True, True, True, False]])
+    index = neighbours(x, near, 4)[0]
+    assert [set(row.tolist()) for row in index] == [{0, 1, 2}] * 3 + [{0, 1, 2, 3}]
+
+
+@pytest.mark.parametrize("name", ALONE)
+def test_training_alone(name, tmp_path, monkeypatch):
+    monkeypatch.setattr(encoder_training, "READ", 256)
+    training_settings = EncoderTraining(
+        name=name, minutes=None, samples=3200, batch=16, points=64, warmup_steps=10, encoder=SMALL[name]
+    )
+    drawn = set()
+
+    def clouds(*given):
+        drawn.add(given[4] if len(given) > 4 else None)
+        return scene_clouds(*given)
+
+    monkeypatch.setattr(encoder_training, "scene_clouds", clouds)
+    before = train_encoder(replace(training_settings, samples=16), str(tmp_path / "short"))
+    report = train_encoder(training_settings, str(tmp_path / "long"))
+    error = "chamfer" if name == "point_autoencoder" else "reconstruction"
+    assert report[error] < 0.9 * before[error]
+    sizes = drawn - {None}
+    assert sizes <= set(range(8, 65)) and len(sizes) > 30 if ENCODERS[name][0].any_size else sizes == {40}
+    encoder = load_encoder(tmp_path / "long")
+    assert encoder_name(encoder) == name
+    scenes = random_scenes(300, 12, np.random.default_rng(5))
+    z = encoder(scene_clouds(encoder, *scenes, np.random.default_rng(6)))
+    torch.testing.assert_close(z.std(0), torch.ones(8), atol=0.35, rtol=0)
+
+
+@pytest.mark.parametrize("name", JOINTLY)
+def test_not_alone(name):
+    with pytest.raises(InputError, match=f"name is {name}.*jointly"):
+        EncoderTraining(name=name)
+
+
+def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(encoder_training, "READ", 32)
+    out = str(tmp_path / "out")
+    command = ["train", "encoder", "--samples", "4", "--batch", "2", "--out", out, "--encoder"]
+    assert main([*command, "compression_autoencoder"]) == 0
+    assert "reconstruction: " in capsys.readouterr().out
+    assert load_encoder(out).settings == CompressionAutoencoderSettings()
+    assert main([*command, "pointnett"]) == 2
+    assert "known: compression_autoencoder, dgcnn" in capsys.readouterr().err
+
+
+def test_scene_distances_against_the_shapes():
+    rng = np.random.default_rng(0)
+    kinds, params = random_scenes(30, 5, rng)
+    at = rng.uniform([-1, -1, 0], [1, 1, 1.2], (25, 3))
+    found = scene_distances(kinds, params, at)
+    for row, scene_kinds, scene_params in zip(found, kinds, params, strict=True):
+        shapes = []
+        for kind, p in zip(scene_kinds, scene_params.astype(float), strict=True):
+            if kind == SPHERE:
+                shapes.append(Sphere(p[:3], p[3]))
+            elif kind == BOX:
+                shapes.append(Box(p[:3], p[3:6], p[6:]))
+        for place, distance in zip(at, row, strict=True):
+            wanted = min((float(_distance(shape, place)) for shape in shapes), default=np.inf)
+            assert distance == pytest.approx(wanted, abs=1e-6)
+
+
+def _distance(shape, place):
+    if isinstance(shape, Sphere):
+        return np.linalg.norm(place - shape.center) - shape.radius
+    local = shape.rotation.T @ (place - shape.center)
+    beyond = np.abs(local) - np.asarray(shape.size) / 2
+    return np.linalg.norm(beyond.clip(0)) if (beyond > 0).any() else beyond.max()
+
+
+def test_readout_of_codes_that_tell_nothing(monkeypatch):
+    monkeypatch.setattr(encoder_training, "READ", 256)
+    encoder = small("pointnet")
+    report = linear_readout(encoder, 4, np.random.default_rng(0))
+    assert report["readout"] < report["readout_of_constant"]
+    last = list(encoder.parameters())[-2]  # the matrix of the last layer
+    torch.nn.init.zeros_(last)
+    report = linear_readout(encoder, 4, np.random.default_rng(0))
+    assert report["readout"] == pytest.approx(report["readout_of_constant"])
+
+
+@pytest.fixture
+def data(tmp_path, monkeypatch):
+    """One shard of random motions."""
+    arm = box_arm()
+    monkeypatch.setattr(training, "load_robot", lambda name: arm)
+    folder = tmp_path / "data"
+    write_manifest(folder, manifest_of(arm))
+    write_shard(folder, 0, random_arrays(arm, 60, np.random.default_rng(0)), {})
+    return folder
+
+
+def planner(data, encoder, **changes) -> PlannerTraining:
+    planned = PlannerTraining(
+        data=str(data), encoder=encoder, minutes=None, samples=96, batch=16, warmup_steps=1,
+        denoiser_settings=TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8),
+    )  # fmt: skip
+    return replace(planned, **changes)
+
+
+@every_encoder
+def test_joint_training_changes_the_encoder(name, data, tmp_path):
+    """And the planner's file holds it."""
+    planned = planner(data, name, encoder_settings=SMALL[name], learning_rate=1e-2)
+    fresh = small(name)
+    train_planner(planned, str(tmp_path / "out"))
+    model = load_model(tmp_path / "out", box_arm())
+    assert type(model.encoder) is ENCODERS[name][0]
+    trained = dict(model.encoder.named_parameters())
+    moved = {key for key, p in fresh.named_parameters() if (trained[key] - p).abs().max() > 1e-3}
+    own = ("decoder", "query") if name in ALONE else ()  # what only reconstructs takes no part
+    assert {key for key in trained if not key.startswith(own) and "empty" not in key} <= moved
+    assert not (data / "codes").exists()
+    z = model.encode(cloud(100)[0].numpy().astype(np.float64))
+    assert np.isfinite(z).all()
+
+
+def test_joint_training_resumes(data, tmp_path, monkeypatch):
+    planned = planner(data, "pointnet", encoder_settings=SMALL["pointnet"])
+    whole = train_planner(planned, str(tmp_path / "whole"))
+    original = training.TrainingRun.step
+
+    def interrupted(self, loss):
+        original(self, loss)
+        if self.at.step == 3:
+            self.save()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(training.TrainingRun, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        train_planner(planned, str(tmp_path / "parts"))
+    monkeypatch.setattr(training.TrainingRun, "step", original)
+    assert train_planner(planned, str(tmp_path / "parts")) == whole
+
+
+@every_encoder
+def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
+    save_encoder(small(name), tmp_path / "encoder", {})
+    before = fingerprint(load_encoder(tmp_path / "encoder"))
+    train_planner(planner(data, str(tmp_path / "encoder")), str(tmp_path / "out"))
+    assert fingerprint(load_model(tmp_path / "out").encoder) == before
+    assert fingerprint(load_encoder(tmp_path / "encoder")) == before
+
+
+def test_batches_with_clouds_instead_of_codes(data):
+    arm = box_arm()
+    encoder = small("dgcnn")
+    config = MotionModelConfig(
+        robot=arm.name, joint_names=arm.joint_names, lower=tuple(arm.lower.tolist()),
+        upper=tuple(arm.upper.tolist()), frame_offsets=(), links=("l1", "l2", "l3"), encoder="dgcnn",
+        encoder_settings=encoder.settings,
+    )  # fmt: skip
+    kept = load_data(str(data), arm, None, config.frames, lambda text: None)
+    assert kept.codes is None
+    batches = Batches(kept, MotionModel(config), lambda k, p, q: np.ones((*q.shape[:2], 3)), 0.1, 5.0)
+    first, again = (batches.draw(8, np.random.default_rng(3)) for _ in range(2))
+    assert first.clouds is not None and again.clouds is not None
+    assert first.clouds.shape == (8, 32, 3)
+    assert torch.equal(first.clouds, again.clouds)
+    assert (first.condition[:, :8] == 0).all() and (first.condition[:, 8:] != 0).any()
+
+
+def test_settings_of_an_encoder_that_is_not_trained_along(data):
+    with pytest.raises(InputError, match="unknown encoder 'runs/encoder'"):
+        planner(data, "runs/encoder", encoder_settings=SMALL["pointnet"])

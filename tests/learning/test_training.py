@@ -1,0 +1,554 @@
+"""Training: it learns, resumes exactly, survives bad steps, and refuses data that do not fit."""
+
+import csv
+import json
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.box_arm import box_arm
+from helpers.stores import FRAMES as STORED
+from helpers.stores import manifest_of, random_arrays
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.data.shards import shard_path, split_of, write_manifest, write_shard
+from robotdiffuse.errors import InputError
+from robotdiffuse.files import alone_in
+from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors, save_encoder
+from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
+from robotdiffuse.learning.diffusion import ScheduleSettings
+from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.objectives import OBJECTIVES
+from robotdiffuse.learning.settings import settings_to_json
+from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training.batches import (
+    Batch,
+    Batches,
+    fast_bf16,
+    load_data,
+    random_scenes,
+    resample_evenly,
+)
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.training.encoder import train_encoder
+from robotdiffuse.learning.training.losses import LossSettings
+from robotdiffuse.learning.training.planner import moving_links, train_planner
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.run import TrainingRun, Validation
+from robotdiffuse.learning.training.validation import FLOOR
+from robotdiffuse.scenes.packed import BOX, SPHERE
+from robotdiffuse.scenes.sampling import sample_surfaces_batch
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+
+SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
+SMALL_DENOISER = TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8)
+FRAMES = 48
+
+
+@pytest.fixture
+def arm(monkeypatch):
+    robot = box_arm()
+    monkeypatch.setattr(training, "load_robot", lambda name: robot)
+    return robot
+
+
+@pytest.fixture
+def data(tmp_path, arm):
+    """Two shards of bows to the side that the obstacle lies on; too far for clearances to tell."""
+    folder = tmp_path / "data"
+    rng = np.random.default_rng(0)
+    write_manifest(folder, manifest_of(arm))
+    for i, n in enumerate((100, 60)):
+        side = rng.choice([-1.0, 1.0], n)
+        ends = rng.uniform(-1.5, 1.5, (2, n, 1, arm.dof))
+        s = np.linspace(0, 1, STORED)[:, None]
+        q = ends[0] * (1 - s) + ends[1] * s + 0.5 * side[:, None, None] * np.sin(np.pi * s)
+        arrays = random_arrays(arm, n, rng)
+        kinds, params = np.zeros_like(arrays["obstacle_kinds"]), np.zeros_like(arrays["obstacle_params"])
+        kinds[:, 0] = SPHERE
+        params[:, 0, :4] = np.stack([0.01 * rng.random(n), 0.5 * side, 0 * side + 1, 0 * side + 0.2], -1)
+        arrays |= {"trajectories": q, "obstacle_kinds": kinds, "obstacle_params": params}
+        write_shard(folder, i, arrays, {})
+    torch.manual_seed(0)
+    save_encoder(PointAutoencoder(SMALL_ENCODER), tmp_path / "encoder", {})
+    return folder
+
+
+def planner_settings(data, **changes) -> PlannerTraining:
+    settings = PlannerTraining(
+        data=str(data),
+        encoder=str(data.parent / "encoder"),
+        minutes=None,
+        samples=160,
+        batch=16,
+        warmup_steps=3,
+        learning_rate=3e-3,
+        turns=0,
+        denoiser_settings=SMALL_DENOISER,
+    )
+    return replace(settings, **changes)
+
+
+def read_log(folder):
+    with open(folder / "log.csv") as file:
+        return list(csv.DictReader(file))
+
+
+def stop_at(monkeypatch, step):
+    """Interrupt training after so many steps, as Ctrl-C would."""
+    original = TrainingRun.step
+
+    def interrupted(self, loss):
+        original(self, loss)
+        if self.at.step == step:
+            self.save()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(TrainingRun, "step", interrupted)
+    return lambda: monkeypatch.setattr(TrainingRun, "step", original)
+
+
+def test_random_scenes():
+    kinds, params = random_scenes(300, 12, np.random.default_rng(0))
+    assert set(np.unique(kinds)) == {0, SPHERE, BOX}
+    assert (params[kinds == 0] == 0).all()
+    assert (params[kinds == SPHERE, 3] > 0).all()
+    np.testing.assert_allclose(np.linalg.norm(params[kinds != 0, 6:], axis=1), 1, atol=1e-5)
+    assert (kinds != 0).sum(1).max() == 12
+    assert np.isfinite(sample_surfaces_batch(kinds, params, 20, np.random.default_rng(0))).all()
+
+
+def test_encoder_learns(tmp_path):
+    settings = EncoderTraining(
+        minutes=None, samples=1600, batch=16, points=64, warmup_steps=10, encoder=SMALL_ENCODER
+    )
+    report = train_encoder(settings, str(tmp_path))
+    losses = [float(row["loss"]) for row in read_log(tmp_path)]
+    assert losses[-1] < 0.85 * losses[0]
+    assert report["distance"] < 0.8 * report["distance_of_constant"]
+    codes = load_encoder(tmp_path)(torch.zeros(1, 0, 3))
+    assert codes.shape == (1, 8)
+
+
+def start(kind, settings, out, *launcher):
+    """A training of training_processes.py, in a process group of its own."""
+    file = out.parent / f"{out.name}.json"
+    file.write_text(json.dumps(settings_to_json(settings)))
+    script = str(Path(__file__).parents[1] / "helpers" / "training_processes.py")
+    return subprocess.Popen(
+        [sys.executable, *launcher, script, kind, str(file), str(out)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def test_killed_training_ends_the_same(tmp_path, data):
+    """By kill -9, at a random moment after the first checkpoint."""
+    settings = planner_settings(data, samples=480, validation_problems=1)
+    train_planner(settings, str(tmp_path / "whole"))
+    out = tmp_path / "killed"
+    run = start("slow", replace(settings, checkpoint_seconds=0.2), out)
+    while not (out / "training.safetensors").exists():
+        assert run.poll() is None, run.communicate()[0]
+        time.sleep(0.01)
+    time.sleep(random.random())
+    run.kill()
+    run.communicate()
+    assert run.returncode == -signal.SIGKILL and not (out / "model.safetensors").exists()
+    train_planner(settings, str(out))
+    files = [tmp_path / part / "model.safetensors" for part in ("whole", "killed")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
+    """A step of two is that of one on both their batches; they resume, and skip a bad step, together."""
+    out = tmp_path / "two"
+    settings = planner_settings(data, samples=160, gradient_norm=1e6, validation_problems=1, device="cpu")
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
+    run = start("two", settings, out, *launcher)
+    said = run.communicate(timeout=500)[0]
+    assert run.returncode == 0, said
+    assert said.count("planner: 100.0%, 160 samples") == 2, "the first process alone reports"
+    first, second = json.loads((out / "seen.json").read_text())
+    assert first == second
+    assert first["report"] == first["again"]
+    assert first["skipped"] == 1 and first["samples"] == 20
+    files = [out / part / "model.safetensors" for part in ("whole", "parts")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    with pytest.raises(InputError, match="processes = '2', now it is '1'"):
+        train_planner(settings, str(out / "parts"))
+
+    draw, gradients = Batches.draw, {}
+
+    def both(self, count, rng):
+        if gradients:
+            return draw(self, count, rng)
+        parts = [draw(self, count // 2, np.random.default_rng(seed)) for seed in (0, [0, 1])]
+        fields = ((name, [getattr(part, name) for part in parts]) for name in vars(parts[0]))
+        joined: dict[str, Any] = {n: None if a is None else np.concatenate([a, b]) for n, (a, b) in fields}
+        return Batch(**joined)
+
+    def step(self, loss):
+        original(self, loss)
+        gradients.update(
+            {name: p.grad.clone() for name, p in self.parameters.items()} if not gradients else {}
+        )
+
+    original = TrainingRun.step
+    monkeypatch.setattr(Batches, "draw", both)
+    monkeypatch.setattr(TrainingRun, "step", step)
+    train_planner(replace(settings, samples=32, batch=32), str(tmp_path / "one"))
+    averaged, _ = read_tensors(out / "first_step.safetensors")
+    assert averaged.keys() == gradients.keys()
+    wanted, found = (torch.cat([g[name].flatten() for name in averaged]) for g in (gradients, averaged))
+    # products in bf16 have 8 digits, and are rounded for each batch
+    assert (found - wanted).norm() < (0.01 if fast_bf16() else 1e-5) * wanted.norm()
+
+
+def test_takes_in_data_that_are_still_being_made(tmp_path, data, monkeypatch, capsys):
+    """Shards that appear are drawn from after the next checkpoint; a whole folder is read once."""
+    shard_path(data, 1).rename(tmp_path / "later")
+    known = []
+    original = TrainingRun.step
+
+    def step(self, loss):
+        original(self, loss)
+        if self.at.step == 3:
+            (tmp_path / "later").rename(shard_path(data, 1))
+
+    read = training.load_data
+
+    def count_reading(*given):
+        known.append(read(*given))
+        return known[-1]
+
+    monkeypatch.setattr(TrainingRun, "step", step)
+    monkeypatch.setattr(training, "load_data", count_reading)
+    settings = planner_settings(data, checkpoint_seconds=0.0, samples=96, validation_problems=1)
+    train_planner(settings, str(tmp_path / "out"))
+    assert len(known) == 2 and len(known[0]) < len(known[1])
+    assert f"grown to {len(known[1]):,} trajectories" in capsys.readouterr().err
+    about = json.loads((tmp_path / "out" / "model.json").read_text())["training"]
+    assert about["trajectories"] == len(known[1]) and about["data"] == known[1].digest
+
+
+@pytest.mark.parametrize("denoiser", DENOISERS)
+def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
+    """On the meta device, which has no numbers, but refuses tensors of other devices as a GPU does."""
+    losses = LossSettings(point=1.0, collision=1.0)
+    settings = planner_settings(
+        data, denoiser=denoiser, denoiser_settings=None, losses=losses, condition_drop=0.5
+    )
+    encoder = load_encoder(data.parent / "encoder")
+    model = MotionModel(training._model_config(settings, arm, encoder))
+    loaded = load_data(str(data), arm, encoder, FRAMES, lambda text: None)
+
+    def far(kinds, params, q):
+        return np.full((*q.shape[:-1], len(model.config.links)), 0.4, np.float32)
+
+    rng = np.random.default_rng(0)
+    batch = Batches(loaded, model, far, 0.1, 5.0).draw(4, rng)
+    elsewhere = Processes("cpu")
+    elsewhere.device = torch.device("meta")
+    model = model.to("meta")
+    loss = training._Loss(model, arm, settings, elsewhere)(batch, 1.0, rng, torch.arange(4) > 1)
+    loss.backward()
+    assert loss.device.type == "meta"
+    assert all(p.grad is not None for p in model.denoiser.parameters())
+
+
+def test_device_is_checked(data, tmp_path, monkeypatch):
+    for name, message in (("tpu", "unknown device 'tpu'; known: cpu, cuda"), ("cuda", "no CUDA device")):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+        with pytest.raises(InputError, match=message):
+            train_planner(planner_settings(data, device=name), str(tmp_path / "out"))
+    Processes("cpu")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation: True)
+    with pytest.raises(InputError, match="has trained on cpu; start a new process"):
+        Processes("cuda")
+
+
+def test_training_without_accelerate_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "accelerate", None)
+    with pytest.raises(InputError, match=r"pip install \"robotdiffuse\[train\]\""):
+        Processes(None)
+
+
+@pytest.mark.parametrize("kind", ["encoder", "planner"])
+def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
+    def train(out):
+        if kind == "encoder":
+            settings = EncoderTraining(minutes=None, samples=96, batch=8, points=32, encoder=SMALL_ENCODER)
+            return train_encoder(settings, str(out))
+        return train_planner(planner_settings(data), str(out))
+
+    whole = train(tmp_path / "whole")
+    resume = stop_at(monkeypatch, 5)
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path / "parts")
+    resume()
+    assert train(tmp_path / "parts") == whole
+    name = "encoder" if kind == "encoder" else "model"
+    files = [tmp_path / part / f"{name}.safetensors" for part in ("whole", "parts")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert train(tmp_path / "parts") == whole, "a finished run is left as it is"
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"target": "absolute", "smooth_noise": False},
+        {"parametrization": "b_spline", "rows": 8},
+        {"parametrization": "b_spline", "rows": 8, "target": "absolute"},
+        {"objective": "noise"},
+        {"objective": "velocity", "schedule": ScheduleSettings(kind="flow"), "sampler": "euler"},
+        {"sees_clearances": False, "sampler": "dpm_solver"},
+        {"losses": LossSettings(point=0.1, collision=0.1, frames=4)},
+    ],
+    ids=lambda changes: "-".join(map(str, changes)),
+)
+def test_every_choice_trains_and_plans(changes, tmp_path, data, arm):
+    """Loss falls, start and goal are exact, samples are within limits."""
+    out = tmp_path / "out"
+    train_planner(planner_settings(data, samples=16 * 120, **changes), str(out))
+    losses = [float(row["loss"]) for row in read_log(out)]
+    assert losses[-1] < losses[0]
+    model = load_model(out, arm)
+    start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
+    z = model.encode(np.zeros((0, 3)))
+
+    def clearances(q):
+        return np.full((*q.shape[:2], 3), 0.3, np.float32)
+
+    q = model.sample(z, start, goal, 3, np.random.default_rng(0), clearances, steps=8)
+    assert q.shape == (3, FRAMES, 3) and np.isfinite(q).all()
+    assert (q[:, 0] == start).all() and (q[:, -1] == goal).all()
+    assert (q >= arm.lower).all() and (q <= arm.upper).all()
+
+
+def test_two_trainings_do_not_share_a_folder(tmp_path, data):
+    out = tmp_path / "out"
+    with alone_in(out), pytest.raises(InputError, match="another process"):
+        train_planner(planner_settings(data), str(out))
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+def test_errors_in_space_weigh_the_same_whatever_is_predicted(data, arm, objective):
+    """They once had the weight of the output's error: 10,000 times too much for noise at the last level."""
+    encoder = load_encoder(data.parent / "encoder")
+    loaded = load_data(str(data), arm, None, FRAMES, print)
+    settings = planner_settings(data, objective=objective)
+    model = MotionModel(training._model_config(settings, arm, encoder))
+    batches = Batches(
+        loaded, model, lambda kinds, params, q: np.zeros((*q.shape[:2], 3), np.float32), 0.1, 5.0
+    )
+    levels = np.arange(1, model.schedule.steps + 1)
+    batch = batches.at(np.zeros(len(levels), np.int64), levels, np.random.default_rng(0))
+    of_clean = model.schedule.weight(levels, 5.0)
+    assert (batch.clean_weight > 0).all()
+    assert (batch.clean_weight <= of_clean * (1 + 1e-5)).all()
+    if objective == "clean":
+        np.testing.assert_allclose(batch.clean_weight, of_clean, rtol=1e-6)
+
+
+def test_planner_learns_which_side(tmp_path, data, arm):
+    out = tmp_path / "out"
+    report = train_planner(
+        planner_settings(data, samples=16 * 500, losses=LossSettings(point=0.01)), str(out)
+    )
+    rows = read_log(out)
+    assert float(rows[-1]["loss"]) < 0.3 * float(rows[0]["loss"])
+    assert report["samples"] == 8000
+    assert 0.0 <= report["success"] <= 1.0 and float(rows[-1]["success"]) == pytest.approx(report["success"])
+    assert list((out / "tensorboard").iterdir()), "the extra `train` is installed: a log for TensorBoard"
+    model = load_model(out, arm)
+    about = json.loads((out / "model.json").read_text())
+    assert about["training"]["trajectories"] == len(load_data(str(data), arm, model.encoder, FRAMES, print))
+    rng = np.random.default_rng(0)
+    start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
+    for side in (-1.0, 1.0):
+        kinds, params = np.array([[SPHERE]], np.int8), np.zeros((1, 1, 10), np.float32)
+        params[0, 0, :4] = 0.0, 0.5 * side, 1.0, 0.2
+        z = model.encode(sample_surfaces_batch(kinds, params, 256, rng)[0])
+        checker = CollisionChecker(arm, Scene([FLOOR.shapes[0], Sphere(params[0, 0, :3], 0.2)]))
+
+        def clearances(q, checker=checker):
+            return checker.link_clearances(q.reshape(-1, 3)).reshape(*q.shape[:2], 3)
+
+        q = model.sample(z, start, goal, 4, rng, clearances)
+        bow = q[:, FRAMES // 2] - (start + goal) / 2
+        assert (bow * side > 0.1).all()
+        np.testing.assert_allclose(bow.mean(), 0.5 * side, atol=0.2)
+
+
+def test_codes_are_kept_beside_the_data(data, arm):
+    encoder = load_encoder(data.parent / "encoder")
+    said = []
+    first = load_data(str(data), arm, encoder, FRAMES, said.append)
+    kept = sorted((data / "codes").iterdir())
+    assert len(kept) == 2
+    assert f"{len(first)} trajectories" in said[-1]
+    kept[0].write_bytes(b"damaged")
+    again = load_data(str(data), arm, encoder, FRAMES, said.append)
+    np.testing.assert_array_equal(again.codes, first.codes)
+    assert again.digest == first.digest
+
+
+def test_turned_copies_are_for_training_alone(data, arm):
+    encoder, said = load_encoder(data.parent / "encoder"), []
+    plain = load_data(str(data), arm, encoder, FRAMES, said.append)
+    turned = load_data(str(data), arm, encoder, FRAMES, said.append, turns=2)
+    assert turned.validation == plain.validation and len(turned) > len(plain)
+    for split, more in zip(plain.split(10**6), turned.split(10**6), strict=True):
+        apart = np.abs(split.q[:, None, :, 1:] - more.q[None, :, :, 1:]).max((2, 3))
+        assert apart.min(axis=1).max() < 1e-5 and apart.min(axis=0).max() < 1e-5
+    np.testing.assert_array_equal(plain.split(10**6)[1].q, turned.split(10**6)[1].q)
+
+
+def test_losses_that_are_not_finite_are_skipped(tmp_path):
+    torch.manual_seed(0)
+    module = torch.nn.Linear(2, 1)
+    settings = EncoderTraining(minutes=None, samples=40, batch=1, warmup_steps=1, checkpoint_seconds=0.0)
+    run = TrainingRun(
+        module,
+        str(tmp_path),
+        settings,
+        average=0.9,
+        weight_decay=0.0,
+        gradient_norm=1.0,
+        bad_steps=3,
+        identity={},
+        processes=Processes("cpu"),
+    )
+    calls = []
+
+    def loss(rng):
+        calls.append(len(calls))
+        bad = calls[-1] in (4, 10, 11, 12)
+        return (module.weight * (float("nan") if bad else 1.0)).square().sum()
+
+    run.loop(loss, lambda: Validation(0.0), "test")
+    assert torch.isfinite(module.weight).all()
+    assert run.at.samples == 40
+    assert run.at.rollbacks == 1
+    assert run.at.skipped == 4
+    assert int(read_log(tmp_path)[-1]["skipped"]) == 4
+
+
+def test_hopeless_training_stops(tmp_path):
+    module = torch.nn.Linear(2, 1)
+    settings = EncoderTraining(minutes=None, samples=40, batch=1)
+    run = TrainingRun(
+        module,
+        str(tmp_path),
+        settings,
+        average=0.9,
+        weight_decay=0.0,
+        gradient_norm=1.0,
+        bad_steps=3,
+        identity={},
+        processes=Processes("cpu"),
+    )
+    with pytest.raises(InputError, match="not finite"):
+        run.loop(lambda rng: module.weight.sum() * float("nan"), lambda: Validation(0.0), "test")
+
+
+def test_other_settings_need_another_folder(tmp_path, data):
+    train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
+    with pytest.raises(InputError, match=r"learning_rate = 0\.003, now it is 0\.1"):
+        train_planner(planner_settings(data, learning_rate=0.1), str(tmp_path / "out"))
+
+
+def test_damaged_checkpoint_is_named(tmp_path, data):
+    train_planner(planner_settings(data, samples=16), str(tmp_path / "out"))
+    file = tmp_path / "out" / "training.safetensors"
+    file.write_bytes(file.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"training\.safetensors is damaged"):
+        train_planner(planner_settings(data), str(tmp_path / "out"))
+
+
+def test_splits_and_frames(data, arm):
+    """Training and validation share no scene, the test split stays out, and frames are even again."""
+    loaded = load_data(str(data), arm, load_encoder(data.parent / "encoder"), FRAMES, print)
+    kept, held_out = loaded.split(1000)
+    assert set(split_of(kept.kinds, kept.params)) == {0}
+    assert set(split_of(held_out.kinds, held_out.params)) == {1}
+    assert 120 < len(kept) + len(held_out) == len(loaded) < 160
+    assert len(loaded.split(2)[1]) == 2
+    assert kept.q.shape[1:] == (FRAMES, arm.dof)
+
+
+def test_resampling():
+    q = np.array([[[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [3.0, 1.0]], [[1.0, 2.0]] * 4], np.float32)
+    even = resample_evenly(q, 5)
+    np.testing.assert_allclose(even[0], [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]], atol=1e-6)
+    np.testing.assert_array_equal(even[1], q[1, [0] * 5])
+    assert resample_evenly(q[:0], 5).shape == (0, 5, 2)
+    long = np.random.default_rng(0).standard_normal((4, 254, 3)).cumsum(1).astype(np.float32)
+    for path, found in zip(long, resample_evenly(long, 48), strict=True):
+        at = np.concatenate([[0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
+        wanted = [np.interp(np.linspace(0, at[-1], 48), at, path[:, j]) for j in range(3)]
+        np.testing.assert_allclose(found, np.stack(wanted, 1), atol=1e-3)  # float32 sums of 400 rad
+        np.testing.assert_array_equal(found[[0, -1]], path[[0, -1]])
+
+
+@pytest.mark.parametrize("case", ["none", "damaged", "robot"])
+def test_bad_data_give_one_line(case, data, arm):
+    message = {
+        "none": "holds no shard",
+        "damaged": r"shard_00001\.zarr",
+        "robot": "use the robot of the data",
+    }
+    if case == "none":
+        for i in (0, 1):
+            shutil.rmtree(shard_path(data, i))
+    elif case == "damaged":
+        shutil.rmtree(shard_path(data, 1) / "line_free")
+    robot = replace(arm, spheres={}) if case == "robot" else arm
+    with pytest.raises(InputError, match=message[case]) as caught:
+        load_data(str(data), robot, load_encoder(data.parent / "encoder"), FRAMES, print)
+    assert "\n" not in str(caught.value)
+
+
+def test_length_is_given_once():
+    with pytest.raises(InputError, match="exactly one"):
+        EncoderTraining(minutes=3.0, samples=4)
+
+
+def test_moving_links(arm):
+    assert moving_links(arm) == ("l1", "l2", "l3")
+
+
+def test_trains_without_some_conditions(data, tmp_path):
+    """The stand-in for a dropped condition is trained, and a guidance scale has an effect afterwards."""
+    small = UNetSettings(width=8, multiples=(1, 2), kernel=3, condition_width=16)
+    settings = planner_settings(data, condition_drop=0.5, denoiser="unet", denoiser_settings=small)
+    assert np.isfinite(train_planner(settings, str(tmp_path / "out"))["validation"])
+    model = load_model(tmp_path / "out")
+    assert model.null_condition is not None and model.null_condition.abs().min() > 0
+    ends = np.full(model.dof, -0.5), np.full(model.dof, 0.5)
+
+    def far(q):
+        return np.full((*q.shape[:-1], len(model.config.links)), 0.4, np.float32)
+
+    plain, pushed = (
+        model.sample(
+            model.encode(np.zeros((0, 3))), *ends, 2, np.random.default_rng(0), far, guidance_scale=w
+        )
+        for w in (1.0, 3.0)
+    )
+    assert not np.array_equal(plain, pushed)

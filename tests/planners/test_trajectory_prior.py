@@ -1,0 +1,376 @@
+"""The diffusion prior of MPD and EDMP, their guides, and the planners around it.
+
+The planners are tested with a prior whose denoiser has a closed form: bumps of a Gaussian process around the
+straight line. So the tests need no trained weights.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.interpolate import CubicSpline
+from torch import Tensor
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.denoisers.unet import UNetSettings
+from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
+from robotdiffuse.learning.networks.base import JointRanges
+from robotdiffuse.learning.networks.checkpoint import load_baseline, save_baseline
+from robotdiffuse.learning.networks.trajectory_prior import (
+    TrajectoryPrior,
+    TrajectoryPriorSettings,
+    exponential_levels,
+    quadratic_levels,
+)
+from robotdiffuse.learning.training.batches import TrajectoryData
+from robotdiffuse.planners.edmp import EDMP, ENSEMBLE, EDMPSettings, GuideSettings
+from robotdiffuse.planners.guided_prior import collision_gradient, shared_out
+from robotdiffuse.planners.mpd import MPD, MPDSettings, gaussian_process, state_precision
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.types import Status
+from robotdiffuse.verify import verify, verify_trajectory
+
+PANDA = load_robot("panda")
+RANGES = JointRanges.of(PANDA)
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
+PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
+CHECKER = CollisionChecker(PANDA, PROBLEM.scene)
+SMALL = TrajectoryPriorSettings(unet=UNetSettings(width=16, multiples=(1, 2), condition_width=16))
+FRAMES = 48
+
+
+def bumps(frames: int) -> Float[ndarray, "inner inner"]:
+    """Covariance of smooth bumps over the inner frames, in normalised joint values."""
+    t = np.linspace(0, 1, frames)[1:-1, None]
+    waves = np.concatenate([0.25 / k * np.sin(np.pi * k * t) for k in (1, 2, 3)], 1)
+    return waves @ waves.T + 1e-6 * np.eye(frames - 2)
+
+
+class Gaussian(TrajectoryPrior):
+    """The exact denoiser of straight lines with such bumps."""
+
+    def forward(
+        self, x: Float[Tensor, "batch frames dof"], level: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch frames dof"]:
+        at = round(float(level[0]) * self.schedule.steps)
+        signal, noise = float(self.schedule.signal[at]), float(self.schedule.noise[at])
+        inner, t = x[:, 1:-1].numpy().astype(np.float64), np.linspace(0, 1, x.shape[1])[1:-1, None]
+        line = (1 - t) * x[:, :1].numpy() + t * x[:, -1:].numpy()
+        total = signal**2 * bumps(x.shape[1]) + noise**2 * np.eye(x.shape[1] - 2)
+        seen = noise * np.linalg.solve(total, inner - signal * line)
+        return torch.nn.functional.pad(torch.from_numpy(seen.astype(np.float32)), (0, 0, 1, 1))
+
+
+@pytest.fixture(scope="module")
+def gaussian() -> Gaussian:
+    return Gaussian(RANGES, SMALL)
+
+
+def data_of(count: int, frames: int = FRAMES) -> TrajectoryData:
+    """Lines with bumps, a third of them called trivial, around one ball."""
+    rng = np.random.default_rng(1)
+    t = np.linspace(0, 1, frames)[:, None]
+    middle, half = (PANDA.lower + PANDA.upper) / 2, (PANDA.upper - PANDA.lower) / 2
+    ends = middle + half * rng.uniform(-0.6, 0.6, (2, count, 1, PANDA.dof))
+    q = (1 - t) * ends[0] + t * ends[1] + 0.3 * np.sin(np.pi * t) * rng.normal(size=(count, 1, PANDA.dof))
+    params = np.zeros((count, 1, 10), np.float32)
+    params[:, 0, :4] = [*BALL.center, BALL.radius]
+    kinds = np.ones((count, 1), np.int8)
+    return TrajectoryData(q.astype(np.float32), kinds, params, np.arange(count) % 3 == 0, None, "x", 0)
+
+
+def test_the_loss_falls() -> None:
+    torch.manual_seed(0)
+    network, data, rng = TrajectoryPrior(RANGES, SMALL), data_of(32), np.random.default_rng(0)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=4e-3)
+    losses = []
+    for _ in range(40):
+        loss = network.loss(data, 16, 0.0, rng)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    # an untrained network says that there is no noise: the variance of it is 1
+    assert losses[0] == pytest.approx(1.0, abs=0.1)
+    assert np.mean(losses[-5:]) < 0.6
+    share = network.success(data_of(6), PANDA, rng)
+    assert share is not None and 0 <= share <= 1
+
+
+def test_share_of_trivial_motions() -> None:
+    data, rng = data_of(30), np.random.default_rng(0)
+    drawn = data.draw(4000, 0.2, rng)
+    assert data.trivial[drawn].mean() == pytest.approx(0.2, abs=0.02)
+    assert set(np.unique(drawn)) == set(range(30))
+    for trivial in (np.ones(30, bool), np.zeros(30, bool)):  # of one kind alone
+        assert set(np.unique(replace(data, trivial=trivial).draw(4000, 0.2, rng))) == set(range(30))
+
+
+def test_success_needs_motions_that_are_not_trivial() -> None:
+    data = replace(data_of(4), trivial=np.ones(4, bool))
+    assert TrajectoryPrior(RANGES, SMALL).success(data, PANDA, np.random.default_rng(0)) is None
+
+
+def test_other_frames_are_refused() -> None:
+    with pytest.raises(InputError, match=r"32 frames and trajectory_prior.frames is 48"):
+        TrajectoryPrior(RANGES, SMALL).loss(data_of(4, 32), 4, 0.0, np.random.default_rng(0))
+
+
+def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> None:
+    """100 steps without guide; 300 samples of several joints know the variance to a few percent."""
+    starts, goals = (np.repeat(end[None], 300, 0) for end in (LEFT, RIGHT))
+    levels = gaussian.schedule.sampling_levels(100)[:-1]
+    q = gaussian.sample(starts, goals, levels, np.random.default_rng(0))
+    assert q is not None
+    x = gaussian.normalized(q.astype(np.float64))
+    t = np.linspace(0, 1, FRAMES)[:, None]
+    bump = x - ((1 - t) * x[:, :1] + t * x[:, -1:])
+    # joints whose bumps the limits cut off tell nothing about the sampler
+    whole = np.abs(x).max((0, 1)) < 0.99
+    assert whole.sum() >= 2
+    bump = bump[:, 1:-1, whole]
+    variance = np.diag(bumps(FRAMES))
+    assert np.abs(bump.mean((0, 2))).max() < 4 * np.sqrt(variance.max() / (300 * whole.sum()))
+    assert bump.var((0, 2)).mean() == pytest.approx(variance.mean(), rel=0.1)
+
+
+def test_samples_hold_their_ends_exactly() -> None:
+    torch.manual_seed(0)
+    network, rng = TrajectoryPrior(RANGES, SMALL), np.random.default_rng(0)
+    starts, goals = (rng.uniform(PANDA.lower, PANDA.upper, (3, PANDA.dof)).astype(np.float32) for _ in "ab")
+
+    def guide(q: ndarray, left: int) -> ndarray:
+        return q + np.float32(0.1 * (left < 2))
+
+    q = network.sample(starts, goals, np.array([255, 100, 20, 1]), rng, guide)
+    assert q is not None and q.dtype == np.float32 and q.shape == (3, FRAMES, PANDA.dof)
+    assert np.array_equal(q[:, 0], starts) and np.array_equal(q[:, -1], goals)
+    assert np.all(q >= PANDA.lower - 1e-5) and np.all(q <= PANDA.upper + 1e-5)
+
+
+def test_the_guide_is_told_the_steps_to_come(gaussian: Gaussian) -> None:
+    told: list[int] = []
+
+    def guide(q: ndarray, left: int) -> ndarray:
+        told.append(left)
+        return q
+
+    ends = LEFT[None], RIGHT[None]
+    gaussian.sample(*ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2)
+    assert told == [2, 1, 0, 0, 0]
+    stopped = gaussian.sample(*ends, np.array([255, 1]), np.random.default_rng(0), guide, stop=lambda: True)
+    assert stopped is None and len(told) == 5
+
+
+@pytest.mark.parametrize("levels", [[], [3, 3], [1, 2], [256, 1], [5, 0]])
+def test_levels_must_fall(gaussian: Gaussian, levels: list[int]) -> None:
+    with pytest.raises(InputError, match="must fall from at most 255 to 1"):
+        gaussian.sample(LEFT[None], RIGHT[None], np.array(levels, np.int64), np.random.default_rng(0))
+
+
+@pytest.mark.parametrize("spaced", [exponential_levels, quadratic_levels])
+@pytest.mark.parametrize("steps", [2, 25, 30, 254, 255])
+def test_spaced_levels(spaced, steps: int) -> None:
+    schedule = NoiseSchedule(ScheduleSettings(steps=255))
+    levels = spaced(schedule, steps)
+    assert len(levels) == steps and levels[0] == 255 and levels[-1] >= 1 and np.all(np.diff(levels) < 0)
+    with pytest.raises(InputError, match="between 2 and 255"):
+        spaced(schedule, 256)
+
+
+def test_the_process_is_that_of_natural_splines() -> None:
+    """Its cost is half the least integral of squared accelerations: by SciPy's natural cubic spline."""
+    q = np.random.default_rng(0).normal(size=(3, 12, 2))
+    expected = []
+    for motion in q:
+        second = CubicSpline(np.arange(12), motion, bc_type="natural")(np.arange(12), 2)
+        a, b = second[:-1], second[1:]
+        expected.append(0.5 * ((a * a + a * b + b * b) / 3).sum())
+    assert gaussian_process(12).costs(q) == pytest.approx(expected)
+    line = np.linspace(0, 1, 12)[None, :, None] * np.ones((1, 1, 2))
+    assert gaussian_process(12).costs(line) == pytest.approx([0.0], abs=1e-9)
+
+
+def test_the_precision_is_that_of_the_process() -> None:
+    """Against the covariance of the process propagated from a vague first state."""
+    frames, vague = 8, 1e3 * np.eye(2)
+    transition, noise = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
+    covariance = np.zeros((2 * frames, 2 * frames))
+    covariance[:2, :2] = vague
+    for i in range(1, frames):
+        here, before = slice(2 * i, 2 * i + 2), slice(2 * i - 2, 2 * i)
+        covariance[here, : 2 * i] = transition @ covariance[before, : 2 * i]
+        covariance[: 2 * i, here] = covariance[here, : 2 * i].T
+        covariance[here, here] = transition @ covariance[before, before] @ transition.T + noise
+    states = np.linalg.inv(covariance)
+    states[:2, :2] -= np.linalg.inv(vague)
+    assert state_precision(frames) == pytest.approx(states, abs=1e-4)
+    positions = np.linalg.inv(covariance[::2, ::2])
+    assert gaussian_process(frames).precision == pytest.approx(positions, abs=0.01)
+
+
+def test_gradient_of_the_process() -> None:
+    process, q = gaussian_process(10), np.random.default_rng(0).normal(size=(1, 10, 1))
+    numeric = np.zeros_like(q)
+    for i in range(10):
+        step = np.zeros_like(q)
+        step[0, i] = 1e-4
+        numeric[0, i] = (process.costs(q + step) - process.costs(q - step)) / 2e-4
+    assert process.gradient(q) == pytest.approx(numeric, abs=1e-6)
+
+
+def test_implicit_step_of_the_process() -> None:
+    process, q = gaussian_process(10), np.random.default_rng(0).normal(size=(2, 10, 3))
+    x = process.step(q, 5.0)
+    assert np.array_equal(x[:, [0, -1]], q[:, [0, -1]])
+    assert x[:, 1:-1] == pytest.approx((q - 5.0 * process.gradient(x))[:, 1:-1])
+    assert np.all(process.costs(x) < process.costs(q))
+
+
+def lines(count: int) -> Float[ndarray, "count frames dof"]:
+    """From left to right through the ball, with small bumps."""
+    t = np.linspace(0, 1, FRAMES)[:, None]
+    bump = np.sin(np.pi * t) * np.random.default_rng(3).normal(0, 0.1, (count, 1, PANDA.dof))
+    return ((1 - t) * LEFT + t * RIGHT + bump).astype(np.float32)
+
+
+@pytest.mark.parametrize("between", [0, 1, 3])
+def test_gradient_of_the_collision_cost(between: int) -> None:
+    """Along itself; where spheres enter a margin and at corners of boxes it has kinks, hence 3 %."""
+    q = lines(3)
+    costs, gradient = collision_gradient(CHECKER, q, 0.05, 0.01, between)
+    size = np.sqrt((gradient**2).sum((1, 2)))[:, None, None]
+    step = 1e-2 * gradient / size
+    up, _ = collision_gradient(CHECKER, q + step, 0.05, 0.01, between)
+    down, _ = collision_gradient(CHECKER, q - step, 0.05, 0.01, between)
+    assert np.all(costs > 0.1)
+    assert (up - down) / 2e-2 == pytest.approx(size[:, 0, 0], rel=0.03)
+
+
+def test_guidance_lowers_the_collision_cost() -> None:
+    q = lines(12)
+    before, _ = collision_gradient(CHECKER, q, 0.0, 0.0, 0)
+    moved = MPD(MPDSettings()).guided(CHECKER, q)
+    after, _ = collision_gradient(CHECKER, moved, 0.0, 0.0, 0)
+    assert np.all(after < before) and np.array_equal(moved[:, [0, -1]], q[:, [0, -1]])
+    edmp = EDMP(EDMPSettings(samples=12))
+    moved = edmp.guided(CHECKER, q, 0)
+    after, _ = collision_gradient(CHECKER, moved, 0.0, 0.0, 0)
+    assert np.all(after < before) and np.array_equal(moved[:, [0, -1]], q[:, [0, -1]])
+
+
+def test_each_guide_moves_its_share_its_own_way() -> None:
+    edmp = EDMP(EDMPSettings(samples=30))
+    shares = edmp.settings.shares()
+    assert np.array_equal(np.concatenate([np.arange(30)[share] for share in shares]), np.arange(30))
+    assert len(set(ENSEMBLE)) == len(shares) == 12
+    same = np.repeat(lines(1), 30, 0)
+    moved = edmp.guided(CHECKER, same, 10)
+    first = [moved[share][0] for share in shares]
+    for i, one in enumerate(first):
+        assert all(np.array_equal(one, row) for row in moved[shares[i]])
+        assert not any(np.array_equal(one, other) for other in first[:i])
+    # before any guide begins
+    late = EDMP(EDMPSettings(guides=tuple(replace(guide, guided_share=0.4) for guide in ENSEMBLE)))
+    assert np.array_equal(late.guided(CHECKER, same[:24], 12), same[:24])
+
+
+def test_margins_fall_towards_the_last_step() -> None:
+    guide = GuideSettings(between=0, far_margin=0.1, near_margin=0.02, weight=0.1, guided_share=0.5)
+    assert guide.margin(25, 50) is None and guide.margin(0, 50) == pytest.approx(0.02)
+    margins = [guide.margin(left, 50) for left in range(25)]
+    assert margins == sorted(margins, key=lambda margin: margin or 0.0) and (margins[-1] or 1.0) < 0.1
+
+
+def test_goals_take_turns() -> None:
+    goals = np.stack([RIGHT, LEFT + 0.1, LEFT + 0.2])
+    starts, shared = shared_out(LEFT, goals, 8)
+    assert np.all(starts == LEFT) and np.array_equal(shared, np.stack([goals[1], goals[2]] * 4))
+    assert np.all(shared_out(LEFT, goals, 3)[1] == goals[1])
+
+
+@pytest.fixture(params=["mpd", "edmp"])
+def planner(request: pytest.FixtureRequest, gaussian: Gaussian, monkeypatch: pytest.MonkeyPatch):
+    made = MPD() if request.param == "mpd" else EDMP()
+    monkeypatch.setattr(made, "prior", lambda _robot: gaussian)
+    return made
+
+
+def test_solved_means_verified(planner: MPD | EDMP) -> None:
+    result = planner.plan(PROBLEM, time_limit=120.0)
+    assert result.solved and result.path is not None and result.trajectory is not None
+    assert result.planner == planner.name
+    assert verify(PROBLEM, result.path).valid and verify_trajectory(PROBLEM, result.trajectory).valid
+    assert np.array_equal(result.path.positions[[0, -1]], np.stack([LEFT, RIGHT]))
+    again = planner.plan(PROBLEM, time_limit=120.0)
+    assert again.path is not None and np.array_equal(again.path.positions, result.path.positions)
+    other = planner.plan(PROBLEM, time_limit=120.0, seed=1)
+    assert other.path is not None and not np.array_equal(other.path.positions, result.path.positions)
+
+
+def test_failure_says_what_was_wrong(planner: MPD | EDMP, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples that all go through the ball."""
+    drawn = lines(planner.samples)
+    monkeypatch.setattr(planner, "draw", lambda *_arguments: drawn)
+    planner.plan(PROBLEM, time_limit=0.1)  # compiles and loads
+    result = planner.plan(PROBLEM, time_limit=2.0)
+    assert result.status is Status.TIMEOUT and result.path is None
+    assert result.refused == "scene_collision" and "samples" in result.reason
+
+
+def test_no_time_for_a_batch(planner: MPD | EDMP) -> None:
+    result = planner.plan(PROBLEM, time_limit=1e-3)
+    assert result.status is Status.TIMEOUT and "time ran out" in result.reason and not result.refused
+
+
+@pytest.mark.parametrize("kind", [MPD, EDMP])
+def test_missing_weights(kind: type[MPD | EDMP], tmp_path) -> None:
+    settings = (MPDSettings if kind is MPD else EDMPSettings)(weights=str(tmp_path))
+    with pytest.raises(InputError, match="train baseline trajectory_prior"):
+        kind(settings).plan(PROBLEM, time_limit=1.0)  # type: ignore[arg-type]
+
+
+def test_weights_survive_a_file(tmp_path) -> None:
+    torch.manual_seed(0)
+    network = TrajectoryPrior(RANGES, SMALL)
+    torch.nn.init.normal_(network.denoiser.out.weight, std=0.1)
+    save_baseline("trajectory_prior", network, tmp_path, {})
+    loaded = load_baseline("trajectory_prior", str(tmp_path), PANDA)
+    assert isinstance(loaded, TrajectoryPrior) and loaded.settings == SMALL
+    x, level = torch.randn(2, FRAMES, PANDA.dof), torch.full((2,), 0.3)
+    with torch.no_grad():
+        assert torch.allclose(loaded(x, level), network(x, level), atol=0.05)
+    assert MPD(MPDSettings(weights=str(tmp_path))).prior(PANDA) is loaded
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (lambda: TrajectoryPriorSettings(frames=2), r"frames is 2; it must be at least 3"),
+        (lambda: TrajectoryPriorSettings(trivial_share=1.5), r"trivial_share is 1.5"),
+        (lambda: MPDSettings(samples=0), r"mpd.samples is 0"),
+        (lambda: MPDSettings(sampling_steps=1), r"mpd.sampling_steps is 1"),
+        (lambda: MPDSettings(guided_share=2.0), r"mpd.guided_share is 2.0"),
+        (lambda: MPDSettings(margin=-0.1), r"mpd.margin is -0.1"),
+        (lambda: MPDSettings(push=0.0), r"mpd.push is 0.0"),
+        (lambda: EDMPSettings(samples=11), r"edmp.samples is 11 and guides are 12"),
+        (lambda: EDMPSettings(guides=()), r"edmp.guides is empty"),
+        (lambda: EDMPSettings(sampling_steps=1), r"edmp.sampling_steps is 1"),
+        (lambda: EDMPSettings(self_margin=-1.0), r"edmp.self_margin is -1.0"),
+        (lambda: EDMPSettings(push=-1.0), r"edmp.push is -1.0"),
+        (lambda: replace(ENSEMBLE[0], weight=-1.0), r"weight is -1.0"),
+        (lambda: replace(ENSEMBLE[0], guided_share=1.1), r"guided_share is 1.1"),
+    ],
+)
+def test_bad_settings(make, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make()

@@ -1,0 +1,348 @@
+"""MoveIt planning scenes and requests: what is read, and what is refused rather than ignored."""
+
+import shutil
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.problems.files import load_motion_bench_maker, load_problems
+from robotdiffuse.problems.moveit import (
+    MoveItFrames,
+    moveit_frames,
+    moveit_request,
+    moveit_scene,
+    read_moveit_scene,
+)
+from robotdiffuse.problems.problem import JointGoal, PoseGoal
+from robotdiffuse.robots import Robot, load_robot
+from robotdiffuse.robots.add import add_robot
+from robotdiffuse.scenes.files import read_yaml
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
+from robotdiffuse.transforms import rotation_about, rotation_from_quaternion
+
+FOLDER = Path(__file__).parents[1] / "files" / "motion_bench_maker"
+Z = np.array([0.0, 0.0, 1.0])
+QUARTER = [0, 0, 0.7071067811865476, 0.7071067811865476]
+"""xyzw of a quarter turn about z."""
+
+
+def scene_data(**world: object) -> dict[str, Any]:
+    return {"world": {"collision_objects": [dict(world)]}}
+
+
+def ball(**more: object) -> dict[str, Any]:
+    at = [{"position": [1, 0, 0], "orientation": [0, 0, 0, 1]}]
+    return {
+        "id": "ball",
+        "primitives": [{"type": "sphere", "dimensions": [0.2]}],
+        "primitive_poses": at,
+        **more,
+    }
+
+
+def test_scene_as_motion_bench_maker_writes_it() -> None:
+    can, board = read_moveit_scene(FOLDER / "scene0001.yaml").shapes
+    assert isinstance(can, Cylinder) and (can.name, can.height, can.radius) == ("can", 0.14, 0.03)
+    assert can.center.tolist() == [0.5, -0.4, 0.3]
+    assert isinstance(board, Box) and board.size.tolist() == [1.2, 0.8, 0.04]
+    # A quarter turn about z: the long side lies along y.
+    np.testing.assert_allclose(board.bounds[1] - board.bounds[0], [0.8, 1.2, 0.04], atol=1e-12)
+
+
+def test_folder() -> None:
+    good, bad = load_motion_bench_maker(FOLDER)
+    assert good.name == "motion_bench_maker/0001" and good.error == ""
+    problem = good.load()
+    assert problem.start.tolist() == [0, -0.785, 0, -2.356, 0, 1.571, 0.785]
+    assert isinstance(problem.goal, JointGoal)
+    assert problem.goal.positions.tolist() == [[1.2, -0.3, 0.5, -1.9, -0.2, 2.1, 0.1]]
+    assert problem.robot.locked == {"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065}
+    assert [shape.name for shape in problem.scene.shapes] == ["can", "board"]
+    assert bad.problem is None
+    with pytest.raises(
+        InputError, match=r"request0002.yaml: goal: panda_joint1 is 3.1 rad; its limits are -2.8"
+    ):
+        bad.load()
+    assert [entry.name for entry in load_problems(FOLDER)] == [good.name, bad.name]
+
+
+def test_robot_may_be_given() -> None:
+    robot = load_robot("panda")
+    problem = load_motion_bench_maker(FOLDER, robot)[0].load()
+    assert problem.robot.locked["panda_finger_joint1"] == 0.065
+    assert robot.locked["panda_finger_joint1"] == 0.04
+
+
+def test_unusable_folders(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"has no files scene\*.yaml"):
+        load_motion_bench_maker(tmp_path)
+    shutil.copy(FOLDER / "scene0001.yaml", tmp_path)
+    [entry] = load_motion_bench_maker(tmp_path)
+    assert "request0001.yaml does not exist" in entry.error
+    (tmp_path / "scene0001.yaml").write_text("robot_model_name: r2d2")
+    [entry] = load_motion_bench_maker(tmp_path)
+    assert "scene0001.yaml: unknown robot 'r2d2'" in entry.error
+    (tmp_path / "scene0001.yaml").write_text("[")
+    [entry] = load_motion_bench_maker(tmp_path)
+    assert "not valid YAML" in entry.error and "\n" not in entry.error
+
+
+def test_vectors_as_mappings_types_as_numbers() -> None:
+    data = scene_data(
+        id=3,
+        primitives=[{"type": 3, "dimensions": [0.4, 0.1]}],
+        primitive_poses=[
+            {"position": {"x": 1, "y": 2, "z": 3}, "orientation": {"x": 0, "y": 0, "z": 0, "w": 1}},
+        ],
+    )
+    [shape] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    assert isinstance(shape, Cylinder) and shape.center.tolist() == [1, 2, 3]
+    assert (shape.name, shape.height, shape.radius) == ("3", 0.4, 0.1)
+
+
+def test_poses_compose_from_the_base_outwards() -> None:
+    """The base stands at [1, 0, 0] and is turned; a frame, the object and its part are offset and turned."""
+    data = scene_data(
+        **ball(
+            header={"frame_id": "table"},
+            pose={"position": [0, 2, 0], "orientation": QUARTER},
+        )
+    )
+    data["robot_state"] = {
+        "multi_dof_joint_state": {"transforms": [{"translation": [1, 0, 0], "rotation": QUARTER}]}
+    }
+    table = {"translation": [0, 0, 5], "rotation": QUARTER}
+    data["fixed_frame_transforms"] = [
+        {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"},
+        {"header": {"frame_id": "world"}, "transform": table, "child_frame_id": "table"},
+    ]
+    [shape] = moveit_scene(data, moveit_frames(data), Path()).shapes
+    turn = rotation_about(Z, np.pi / 2)
+    in_object = np.array([1.0, 0, 0])
+    in_world = np.array([0, 0, 5.0]) + turn @ (np.array([0, 2.0, 0]) + turn @ in_object)
+    expected = turn.T @ (in_world - np.array([1.0, 0, 0]))
+    assert isinstance(shape, Sphere)
+    np.testing.assert_allclose(shape.center, expected, atol=1e-12)
+    data["world"]["collision_objects"][0]["header"]["frame_id"] = "panda_link0"
+    [shape] = moveit_scene(data, moveit_frames(data, load_robot("panda")), Path()).shapes
+    assert isinstance(shape, Sphere)
+    np.testing.assert_allclose(shape.center, np.array([0, 2.0, 0]) + turn @ in_object, atol=1e-12)
+
+
+MOUNTED = """<robot name="mounted">
+  <link name="world"/><link name="stand"/>
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="arm"><collision>
+    <origin xyz="0.3 0 0"/><geometry><box size="0.4 0.05 0.05"/></geometry></collision>
+  </link>
+  <joint name="mount" type="fixed"><parent link="world"/><child link="stand"/>
+    <origin xyz="1 2 0.5" rpy="0 0 1.5707963267948966"/></joint>
+  <joint name="rail" type="{kind}"><parent link="stand"/><child link="base"/><origin xyz="0 0 0.3"/>
+    <axis xyz="1 0 0"/><limit lower="-1" upper="1" velocity="1" effort="1"/></joint>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
+</robot>"""
+"""An arm on a stand in the world: its base is not the root of the URDF."""
+
+
+def mounted(folder: Path, kind: str) -> Robot:
+    (folder / "mounted.urdf").write_text(MOUNTED.format(kind=kind))
+    return add_robot(folder / "mounted.urdf", base="base", out=folder / "mounted").robot
+
+
+def test_scene_in_the_world_of_a_robot_whose_base_is_not_its_root(tmp_path: Path) -> None:
+    """`robot add --base` once dropped the transform between them: verified motions met obstacles by 8 cm."""
+    robot = mounted(tmp_path, "fixed")
+    in_base = np.array([0.5, 0.0, 0.1])
+    turn = rotation_about(Z, np.pi / 2)
+    in_world = turn @ in_base + [1, 2, 0.8]
+    for frame, at in {
+        "": in_world,
+        "world": in_world,
+        "stand": in_base + np.array([0, 0, 0.3]),
+        "base": in_base,
+    }.items():
+        pose = {"position": at.tolist(), "orientation": [0, 0, 0, 1]}
+        data = scene_data(**ball(header={"frame_id": frame}, primitive_poses=[pose]))
+        [shape] = moveit_scene(data, moveit_frames(data, robot), tmp_path).shapes
+        assert isinstance(shape, Sphere)
+        np.testing.assert_allclose(shape.center, in_base, atol=1e-9, err_msg=frame)
+
+
+def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_path: Path) -> None:
+    robot = mounted(tmp_path, "prismatic")
+    data = scene_data(**ball(header={"frame_id": "world"}))
+    data["fixed_frame_transforms"] = [
+        {"transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}, "child_frame_id": "world"}
+    ]
+    with pytest.raises(InputError, match="a joint moves base in world"):
+        moveit_scene(data, moveit_frames(data, robot), tmp_path)
+    data = scene_data(**ball(header={"frame_id": "base"}))
+    [shape] = moveit_scene(data, moveit_frames(data, robot), tmp_path).shapes
+    assert isinstance(shape, Sphere) and shape.center.tolist() == [1, 0, 0]
+
+
+def test_pose_of_the_object_alone_is_enough() -> None:
+    entry = ball(pose={"position": [0, 0, 2], "orientation": [0, 0, 0, 1]})
+    del entry["primitive_poses"]
+    [shape] = moveit_scene(scene_data(**entry), moveit_frames({}), Path()).shapes
+    assert isinstance(shape, Sphere) and shape.center.tolist() == [0, 0, 2]
+
+
+def test_meshes(tmp_path: Path) -> None:
+    trimesh.creation.box([1, 1, 1]).export(tmp_path / "cube.stl")
+    at = {"position": [0, 0, 1], "orientation": QUARTER}
+    rows = [{"x": 0, "y": 0, "z": 0}, {"x": 1, "y": 0, "z": 0}, {"x": 0, "y": 1, "z": 0}]
+    data = scene_data(
+        id="things",
+        meshes=[
+            {"triangles": [{"vertex_indices": [0, 1, 2]}], "vertices": rows},
+            {"resource": "cube.stl", "dimensions": [2, 1, 1]},
+        ],
+        mesh_poses=[at, at],
+    )
+    triangle, cube = moveit_scene(data, moveit_frames(data), tmp_path).shapes
+    assert isinstance(triangle, Mesh) and isinstance(cube, Mesh)
+    np.testing.assert_allclose(triangle.world_vertices, [[0, 0, 1], [0, 1, 1], [-1, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(cube.bounds, [[-0.5, -1, 0.5], [0.5, 1, 1.5]], atol=1e-12)
+    assert (triangle.name, cube.name) == ("things", "things_2")
+
+
+CONE = {"type": "cone", "dimensions": [0.4, 0.1]}
+SHORT = {"type": "box", "dimensions": [0.4, 0.1]}
+WRONG_SCENES: dict[str, tuple[object, str]] = {
+    "number": (3, "a planning scene is 3; it must be a mapping"),
+    "cone": (
+        scene_data(**ball(primitives=[CONE])),
+        "object ball: unknown type of .*'cone'; known: box, cylinder",
+    ),
+    "cone by number": (scene_data(**ball(primitives=[CONE | {"type": 4}])), "'cone'; known"),
+    "dimensions": (scene_data(**ball(primitives=[SHORT])), r"primitives\[0\].dimensions .* 3 finite numbers"),
+    "poses": (scene_data(**ball(primitive_poses=[])), "has 1 primitives and 0 primitive_poses"),
+    "quaternion": (
+        scene_data(**ball(primitive_poses=[{"position": [0, 0, 0], "orientation": [0, 0, 0, 0]}])),
+        r"ball: primitive_poses\[0\].orientation .* must not be zero",
+    ),
+    "position": (scene_data(**ball(primitive_poses=[{"orientation": [0, 0, 0, 1]}])), "position.xyz is None"),
+    "frame": (
+        scene_data(**ball(header={"frame_id": "moon"})),
+        "unknown frame_id of header: 'moon'; known: world",
+    ),
+    "plane": (scene_data(**ball(planes=[{"coef": [0, 0, 1, 0]}])), "planes are not supported"),
+    "package": (
+        scene_data(**ball(meshes=[{"resource": "package://a/b.stl"}], mesh_poses=ball()["primitive_poses"])),
+        r"object ball: meshes\[0\].resource is package://a/b.stl",
+    ),
+    "objects": ({"world": {"collision_objects": {}, "octomap": {"octomap": {"data": [1]}}}}, "octomap"),
+    "objects a text": ({"world": {"collision_objects": "ball"}}, "'ball'; it must be a list"),
+    "attached": ({"robot_state": {"attached_collision_objects": [1]}}, "attached_collision_objects"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_SCENES)
+def test_wrong_scenes(case: str, tmp_path: Path) -> None:
+    data, message = WRONG_SCENES[case]
+    file = tmp_path / "scene.yaml"
+    file.write_text(yaml.safe_dump(data))
+    with pytest.raises(InputError, match=message) as raised:
+        read_moveit_scene(file)
+    assert str(raised.value).startswith(str(file)) and "\n" not in str(raised.value)
+
+
+def request_data() -> dict[str, Any]:
+    data = read_yaml(FOLDER / "request0001.yaml")
+    assert isinstance(data, dict)
+    return deepcopy(data)
+
+
+def pose_constraint() -> dict[str, Any]:
+    region = {"primitive_poses": [{"position": [0.4, 0, 0.5], "orientation": [0, 0, 0, 1]}]}
+    return {
+        "position_constraints": [{"link_name": "panda_hand", "constraint_region": region}],
+        "orientation_constraints": [{"link_name": "panda_hand", "orientation": [1, 0, 0, 0]}],
+    }
+
+
+def test_several_goal_constraints_are_a_set() -> None:
+    data = request_data()
+    data["goal_constraints"].append(data["goal_constraints"][0])
+    assert len(moveit_request(data, moveit_frames({})).joint_goals) == 2
+
+
+def test_pose_goal(tmp_path: Path) -> None:
+    for file in FOLDER.glob("*0001.yaml"):
+        shutil.copy(file, tmp_path)
+    data = request_data() | {"goal_constraints": [pose_constraint()]}
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
+    goal = load_motion_bench_maker(tmp_path)[0].load().goal
+    assert isinstance(goal, PoseGoal) and goal.frame == "panda_hand"
+    np.testing.assert_allclose(goal.T_base_frame[:3, 3], [0.4, 0, 0.5])
+    np.testing.assert_allclose(goal.T_base_frame[:3, :3], np.diag([1.0, -1, -1]), atol=1e-12)
+    link, T = moveit_request(data, MoveItFrames(None, np.diag([-1.0, -1, 1, 1]))).pose_goal or ("", np.eye(4))
+    assert link == "panda_hand"
+    np.testing.assert_allclose(T[:3, 3], [-0.4, 0, 0.5])
+    flipped = np.diag([-1.0, -1, 1]) @ rotation_from_quaternion(np.array([0.0, 1, 0, 0]))
+    np.testing.assert_allclose(T[:3, :3], flipped, atol=1e-12)
+
+
+def change(data: dict[str, Any], path: list[Any], value: object) -> dict[str, Any]:
+    at: Any = data
+    for key in path[:-1]:
+        at = at[key]
+    at[path[-1]] = value
+    return data
+
+
+def pose_request(path: list[Any], value: object) -> dict[str, Any]:
+    return request_data() | {"goal_constraints": [change(pose_constraint(), path, value)]}
+
+
+WRONG_REQUESTS: dict[str, tuple[object, str]] = {
+    "number": (3, "a motion plan request is 3"),
+    "no goal": (request_data() | {"goal_constraints": []}, "goal_constraints is empty"),
+    "path constraints": (
+        request_data() | {"path_constraints": {"joint_constraints": [1]}},
+        "path_constraints",
+    ),
+    "attached": (change(request_data(), ["start_state", "attached_collision_objects"], [1]), "attached"),
+    "positions": (
+        change(request_data(), ["start_state", "joint_state", "position"], [0]),
+        "9 finite numbers",
+    ),
+    "value": (
+        change(request_data(), ["goal_constraints", 0, "joint_constraints", 2, "position"], None),
+        r"goal_constraints\[0\].joint_constraints\[2\].position is \[None\]",
+    ),
+    "two poses": (
+        request_data() | {"goal_constraints": [pose_constraint(), pose_constraint()]},
+        "joint_constraints alone, or be the only goal",
+    ),
+    "position alone": (pose_request(["orientation_constraints"], []), "one position and one orientation"),
+    "two links": (pose_request(["orientation_constraints", 0, "link_name"], "x"), "must be one link"),
+    "offset": (pose_request(["position_constraints", 0, "target_point_offset"], [0, 0, 1]), "must be zero"),
+    "region": (pose_request(["position_constraints", 0, "constraint_region"], {}), "has 0 primitive_poses"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_REQUESTS)
+def test_wrong_requests(case: str) -> None:
+    data, message = WRONG_REQUESTS[case]
+    with pytest.raises(InputError, match=message) as raised:
+        moveit_request(data, moveit_frames({}))
+    assert "\n" not in str(raised.value)
+
+
+def test_goal_without_a_joint(tmp_path: Path) -> None:
+    for file in FOLDER.glob("*0001.yaml"):
+        shutil.copy(file, tmp_path)
+    data = request_data()
+    del data["goal_constraints"][0]["joint_constraints"][3]
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
+    [entry] = load_motion_bench_maker(tmp_path)
+    assert "goal_constraints[0] has no value for panda_joint4" in entry.error

@@ -1,0 +1,413 @@
+"""Problems: what the constructor refuses and repairs; problem files, and all that can be wrong in them."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.problems.files import (
+    load_problem,
+    load_problems,
+    problem_from_record,
+    problem_record,
+    save_problem,
+)
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
+from robotdiffuse.transforms import rotation_about, transform
+
+Z = np.array([0.0, 0.0, 1.0])
+READY = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
+DATA = Path(__file__).parents[1] / "files"
+
+
+def crane() -> Robot:
+    """A revolute, a continuous and a prismatic joint."""
+    joints = (
+        Joint("swing", "revolute", "base", "tower", np.eye(4), Z, lower=-1.0, upper=2.0),
+        Joint("spin", "continuous", "tower", "jib", np.eye(4), Z, lower=-np.pi, upper=np.pi),
+        Joint("lift", "prismatic", "jib", "hook", np.eye(4), Z, lower=0.0, upper=0.5),
+        Joint("bolt", "fixed", "base", "plinth", np.eye(4), Z),
+    )
+    return Robot("crane", "base", "hook", joints)
+
+
+def problem(start: Any = (0, 0, 0), goal: Any = (1, 1, 0.1)) -> Problem:
+    return Problem(crane(), Scene(), start, goal)
+
+
+def test_forms_of_goals() -> None:
+    one = problem([0, 0, 0], [1, 1, 0.1])
+    assert one.start.dtype == np.float64 and one.start.tolist() == [0, 0, 0]
+    assert isinstance(one.goal, JointGoal) and one.goal.positions.tolist() == [[1, 1, 0.1]]
+    for two in ([[1, 1, 0], [0, 1, 0]], np.array([[1, 1, 0], [0, 1, 0]]), JointGoal([[1, 1, 0], [0, 1, 0]])):
+        goal = problem(goal=two).goal
+        assert isinstance(goal, JointGoal) and goal.positions.tolist() == [[1, 1, 0], [0, 1, 0]]
+    pose = PoseGoal("hook", transform(Z, rotation_about(Z, 0.4)))
+    assert problem(goal=pose).goal is pose
+    assert one.notes == ()
+
+
+def test_a_hair_over_a_limit_is_clamped_and_said() -> None:
+    made = problem([2 + 1e-6, 0, -1e-8], [[0, 0, 0], [-1 - 9e-6, 0, 0]])
+    assert made.start.tolist() == [2.0, 0.0, 0.0]
+    assert isinstance(made.goal, JointGoal) and made.goal.positions[1, 0] == -1.0
+    assert made.notes == (
+        "start: swing clamped from 2.000001 to its limit 2.0 rad",
+        "start: lift clamped from -1e-08 to its limit 0.0 m",
+        "goal[1]: swing clamped from -1.000009 to its limit -1.0 rad",
+    )
+
+
+@given(st.floats(-100, 100))
+def test_continuous_joints_are_wrapped(angle: float) -> None:
+    made = problem([0, angle, 0])
+    wrapped = made.start[1]
+    assert -np.pi <= wrapped <= np.pi
+    assert np.cos(wrapped - angle) == pytest.approx(1, abs=1e-12)
+    assert (wrapped == angle and made.notes == ()) if abs(angle) <= np.pi else "spin wrapped" in made.notes[0]
+
+
+SKEWED = np.eye(4) * [1.1, 1, 1, 1]
+MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: problem([0, 0]), "start has 2 values; crane has 3 planned joints: swing, spin, lift"),
+        (lambda: problem([0, 0, 0, 0]), "start has 4 values"),
+        (lambda: problem(goal=[1.0]), "goal has 1 values"),
+        (lambda: problem(goal=[[0, 0, 0], [1, 1]]), "goal is .* a list of them of one length"),
+        (lambda: problem(goal=[[0, 0], [1, 1]]), r"goal\[0\] has 2 values"),
+        (lambda: problem([0, np.nan, 0]), r"start: spin is nan; it must be a finite number \[rad\]"),
+        (lambda: problem([0, 0, np.inf]), r"start: lift is inf; it must be a finite number \[m\]"),
+        (lambda: problem(goal=[0, 0, np.nan]), "goal: lift is nan"),
+        (lambda: problem([2.1, 0, 0]), "start: swing is 2.1 rad; its limits are -1 to 2"),
+        (lambda: problem([2 + 2e-5, 0, 0]), "start: swing is 2.00002 rad"),
+        (
+            lambda: problem(goal=[[0, 0, 0], [0, 0, 0.6]]),
+            r"goal\[1\]: lift is 0.6 m; its limits are 0 to 0.5",
+        ),
+        (lambda: problem("home"), "start is 'home'; it must be a list of 3 numbers: swing, spin, lift"),
+        (lambda: problem(["0", "0", "0"]), "it must be a list of 3 numbers"),
+        (lambda: problem([True, False, True]), "it must be a list of 3 numbers"),
+        (lambda: problem(None), "start is None"),
+        (lambda: problem(goal=None), "goal is None"),
+        (lambda: problem(goal=[]), r"goal is \[\]; it must be a configuration or a list of them"),
+        (
+            lambda: problem(goal=PoseGoal("claw", np.eye(4))),
+            "unknown link in goal.frame: 'claw'; known: hook, jib, tower",
+        ),
+        (lambda: problem(goal=PoseGoal("plinth", np.eye(4))), "'plinth' is moved by no planned joint"),
+        (lambda: PoseGoal(7, np.eye(4)), "goal.frame is 7"),  # type: ignore[arg-type]
+        (lambda: PoseGoal("hook", np.eye(3)), "it must be 4 x 4 finite numbers"),
+        (lambda: PoseGoal("hook", np.eye(4) * np.nan), "it must be 4 x 4 finite numbers"),
+        (lambda: PoseGoal("hook", SKEWED), "it must be a rotation and a translation"),
+        (lambda: PoseGoal("hook", MIRROR), "it must be a rotation and a translation"),
+        (lambda: PoseGoal("hook", 2 * np.eye(4)), "it must be a rotation and a translation"),
+        (lambda: Problem("panda", Scene(), [0], [0]), "robot is 'panda'; it must be a Robot"),  # type: ignore[arg-type]
+        (lambda: Problem(crane(), [], [0], [0]), "scene is .*; it must be a Scene"),  # type: ignore[arg-type]
+    ],
+)
+def test_wrong_problems(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        make()
+    assert "\n" not in str(raised.value)
+
+
+GOOD: dict[str, Any] = {
+    "robot": "panda",
+    "locked": {"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.065},
+    "scene": [
+        {"sphere": {"center": [0.5, 0.3, 0.6], "radius": 0.25}},
+        {"box": {"center": [0, 0.6, 0.4], "size": [0.2, 0.2, 0.2], "wxyz": [0.5, 0.5, 0.5, 0.5]}},
+        {"cylinder": {"center": [0.4, -0.3, 0.2], "radius": 0.05, "height": 0.4, "name": "pole"}},
+    ],
+    "start": READY,
+    "goal": {"joints": [1, -0.785, 0, -2.356, 0, 1.571, 0.785]},
+}
+
+
+def written(folder: Path, data: object, ending: str = "yaml") -> Path:
+    file = folder / f"problem.{ending}"
+    file.write_text(yaml.safe_dump(data) if ending == "yaml" else json.dumps(data))
+    return file
+
+
+@pytest.mark.parametrize("ending", ["yaml", "json", "jsonl"])
+def test_problem_file(ending: str, tmp_path: Path) -> None:
+    loaded = load_problem(written(tmp_path, GOOD, ending))
+    assert loaded.robot.name == "panda"
+    assert loaded.robot.locked["panda_finger_joint1"] == 0.065
+    assert [shape.name for shape in loaded.scene.shapes] == ["sphere", "box", "pole"]
+    assert loaded.start.tolist() == READY
+    assert isinstance(loaded.goal, JointGoal) and loaded.goal.positions.shape == (1, 7)
+    assert Problem.load(tmp_path / f"problem.{ending}").start.tolist() == READY
+
+
+def test_goal_sets_and_poses_in_files(tmp_path: Path) -> None:
+    rows = [READY, GOOD["goal"]["joints"]]
+    goal = load_problem(written(tmp_path, GOOD | {"goal": {"joint_set": rows}})).goal
+    assert isinstance(goal, JointGoal) and goal.positions.tolist() == rows
+    pose = {"frame": "panda_hand", "xyz": [0.4, 0.1, 0.5], "wxyz": [0, 2, 0, 0]}
+    goal = load_problem(written(tmp_path, GOOD | {"goal": {"pose": pose}})).goal
+    assert isinstance(goal, PoseGoal) and goal.frame == "panda_hand"
+    np.testing.assert_allclose(
+        goal.T_base_frame, transform(np.array([0.4, 0.1, 0.5]), np.diag([1.0, -1, -1]))
+    )
+
+
+def without(name: str) -> dict[str, Any]:
+    return {key: value for key, value in GOOD.items() if key != name}
+
+
+def shape(**entry: object) -> dict[str, Any]:
+    return GOOD | {"scene": [GOOD["scene"][0], entry]}
+
+
+WRONG: dict[str, tuple[object, str]] = {
+    "no mapping": (["panda"], "problem is .* it must be a mapping with the fields robot, scene, start, goal"),
+    "empty": (None, "problem is None"),
+    "unknown field": (
+        GOOD | {"strat": []},
+        "unknown field of problem: 'strat'; known: goal, locked, robot, scene, start",
+    ),
+    "field not a text": (GOOD | {1: 2}, "unknown field of problem: '?1'?"),
+    "no start": (without("start"), "problem has no start"),
+    "no goal, no robot": (without("goal") | {"robot": None}, "problem has no goal"),
+    "unknown robot": (GOOD | {"robot": "pandora"}, "unknown robot 'pandora'; known: .*panda"),
+    "robot not a text": (GOOD | {"robot": 7}, "robot is 7; it must be a bundled name"),
+    "missing URDF": (GOOD | {"robot": "none/arm.urdf"}, "none/arm.urdf"),
+    "unknown locked joint": (GOOD | {"locked": {"thumb": 0}}, "unknown joint in locked 'thumb'"),
+    "locked not a number": (
+        GOOD | {"locked": {"panda_finger_joint1": "open"}},
+        "'open'; it must be a number",
+    ),
+    "locked NaN": (GOOD | {"locked": {"panda_finger_joint1": float("nan")}}, "panda_finger_joint1 is nan"),
+    "locked a list": (GOOD | {"locked": [1]}, "locked is .* it must map names of joints to values"),
+    "unknown shape": (shape(pyramid={}), r"unknown shape in scene\[1\]: 'pyramid'; known: box, capsule"),
+    "unknown shape field": (
+        shape(sphere={"center": [0, 0, 1], "radius": 1, "color": "red"}),
+        r"unknown field of scene\[1\].sphere: 'color'; known: center, name, radius",
+    ),
+    "shape without a field": (shape(sphere={"center": [0, 0, 1]}), r"scene\[1\].sphere has no radius"),
+    "two shapes in one": (shape(sphere={}, box={}), r"scene\[1\] is .* it must be one shape"),
+    "shape a text": (GOOD | {"scene": ["sphere"]}, r"scene\[0\] is 'sphere'; it must be one shape"),
+    "shape not a mapping": (shape(sphere=3), r"scene\[1\].sphere is 3; it must be a mapping"),
+    "scene a number": (GOOD | {"scene": 3}, "scene is 3; it must be a list of shapes"),
+    "missing scene file": (GOOD | {"scene": "none.yaml"}, "none.yaml does not exist"),
+    "radius of nothing": (
+        shape(sphere={"center": [0, 0, 1], "radius": None}),
+        r"scene\[1\].sphere.radius is None; it must be a positive number",
+    ),
+    "short centre": (shape(sphere={"center": [0, 1], "radius": 1}), r"scene\[1\].sphere.center is \[0, 1\]"),
+    "NaN in a shape": (
+        shape(sphere={"center": [0, 1, float("nan")], "radius": 1}),
+        r"scene\[1\].sphere.center .* 3 finite numbers",
+    ),
+    "missing mesh": (
+        shape(mesh={"file": "none.stl"}),
+        r"scene\[1\].mesh: mesh file .*none.stl does not exist",
+    ),
+    "mesh file a number": (shape(mesh={"file": 3}), r"scene\[1\].mesh.file is 3"),
+    "missing cloud": (shape(point_cloud={"file": "none.ply"}), "none.ply does not exist"),
+    "file and points": (
+        shape(point_cloud={"file": "none.ply", "points": []}),
+        r"unknown field of scene\[1\].point_cloud: 'points'",
+    ),
+    "wrong length": (
+        GOOD | {"start": [0, 0, 0]},
+        "start has 3 values; panda has 7 planned joints: panda_joint1,",
+    ),
+    "NaN": (GOOD | {"start": [float("nan"), *READY[1:]]}, "start: panda_joint1 is nan"),
+    "start a text": (GOOD | {"start": "home"}, "start is 'home'"),
+    "out of limits": (
+        GOOD | {"goal": {"joints": [9, *READY[1:]]}},
+        "goal: panda_joint1 is 9 rad; its limits are -2.8",
+    ),
+    "goal a list": (GOOD | {"goal": READY}, "goal is .* it must be one of joints, joint_set and pose"),
+    "unknown goal": (
+        GOOD | {"goal": {"place": []}},
+        "unknown field of goal: 'place'; known: joint_set, joints",
+    ),
+    "two goals": (
+        GOOD | {"goal": {"joints": READY, "pose": {}}},
+        "it must be one of joints, joint_set and pose",
+    ),
+    "set as joints": (GOOD | {"goal": {"joints": [READY]}}, "goal.joints is .* it must be a list of numbers"),
+    "joints as set": (GOOD | {"goal": {"joint_set": READY}}, "goal.joint_set is .* a list of configurations"),
+    "empty set": (GOOD | {"goal": {"joint_set": []}}, "goal.joint_set is"),
+    "pose without a frame": (
+        GOOD | {"goal": {"pose": {"xyz": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}},
+        "has no frame",
+    ),
+    "unknown frame": (
+        GOOD | {"goal": {"pose": {"frame": "hand", "xyz": [0, 0, 1], "wxyz": [1, 0, 0, 0]}}},
+        "unknown link in goal.frame: 'hand'; known: .*panda_hand",
+    ),
+    "zero quaternion": (
+        GOOD | {"goal": {"pose": {"frame": "panda_hand", "xyz": [0, 0, 1], "wxyz": [0, 0, 0, 0]}}},
+        "goal.pose.wxyz .* must not be zero",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_problem_files(case: str, tmp_path: Path) -> None:
+    data, message = WRONG[case]
+    for ending in ("yaml", "json"):
+        file = written(tmp_path, data, ending)
+        with pytest.raises(InputError, match=message) as raised:
+            load_problem(file)
+        assert str(raised.value).startswith(str(file)), "the file is named first"
+        assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.yaml", b"robot: [panda", "a.yaml is not valid YAML: .*line"),
+        ("a.yaml", b"\xff\xfe\x00", "a.yaml cannot be read"),
+        ("a.yaml", b"robot: panda\n\trobot: x", "not valid YAML"),
+        ("a.json", b"{", "a.json is not valid JSON: .* line 1, column 2"),
+        ("a.txt", b"", "problem file format of .*a.txt: '.txt'; known: .json, .jsonl, .yaml, .yml"),
+        ("a.yaml", None, "a.yaml does not exist"),
+    ],
+)
+def test_damaged_problem_files(name: str, content: bytes | None, message: str, tmp_path: Path) -> None:
+    if content is not None:
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=message) as raised:
+        load_problem(tmp_path / name)
+    assert "\n" not in str(raised.value)
+
+
+def test_lines_of_problems(tmp_path: Path) -> None:
+    file = tmp_path / "many.jsonl"
+    lines = [json.dumps(GOOD | {"start": [0.1 * i, *READY[1:]]}) for i in range(3)]
+    file.write_text(lines[0] + "\n\n" + "\n".join(lines[1:]) + "\n")
+    entries = load_problems(file)
+    assert [entry.name for entry in entries] == ["many:1", "many:3", "many:4"]
+    assert [entry.load().start[0] for entry in entries] == [0, 0.1, 0.2]
+    assert entries[0].load().robot is entries[2].load().robot
+    assert load_problem(file, 1).start[0] == 0.1
+    with pytest.raises(InputError, match=r"index is 3; .* holds 3 problems"):
+        load_problem(file, 3)
+    file.write_text(lines[0] + '\n{"robot": 3')
+    with pytest.raises(InputError, match=r"many\.jsonl, line 2 is not valid JSON"):
+        load_problems(file)
+    file.write_text(lines[0] + "\n" + json.dumps(GOOD | {"start": []}) + "\n")
+    with pytest.raises(InputError, match=r"many\.jsonl, line 2: start has 0 values"):
+        load_problems(file)
+
+
+def test_one_problem_counts_as_many(tmp_path: Path) -> None:
+    file = written(tmp_path, GOOD)
+    [entry] = load_problems(file)
+    assert entry.name == "problem" and entry.load().start.tolist() == READY
+    with pytest.raises(InputError, match=r"index is 2; .* holds one problem"):
+        load_problem(file, 2)
+
+
+def full_problem(goal: Any) -> Problem:
+    rng = np.random.default_rng(0)
+    ball = Sphere(rng.normal(size=3), 1 / 3)
+    shapes = [
+        ball,
+        ball,
+        Box(rng.normal(size=3), [0.1, 1e-7, 1e5], rng.normal(size=4), name="on off: {no}"),
+        Cylinder(rng.normal(size=3), 0.1, 1 / 7, rng.normal(size=4)),
+        Capsule(rng.normal(size=3), 0.1, 1 / 7),
+        Mesh(rng.normal(size=(4, 3)), [[0, 1, 2], [0, 1, 3]], wxyz=rng.normal(size=4)),
+        PointCloud(rng.normal(size=(20, 3)), 0.003),
+        PointCloud([]),
+    ]
+    robot = load_robot("panda", locked={"panda_finger_joint1": 0.01})
+    start = rng.uniform(robot.lower, robot.upper)
+    return Problem(robot, Scene(shapes), start, goal if goal is not None else robot.lower)
+
+
+@pytest.mark.parametrize("ending", ["yaml", "yml", "json", "jsonl"])
+@pytest.mark.parametrize("goal", [None, [READY, READY]], ids=["joints", "set"])
+def test_saved_problems_are_read_back_exactly(ending: str, goal: Any, tmp_path: Path) -> None:
+    saved = full_problem(goal)
+    file = tmp_path / f"problem.{ending}"
+    save_problem(saved, file)
+    for back in (load_problem(file), problem_from_record(problem_record(saved))):
+        assert (back.start == saved.start).all()
+        assert isinstance(back.goal, JointGoal) and isinstance(saved.goal, JointGoal)
+        assert (back.goal.positions == saved.goal.positions).all()
+        assert back.robot.locked == saved.robot.locked and back.notes == ()
+        for one, other in zip(back.scene.shapes, saved.scene.shapes, strict=True):
+            assert type(one) is type(other)
+            for field in vars(other):
+                assert np.array_equal(getattr(one, field), getattr(other, field)), (one.name, field)
+    assert [file.name for file in tmp_path.iterdir()] == [file.name], "no part of a file is left behind"
+
+
+def test_saved_poses_are_read_back(tmp_path: Path) -> None:
+    pose = PoseGoal("panda_hand", transform(np.array([0.3, 0.2, 1 / 3]), rotation_about(Z, 2.0)))
+    save_problem(full_problem(pose), tmp_path / "pose.yaml")
+    back = load_problem(tmp_path / "pose.yaml").goal
+    assert isinstance(back, PoseGoal) and back.frame == "panda_hand"
+    np.testing.assert_allclose(back.T_base_frame, pose.T_base_frame, atol=1e-15)
+
+
+def test_lines_are_appended(tmp_path: Path) -> None:
+    for i in range(3):
+        save_problem(full_problem([0.1 * i, *READY[1:]]), tmp_path / "many.jsonl")
+    goals = [entry.load().goal for entry in load_problems(tmp_path / "many.jsonl")]
+    assert [goal.positions[0, 0] for goal in goals if isinstance(goal, JointGoal)] == [0, 0.1, 0.2]
+
+
+def test_places_that_cannot_be_written_to(tmp_path: Path) -> None:
+    made = full_problem(None)
+    (tmp_path / "folder.json").mkdir()
+    for file in (tmp_path / "none" / "a.yaml", tmp_path / "none" / "a.jsonl", tmp_path / "folder.json"):
+        with pytest.raises(InputError, match="cannot be written"):
+            save_problem(made, file)
+    with pytest.raises(InputError, match="problem file format"):
+        save_problem(made, tmp_path / "a.txt")
+
+
+def test_a_robot_that_could_not_be_found_again() -> None:
+    with pytest.raises(InputError, match="'crane' is neither bundled nor read from a file"):
+        problem_record(problem())
+    assert problem_record(problem(), robot="crane.urdf")["robot"] == "crane.urdf"
+
+
+def test_files_are_looked_up_from_the_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "clouds").mkdir()
+    np.save(tmp_path / "clouds" / "a.npy", [[0.5, 0, 0.2], [np.nan, 0, 0]])
+    entry = {"point_cloud": {"file": "clouds/a.npy", "point_radius": 0.02}}
+    file = written(tmp_path, GOOD | {"scene": [entry]})
+    monkeypatch.chdir("/")
+    loaded = load_problem(file)
+    assert len(loaded.notes) == 1 and "1 of 2 points are not finite" in loaded.notes[0]
+    save_problem(loaded, tmp_path / "again.json")
+    assert json.loads((tmp_path / "again.json").read_text())["scene"] == [entry]
+    record = problem_record(loaded)
+    assert problem_from_record(record).scene.shapes[0].area == loaded.scene.shapes[0].area
+
+
+def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
+    folder = DATA / "motion_bench_maker"
+    scene, request = str(folder / "scene0001.yaml"), str(folder / "request0001.yaml")
+    loaded = load_problem(written(tmp_path, GOOD | {"scene": scene}))
+    assert [shape.name for shape in loaded.scene.shapes] == ["can", "board"]
+    loaded = load_problem(written(tmp_path, {"robot": "panda", "scene": scene, "request": request}))
+    assert loaded.robot.locked["panda_finger_joint2"] == 0.065
+    assert isinstance(loaded.goal, JointGoal) and loaded.goal.positions[0, 0] == 1.2
+    with pytest.raises(InputError, match=r"unknown field of problem: '(start|goal)'"):
+        load_problem(written(tmp_path, GOOD | {"request": request}))

@@ -1,0 +1,164 @@
+"""Inverse kinematics: solutions reach the pose, lie within limits, differ, and are honest about failure."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.example_robots import TIPS, example_robot, planar_arm
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
+from robotdiffuse.robots.kinematics import ForwardKinematics, link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.transforms import rotation_angle, transform
+
+
+def errors(robot: Robot, frame: str, T: np.ndarray, q: np.ndarray) -> tuple[float, float]:
+    """Largest position [m] and orientation error [rad] of solutions, by PyTorch's kinematics."""
+    poses = ForwardKinematics(robot, torch.float64).link(torch.tensor(q), frame).numpy()
+    turns = [rotation_angle(pose[:3, :3] @ T[:3, :3].T) for pose in poses]
+    return float(np.linalg.norm(poses[:, :3, 3] - T[:3, 3], axis=1).max()), max(turns)
+
+
+def smallest_gap(q: np.ndarray) -> float:
+    """Least max-norm distance between two different rows."""
+    gaps = np.abs(q[:, None] - q[None]).max(-1)
+    return float(gaps[~np.eye(len(q), dtype=bool)].min(initial=np.inf))
+
+
+@pytest.mark.parametrize("name", TIPS)
+def test_solutions_are_exact_distinct_and_within_limits(name: str) -> None:
+    robot, rng = example_robot(name), np.random.default_rng(3)
+    for _ in range(25):
+        T = link_pose(robot, rng.uniform(robot.lower, robot.upper), robot.tip)
+        q = inverse_kinematics(robot, robot.tip, T, 10, rng=rng)
+        assert 1 <= len(q) <= 10
+        assert robot.dof == 6 or len(q) == 10
+        position, rotation = errors(robot, robot.tip, T, q)
+        assert position <= 2e-6 and rotation <= 3e-6  # 1e-6, and the margin of wrapped continuous joints
+        assert (q > robot.lower).all() and (q < robot.upper).all()
+        assert smallest_gap(q) > 0.1
+
+
+def test_every_configuration_of_the_panda_can_be_found_again() -> None:
+    """Of 300 reachable poses all are solved; the benchmark does 1,000 with ten solutions each."""
+    robot, rng = example_robot("panda"), np.random.default_rng(4)
+    for _ in range(300):
+        T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "panda_hand")
+        assert len(inverse_kinematics(robot, "panda_hand", T, 1, rng=rng)) == 1
+
+
+def test_ur5_has_at_most_eight_solutions() -> None:
+    """A 6R arm with a spherical-like wrist and joints of one turn each: the textbook's eight."""
+    robot, rng = example_robot("ur5"), np.random.default_rng(5)
+    counts = []
+    for _ in range(20):
+        T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "tool0")
+        counts.append(len(inverse_kinematics(robot, "tool0", T, 50, rng=rng)))
+    assert max(counts) == 8
+
+
+def test_planar_elbow_up_and_down() -> None:
+    arm = planar_arm(1.0, 1.0)
+    robot = replace(arm, joints=tuple(replace(joint, lower=-3.0, upper=3.0) for joint in arm.joints))
+    settings = InverseKinematicsSettings(position_only=True)
+    T = transform(np.array([1.0, 1.0, 0.0]))
+    q = inverse_kinematics(robot, "tip", T, 10, rng=np.random.default_rng(0), settings=settings)
+    np.testing.assert_allclose(q[np.argsort(q[:, 0])], [[0, np.pi / 2], [np.pi / 2, -np.pi / 2]], atol=1e-5)
+
+
+@pytest.mark.parametrize("limit", ["lower", "upper"])
+def test_poses_that_need_a_joint_at_its_limit(limit: str) -> None:
+    robot, rng = example_robot("panda"), np.random.default_rng(6)
+    for joint in range(robot.dof):
+        q = rng.uniform(robot.lower, robot.upper)
+        q[joint] = getattr(robot, limit)[joint]
+        T = link_pose(robot, q, "panda_hand")
+        assert len(inverse_kinematics(robot, "panda_hand", T, 3, rng=rng)) > 0
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0.3, 0.6), st.floats(-0.4, 0.4), st.floats(0.2, 0.7))
+def test_position_only(seed: int, x: float, y: float, z: float) -> None:
+    robot = example_robot("panda")
+    T = transform(np.array([x, y, z]))
+    settings = InverseKinematicsSettings(position_only=True)
+    q = inverse_kinematics(robot, "panda_link8", T, 10, rng=np.random.default_rng(seed), settings=settings)
+    assert len(q) == 10
+    assert errors(robot, "panda_link8", T, q)[0] <= 2e-6
+
+
+def test_a_link_in_the_middle_of_the_chain() -> None:
+    robot, rng = example_robot("panda"), np.random.default_rng(7)
+    T = link_pose(robot, rng.uniform(robot.lower, robot.upper), "panda_link4")
+    q = inverse_kinematics(robot, "panda_link4", T, 4, rng=rng)
+    assert len(q) == 4
+    assert max(errors(robot, "panda_link4", T, q)) <= 2e-6
+
+
+@pytest.mark.parametrize(
+    "xyz", [(5.0, 0.0, 0.5), (0.85, 0.0, 0.6), (0.0, 0.0, -0.9)], ids=["far", "just too far", "below"]
+)
+def test_unreachable_poses_give_nothing(xyz: tuple[float, float, float]) -> None:
+    T = transform(np.array(xyz))
+    assert inverse_kinematics(
+        example_robot("panda"), "panda_hand", T, rng=np.random.default_rng(0)
+    ).shape == (0, 7)
+
+
+def test_accept_is_honoured() -> None:
+    robot, rng = example_robot("panda"), np.random.default_rng(8)
+    T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
+    q = inverse_kinematics(robot, "panda_hand", T, 6, rng=rng, accept=lambda q: q[:, 0] > 0.5)
+    assert len(q) == 6 and (q[:, 0] > 0.5).all()
+    assert smallest_gap(q) > 0.1
+
+
+def test_a_narrow_range_of_acceptance_is_found() -> None:
+    """Solutions close to refused ones are tried too: here 0.02 rad of the elbow's turn are accepted."""
+    robot, rng = example_robot("panda"), np.random.default_rng(8)
+    T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
+    q = inverse_kinematics(robot, "panda_hand", T, 1, rng=rng, accept=lambda q: abs(q[:, 0] - 0.5) < 0.01)
+    assert len(q) == 1
+
+
+def test_nothing_accepted_ends_with_nothing() -> None:
+    robot = example_robot("panda")
+    T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
+    settings = InverseKinematicsSettings(max_rounds=3)
+    q = inverse_kinematics(
+        robot,
+        "panda_hand",
+        T,
+        rng=np.random.default_rng(0),
+        accept=lambda q: np.zeros(len(q), dtype=bool),
+        settings=settings,
+    )
+    assert q.shape == (0, 7)
+
+
+def test_same_generator_state_same_solutions() -> None:
+    robot = example_robot("panda")
+    T = link_pose(robot, (robot.lower + robot.upper) / 2, "panda_hand")
+    first, second = (inverse_kinematics(robot, "panda_hand", T, rng=np.random.default_rng(9)) for _ in "ab")
+    np.testing.assert_array_equal(first, second)
+
+
+def test_bad_input() -> None:
+    robot, rng, T = example_robot("panda"), np.random.default_rng(0), np.eye(4)
+    with pytest.raises(InputError, match="unknown link 'wrist'"):
+        inverse_kinematics(robot, "wrist", T, rng=rng)
+    with pytest.raises(InputError, match="no planned joint moves the link 'panda_link0'"):
+        inverse_kinematics(robot, "panda_link0", T, rng=rng)
+    with pytest.raises(InputError, match="count is 0"):
+        inverse_kinematics(robot, "panda_hand", T, 0, rng=rng)
+    with pytest.raises(InputError, match="finite"):
+        inverse_kinematics(robot, "panda_hand", np.full((4, 4), np.nan), rng=rng)
+    with pytest.raises(InputError, match="no rigid transform"):
+        inverse_kinematics(robot, "panda_hand", 2 * T, rng=rng)
+    with pytest.raises(InputError, match="max_rounds is 0"):
+        InverseKinematicsSettings(max_rounds=0)
+    with pytest.raises(InputError, match="position_tolerance is 0"):
+        InverseKinematicsSettings(position_tolerance=0.0)
