@@ -41,8 +41,9 @@ def read_urdf(
     are given there, while links above it are left out. The default tip: from the base, follow the subtree
     with the most movable joints in a row, as far as the link where the gripper branches off (two or more
     subtrees with movable joints, none with more than three in a row); without a gripper, on to the deepest
-    link. So it is panda_hand for a Panda with fingers. Movable joints off the chain from base to tip are locked,
-    at zero clipped into their limits unless `locked` names another value; joints on the chain may be locked too.
+    link. So it is panda_hand for a Panda with fingers. Movable joints off the chain from base to tip are
+    locked, at zero clipped into their limits unless `locked` names another value; joints on the chain may be
+    locked too.
 
     Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity and 10 / s times the
     acceleration (see limits.py to set them). Collision elements become convex hulls in the link's frame;
