@@ -13,6 +13,8 @@ MODULES = sorted(SOURCE.rglob("*.py"))
 
 CHAIN = (
     "errors",
+    "registry",
+    "settings",
     "files",
     "transforms",
     "types",
