@@ -68,10 +68,15 @@ def test_a_free_motion_is_accepted_with_a_certified_clearance() -> None:
     exact = ExactCollision(
         box_arm(), Scene([Sphere(vector(1.3, 0.3, 0), 0.1), Sphere(vector(0, -1, 0), 0.2)])
     )
-    least = min(d.distance for q in dense(SWING, 0.01)[0] for d in exact.link_distances(q))
-    assert report.min_clearance is not None
-    # Spheres stick out of the boxes by 2 cm; the certificate may give away half.
-    assert 0.5 * (least - 0.02) <= report.min_clearance <= least
+    for found, distances in (
+        (report.scene_clearance, exact.link_distances),
+        (report.self_clearance, exact.pair_distances),
+    ):
+        least = min(d.distance for q in dense(SWING, 0.01)[0] for d in distances(q))
+        assert found is not None
+        # Spheres stick out of the boxes by 2 cm, towards each other by 4; the certificate may give away half.
+        assert 0.5 * (least - 0.04) <= found <= least
+    assert report.min_clearance == report.scene_clearance
 
 
 def test_an_empty_scene_and_a_motion_of_one_waypoint() -> None:
@@ -79,6 +84,8 @@ def test_an_empty_scene_and_a_motion_of_one_waypoint() -> None:
     assert report.valid
     assert report.min_clearance is not None
     assert 0.2 < report.min_clearance < 0.4
+    assert report.scene_clearance == pytest.approx(1.0, abs=1e-4)
+    assert report.self_clearance == report.min_clearance
     refused(judge(vector(1, 2.6, 2.6)[None]), "self_collision")
     assert judge(np.zeros((3, 3))).valid
 

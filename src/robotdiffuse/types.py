@@ -76,7 +76,11 @@ class PlanResult:
     path: Path | None = None
     trajectory: Trajectory | None = None
     min_clearance: float | None = None
-    """A lower bound of all distances to obstacles and between links along the motion [m]."""
+    """A lower bound of all distances along the motion [m], the smaller of ..."""
+    scene_clearance: float | None = None
+    """... that of the distances to obstacles, and ..."""
+    self_clearance: float | None = None
+    """... that of those between links. Results of earlier versions lack the two."""
     notes: tuple[str, ...] = field(default=())
     """What was changed or ignored in the input, e.g. a start clamped to a limit."""
     progress: tuple[tuple[float, float], ...] = ()

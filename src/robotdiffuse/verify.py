@@ -46,7 +46,7 @@ class VerifySettings:
     reversals: int = 3
     """More sharp reversals than this are twitching."""
     tightness: float = 0.5
-    """`Report.min_clearance` is at least this share of the least clearance that was measured, in (0, 1)."""
+    """Each clearance of a `Report` is at least this share of the least one that was measured, in (0, 1)."""
 
     def __post_init__(self) -> None:
         if not 0 < self.tightness < 1:
@@ -82,13 +82,22 @@ class Report:
     valid: bool
     violation: Violation | None
     """None if and only if the motion is valid."""
-    min_clearance: float | None
-    """No point of a moving link comes nearer to an obstacle, or to a link it is checked against, than this
-    [m]: a lower bound over the whole motion, at most 1 m. None for an invalid motion."""
+    scene_clearance: float | None
+    """No point of a moving link comes nearer to an obstacle than this [m]: a lower bound over the whole
+    motion, at most 1 m. None for an invalid motion."""
+    self_clearance: float | None
+    """The same to the links that it is checked against."""
     sphere_checks: int
     """Configurations checked by covering spheres."""
     mesh_checks: int
     """Distances of one link to the scene or to another link, by exact meshes."""
+
+    @property
+    def min_clearance(self) -> float | None:
+        """The smaller of both clearances [m]."""
+        if self.scene_clearance is None or self.self_clearance is None:
+            return None
+        return min(self.scene_clearance, self.self_clearance)
 
 
 def verify(problem: Problem, path: Path, settings: VerifySettings | None = None) -> Report:
@@ -125,12 +134,12 @@ class Verifier:
                 )
         if not all(np.isfinite(values).all() for values in rows):
             violation = Violation("not_finite", 0.0, "the trajectory holds values that are not finite")
-            return Report(False, violation, None, 0, 0)
+            return Report(False, violation, None, None, 0, 0)
         backwards = np.flatnonzero(np.diff(trajectory.times) <= 0)
         if len(backwards):
             at = float(trajectory.times[backwards[0] + 1])
             message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
-            return Report(False, Violation("time", at, message), None, 0, 0)
+            return Report(False, Violation("time", at, message), None, None, 0, 0)
         return self._report(trajectory.positions, trajectory.times, self._rates(trajectory))
 
     def collision_free(self, path: Path) -> bool:
@@ -153,7 +162,7 @@ class Verifier:
         if len(bad):
             at = float(bad[0] if times is None else times[bad[0]])
             message = f"waypoint {bad[0]} holds values that are not finite"
-            return Report(False, Violation("not_finite", at, message), None, 0, 0)
+            return Report(False, Violation("not_finite", at, message), None, None, 0, 0)
         clock = np.arange(len(q), dtype=float) if times is None else times
         found = [
             v
@@ -170,8 +179,9 @@ class Verifier:
             )
         every = [v for v in (first, collision, self._goal(q[-1], float(clock[-1]))) if v is not None]
         violation = min(every, key=lambda v: v.time, default=None)
-        clearance = sweep.clearance if violation is None else None
-        return Report(violation is None, violation, clearance, sweep.sphere_checks, sweep.mesh_checks)
+        valid = violation is None
+        scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
+        return Report(valid, violation, scene, itself, sweep.sphere_checks, sweep.mesh_checks)
 
     def _start(self, q: ndarray) -> Violation | None:
         difference = np.abs(q[0] - self.problem.start)

@@ -35,6 +35,8 @@ def solved(trajectory: Trajectory) -> PlanResult:
         path=Path(NAMES, trajectory.positions[[0, 3]]),
         trajectory=trajectory,
         min_clearance=0.02,
+        scene_clearance=0.02,
+        self_clearance=0.05,
         notes=("start clamped",),
     )
 
@@ -49,9 +51,20 @@ def test_solved_result_round_trip(solved: PlanResult, tmp_path: FilePath) -> Non
     save_result(solved, file, {"robot": "panda", "scene": []})
     read = load_result(file)
     assert read.problem == {"robot": "panda", "scene": []}
-    for name in ("status", "reason", "planner", "robot", "planning_time", "seed", "stage", "notes"):
+    clearances = ("min_clearance", "scene_clearance", "self_clearance")
+    for name in (
+        "status",
+        "reason",
+        "planner",
+        "robot",
+        "planning_time",
+        "seed",
+        "stage",
+        "notes",
+        *clearances,
+    ):
         assert getattr(read.result, name) == getattr(solved, name)
-    assert read.result.min_clearance == 0.02 and read.result.path_length == solved.path_length
+    assert read.result.path_length == solved.path_length
     assert read.result.path is not None and solved.path is not None
     assert np.array_equal(read.result.path.positions, solved.path.positions)
     for name in ("times", "positions", "velocities", "accelerations"):
@@ -63,11 +76,21 @@ def test_fields_are_those_that_the_design_promises(solved: PlanResult, tmp_path:
     record = json.loads((tmp_path / "r.json").read_text())
     promised = (
         "status reason planner robot joint_names times positions velocities accelerations path_length "
-        "min_clearance planning_time verified seed"
+        "min_clearance scene_clearance self_clearance planning_time verified seed"
     )
     assert set(promised.split()) <= set(record)
     assert record["verified"] is True and record["status"] == "solved"
     assert len(record["times"]) == len(record["positions"]) == len(record["accelerations"]) == 4
+
+
+def test_results_of_earlier_versions_have_one_clearance(solved: PlanResult, tmp_path: FilePath) -> None:
+    file = tmp_path / "r.json"
+    solved.save(str(file))
+    record = json.loads(file.read_text())
+    del record["scene_clearance"], record["self_clearance"]
+    file.write_text(json.dumps(record))
+    read = load_result(file).result
+    assert (read.min_clearance, read.scene_clearance, read.self_clearance) == (0.02, None, None)
 
 
 def test_failed_result_round_trip(failed: PlanResult, tmp_path: FilePath) -> None:

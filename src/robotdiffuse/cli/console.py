@@ -4,6 +4,16 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from robotdiffuse.types import PlanResult
+    from robotdiffuse.verify import Report
+
+
+def clearances(motion: "PlanResult | Report") -> str:
+    """The least [mm], and where they are known those to the scene and between links."""
+    names = ("min_clearance", "scene_clearance", "self_clearance")
+    least, scene, itself = (f"{1e3 * (getattr(motion, name) or 0.0):.1f} mm" for name in names)
+    return (
+        least if motion.scene_clearance is None else f"{least} (to the scene {scene}, between links {itself})"
+    )
 
 
 def print_result(result: "PlanResult") -> None:
@@ -22,7 +32,7 @@ def print_result(result: "PlanResult") -> None:
         rows.append(("path", f"{len(result.path.positions)} waypoints, length {result.path.length:.3f} rad"))
         rows.append(("verified", "yes"))
     if result.min_clearance is not None:
-        rows.append(("least clearance", f"{1e3 * result.min_clearance:.1f} mm"))
+        rows.append(("least clearance", clearances(result)))
     if result.trajectory is not None:
         rows.append(("motion", f"{result.trajectory.duration:.2f} s, {len(result.trajectory.times)} rows"))
     rows += [("note", note) for note in result.notes]

@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from robotdiffuse.cli.console import clearances
 from robotdiffuse.cli.draw import ENDINGS, draw, show
 from robotdiffuse.errors import InputError
 
@@ -78,5 +79,5 @@ def run_verify(arguments: argparse.Namespace) -> int:
         if report.violation is not None:
             print(f"{what}: not valid: {report.violation.message} (at {report.violation.time:.3f})")
         else:
-            print(f"{what}: valid, clearance at least {1e3 * (report.min_clearance or 0.0):.1f} mm")
+            print(f"{what}: valid, clearance at least {clearances(report)}")
     return 0 if all(report.valid for report in reports.values()) else 1

@@ -53,8 +53,10 @@ class Sweep(NamedTuple):
     """What is known of a motion."""
 
     contact: Contact | None
-    clearance: float
-    """A lower bound on all clearances along the motion [m], at most 1 m; 0 with a contact."""
+    scene_clearance: float
+    """A lower bound on all clearances to the scene along the motion [m], at most 1 m; 0 with a contact."""
+    self_clearance: float
+    """The same between links."""
     sphere_checks: int
     """Configurations checked by covering spheres."""
     mesh_checks: int
@@ -84,7 +86,8 @@ class ContinuousCollision:
 
     def __init__(self, robot: Robot, scene: Scene, contact: float, tightness: float) -> None:
         """Meshes nearer than `contact` [m] touch. Pieces are split until each certified clearance is at least
-        the share `tightness`, in (0, 1), of the least one measured."""
+        the share `tightness`, in (0, 1), of the least one measured of its kind: to the scene, or between
+        links."""
         self.contact, self.tightness = contact, tightness
         self.exact = ExactCollision(robot, scene)
         self._checker = CollisionChecker(robot, scene)
@@ -98,7 +101,8 @@ class ContinuousCollision:
     def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
         """Judge the motion along straight joint-space lines through the waypoints (at least one)."""
         motion = _Motion(q, self._levers)
-        todo, best, certified = self._first_pieces(motion), CAP, CAP
+        todo = self._first_pieces(motion)
+        best = certified = np.full(len(self.exact.checks), CAP)
         hit: tuple[float, int] | None = None
         spheres = meshes = 0
         while len(todo.start):
@@ -106,10 +110,10 @@ class ContinuousCollision:
             at, travel = motion.configurations(middle), motion.travel(middle)
             bound = np.maximum(travel - motion.travel(todo.start), motion.travel(todo.stop) - travel)
             clearance = np.where(todo.undecided, self._sphere_clearances(at), np.inf)
-            best = float(clearance[clearance > MESH_BELOW].min(initial=best))
+            best = self._least(best, np.where(clearance > MESH_BELOW, clearance, CAP))
 
             rows, checks = np.nonzero((clearance <= MESH_BELOW) & (clearance - bound < self.tightness * best))
-            cutoffs = np.minimum(bound[rows, checks] + best, CAP)
+            cutoffs = np.minimum(bound[rows, checks] + best[checks], CAP)
             distances, _ = self.exact.nearest(at[rows], checks, cutoffs, stop=self.contact)
             asked = int(np.isfinite(distances).sum())
             spheres, meshes = spheres + len(at), meshes + asked
@@ -119,13 +123,15 @@ class ContinuousCollision:
                 hit_row = int(rows[asked])
                 hit = (float(middle[hit_row]), int(checks[asked]))
             clearance[rows[:asked], checks[:asked]] = distances[:asked]
-            best = float(distances[:asked].min(initial=best))
+            measured = np.full(clearance.shape, CAP)
+            measured[rows[:asked], checks[:asked]] = distances[:asked]
+            best = self._least(best, measured)
 
             lower = clearance - bound
             certain = lower >= self.tightness * best
             if hit_row is not None:
                 certain[hit_row:] = False
-            certified = float(lower[certain & todo.undecided].min(initial=certified))
+            certified = self._least(certified, np.where(certain & todo.undecided, lower, CAP))
             todo.undecided &= ~certain
             need = bound / np.maximum(clearance - self.tightness * best, 1e-9)
             need = np.where(todo.undecided, need, 0).max(axis=1, initial=0)
@@ -135,7 +141,21 @@ class ContinuousCollision:
                 into[hit_row + (bound[hit_row].max() > FIRST_CONTACT_TRAVEL) :] = 0
             todo = todo.split(into)
         contact = None if hit is None else self._contact(motion, *hit)
-        return Sweep(contact, certified if hit is None else 0.0, spheres, meshes)
+        scene, itself = (0.0, 0.0) if hit is not None else self._by_kind(certified)
+        return Sweep(contact, scene, itself, spheres, meshes)
+
+    def _by_kind(self, values: Float[ndarray, "checks"]) -> tuple[float, float]:
+        """The least of the checks against the scene, and of those between links."""
+        links = len(self.exact.links)
+        return float(values[:links].min(initial=CAP)), float(values[links:].min(initial=CAP))
+
+    def _least(
+        self, before: Float[ndarray, "checks"], values: Float[ndarray, "n checks"]
+    ) -> Float[ndarray, "checks"]:
+        """For each check the least value of its kind, or that before."""
+        scene, itself = self._by_kind(values.min(axis=0, initial=CAP))
+        links = len(self.exact.links)
+        return np.minimum(before, np.repeat([scene, itself], [links, len(before) - links]))
 
     def _first_pieces(self, motion: "_Motion") -> _Pieces:
         """Pieces of about equal motion bound, after one of no length at the start."""

@@ -133,6 +133,8 @@ def _result_record(result: PlanResult, problem: dict[str, Any] | None) -> dict[s
         "seed": result.seed,
         "path_length": result.path_length,
         "min_clearance": result.min_clearance,
+        "scene_clearance": result.scene_clearance,
+        "self_clearance": result.self_clearance,
         "notes": list(result.notes),
         "joint_names": [],
         "waypoints": None if result.path is None else result.path.positions.tolist(),
@@ -169,7 +171,9 @@ def _result(record: dict[str, Any]) -> PlanResult:
         stage=_text(record, "stage") if "stage" in record else "",
         path=path,
         trajectory=trajectory,
-        min_clearance=None if record.get("min_clearance") is None else _number(record, "min_clearance"),
+        min_clearance=_number_or_none(record, "min_clearance"),
+        scene_clearance=_number_or_none(record, "scene_clearance"),
+        self_clearance=_number_or_none(record, "self_clearance"),
         notes=_names(record, "notes") if "notes" in record else (),
     )
 
@@ -206,6 +210,10 @@ def _number(record: dict[str, Any], name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise InputError(f"{name} is {value!r}; it must be a finite number")
     return float(value)
+
+
+def _number_or_none(record: dict[str, Any], name: str) -> float | None:
+    return None if record.get(name) is None else _number(record, name)
 
 
 def _rows(record: dict[str, Any], name: str, rows: int | None, columns: int | None) -> np.ndarray:

@@ -11,7 +11,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.types import Path, PlanResult, Status, Trajectory
-from robotdiffuse.verify import Report, Verifier, VerifySettings, verifier
+from robotdiffuse.verify import Report, Verifier, VerifySettings, Violation, verifier
 
 
 @runtime_checkable
@@ -85,14 +85,16 @@ class Call:
         path = Path(problem.robot.joint_names, np.asarray(waypoints, dtype=np.float64))
         judge = verifier(problem, VerifySettings())
         report = judge.path(path)
-        if report.violation is not None or report.min_clearance is None:
-            return self._refuse(report)
+        if report.violation is not None:
+            return self._refuse(report.violation)
         planning_time = self.elapsed
         motion = _TimedMotion(judge)
         trajectory = time_parameterize(problem.robot, path, motion.valid, judge.collision_free)
         timed = motion.report(trajectory)
-        if timed.violation is not None or timed.min_clearance is None:
-            return self._refuse(timed)
+        if timed.violation is not None:
+            return self._refuse(timed.violation)
+        scene = _least(report.scene_clearance, timed.scene_clearance)
+        itself = _least(report.self_clearance, timed.self_clearance)
         # found when the search had it, if it noted that; what it had shorter was refused
         same = path.length * 1e-3
         longer = [(at, length) for at, length in self._progress if length > path.length + same]
@@ -107,15 +109,20 @@ class Call:
             stage=stage,
             path=path,
             trajectory=trajectory,
-            min_clearance=min(report.min_clearance, timed.min_clearance),
+            min_clearance=min(scene, itself),
+            scene_clearance=scene,
+            self_clearance=itself,
             notes=tuple(self.notes),
             progress=(*longer, (found[0] if found else planning_time, path.length)),
             refused=self._refused,
         )
 
-    def _refuse(self, report: Report) -> None:
-        assert report.violation is not None  # by Report
-        self._refused = report.violation.kind
+    def _refuse(self, violation: Violation) -> None:
+        self._refused = violation.kind
+
+
+def _least(*clearances: float | None) -> float:
+    return min(clearance for clearance in clearances if clearance is not None)
 
 
 class _TimedMotion:
