@@ -16,7 +16,8 @@ from robotdiffuse.learning.encoders import PointAutoencoderSettings
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, bundled_model, encode
+from robotdiffuse.planners.diffusion import bundled_model, encode
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere

@@ -10,11 +10,10 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.planners import robotdiffuse as module
+from robotdiffuse.planners.diffusion import bundled_model, encode
 from robotdiffuse.planners.robotdiffuse import (
     RobotDiffuse,
     RobotDiffuseSettings,
-    bundled_model,
-    encode,
     unlearned_starts,
 )
 from robotdiffuse.planners.rrt_connect.planner import RRTConnect

@@ -8,7 +8,10 @@ from robotdiffuse.cli.arguments import count, natural, positive, share
 from robotdiffuse.errors import InputError
 
 SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
-PARTS = ("denoiser", "objective", "sampler", "parametrization", "rows", "target", "condition_drop", "frames")
+PARTS = (
+    *("denoiser", "objective", "sampler", "sampling_steps", "parametrization", "rows", "target"),
+    *("condition_drop", "frames"),
+)
 """Of the planner's config."""
 
 
@@ -67,6 +70,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parts.add_argument("--objective", metavar="NAME", help="what is predicted: clean, noise or velocity")
     parts.add_argument("--schedule", metavar="NAME", help="of the noise: cosine, linear or flow")
     parts.add_argument("--sampler", metavar="NAME", help="for planning: ddim, ddpm, dpm_solver or euler")
+    parts.add_argument(
+        "--sampling-steps", type=count, metavar="N", help="for planning: calls of the denoiser for a batch"
+    )
     parts.add_argument("--parametrization", metavar="NAME", help="of motions: frames or b_spline")
     parts.add_argument("--rows", type=count, metavar="N", help="control points of b_spline")
     parts.add_argument("--target", metavar="NAME", help="residual, to the straight line, or absolute")

@@ -122,6 +122,7 @@ def from_network(settings: RobotDiffuseSettings) -> Draw:
 def without_network(settings: RobotDiffuseSettings, frames: int) -> Draw:
     """The control: the line and random bumps, and as many gradient steps as a network's samples take, all of
     them one after the other."""
+    assert settings.sampling_steps is not None
     steps = settings.guidance_steps * ceil(settings.guided_share * settings.sampling_steps)
 
     def draw(checker: CollisionChecker, problem: Problem, rng: np.random.Generator) -> ndarray:

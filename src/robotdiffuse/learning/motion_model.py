@@ -74,6 +74,8 @@ class MotionModelConfig:
     null_condition: bool = False
     """Whether the model has a learned stand-in for a dropped condition, for classifier-free guidance."""
     sampler: str = "ddim"
+    sampling_steps: int | None = 6
+    """Calls of the denoiser for a batch; None: all levels of the schedule."""
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
     parametrization: str = "frames"
     """What the rows are that are diffused: frames, or b_spline control points."""
@@ -228,7 +230,7 @@ class MotionModel(TrajectoryRows):
         count: int,
         rng: np.random.Generator,
         clearances: ClearanceFn,
-        steps: int = 6,
+        steps: int | None = None,
         guide: GuideFn | None = None,
         eta: float = 0.0,
         guidance_scale: float = 1.0,
@@ -241,7 +243,7 @@ class MotionModel(TrajectoryRows):
 
         code: z of the scene, from `encode`.
         clearances: see ClearanceFn.
-        steps: calls of the denoiser.
+        steps: calls of the denoiser; None: as many as the checkpoint names.
         guide: improves the predicted clean trajectories in some of the steps (paper, section Motion Guided
             Generation). It need not keep the ends, but should keep more known frames, and move away from
             them smoothly.
@@ -277,6 +279,7 @@ class MotionModel(TrajectoryRows):
             raise unknown_name("sampler", sampler, SAMPLERS)
         if not 0 <= guided_share <= 1:
             raise InputError(f"guided_share is {guided_share}; it must be between 0 and 1")
+        steps = steps or self.config.sampling_steps or self.schedule.steps
         prefix, suffix = known_frames("prefix", prefix, start, 0), known_frames("suffix", suffix, goal, -1)
         between = self.around(prefix, suffix)
         far, near = self.regression(between), self.regression(between, BLEND * self.rows)

@@ -24,8 +24,13 @@ _ROOM = "robotdiffuse.planners."
 PLANNERS = {
     "robotdiffuse": Entry(
         _ROOM + "robotdiffuse:RobotDiffuse",
-        "diffusion model, collision guidance and refinement; search where they fail (the default)",
+        "hybrid of the diffusion model under guidance, refinement and search (the default)",
         "RobotDiffuseSettings",
+    ),
+    "diffusion": Entry(
+        _ROOM + "diffusion:Diffusion",
+        "the paper's method alone: encoder, sampling, guidance; no search, nothing shortened",
+        "DiffusionSettings",
     ),
     "rrt_connect": Entry(
         _ROOM + "rrt_connect.planner:RRTConnect",

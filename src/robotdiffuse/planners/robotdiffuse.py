@@ -1,4 +1,4 @@
-"""RobotDiffuse: the paper's diffusion model, and around it what makes its motions dependable.
+"""RobotDiffuse, a hybrid: the paper's diffusion model, and around it search, which makes it dependable.
 
 The straight line if it is free. Else a quick search for a path to fall back on, within milliseconds; then a
 batch of trajectories sampled by the diffusion model under collision guidance, or, where none of them is free,
@@ -7,21 +7,18 @@ longer search. Everything goes through the judge, and the result names the stage
 """
 
 from dataclasses import dataclass, field
-from functools import cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.checkpoint import BUNDLED, load_model
-from robotdiffuse.learning.clearances import link_clearances
-from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, encode
 from robotdiffuse.planners.ends import Ends, usable_ends
 from robotdiffuse.planners.rrt_connect import kernel
 from robotdiffuse.planners.rrt_connect.planner import (
@@ -32,32 +29,15 @@ from robotdiffuse.planners.rrt_connect.planner import (
 )
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.types import Path, PlanResult
 
 
 @dataclass(frozen=True)
-class RobotDiffuseSettings:
-    weights: str | None = None
-    """Folder of a trained model; None: the one that comes with the package for the robot."""
-    samples: int = 16
-    """Trajectories per batch."""
-    sampling_steps: int = 2
+class RobotDiffuseSettings(SamplingSettings):
+    planner: ClassVar[str] = "robotdiffuse"
+    sampling_steps: int | None = 2
     """Calls of the denoiser per batch. With guidance, more bring no more solved problems, see
     benchmarks/results/guidance.txt."""
-    guidance_steps: int = 8
-    """Gradient steps at each guided denoising step."""
-    guided_share: float = 0.5
-    """Share of the denoising steps that are guided, the last ones: 0 none, 1 all."""
-    guidance_scale: float = 1.0
-    """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further.
-    Other than 1 needs weights that were trained with a condition_drop above 0."""
-    sampler: str | None = None
-    """Name in `learning.samplers.SAMPLERS`; None: the one that the weights name."""
-    eta: float = 0.0
-    """Fresh noise per denoising step: 0 is DDIM, 1 is ancestral sampling."""
-    points: int = 320
-    """Points of the cloud that the encoder sees (paper: 1,400)."""
     refinement_steps: int = 40
     """Most gradient steps on the sampled trajectories that still collide."""
     shortened: int = 6
@@ -66,26 +46,17 @@ class RobotDiffuseSettings:
     """Attempts to shorten each of them."""
     resolution: float = 0.02
     """No point of the arm moves further than this between two checks of a candidate [m]."""
-    guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
     search: RRTConnectSettings = field(default_factory=RRTConnectSettings)
 
     def __post_init__(self) -> None:
-        for name in ("samples", "sampling_steps", "points", "shortened"):
-            if getattr(self, name) < 1:
-                raise InputError(f"robotdiffuse.{name} is {getattr(self, name)}; it must be at least 1")
-        if self.sampler is not None and self.sampler not in SAMPLERS:
-            raise unknown_name("robotdiffuse.sampler", self.sampler, SAMPLERS)
-        if not 0 <= self.guided_share <= 1:
-            raise InputError(f"robotdiffuse.guided_share is {self.guided_share}; it must be between 0 and 1")
+        super().__post_init__()
+        for name in ("refinement_steps", "shortcuts"):
+            if getattr(self, name) < 0:
+                raise InputError(f"robotdiffuse.{name} is {getattr(self, name)}; it must be at least 0")
+        if self.shortened < 1:
+            raise InputError(f"robotdiffuse.shortened is {self.shortened}; it must be at least 1")
         if not self.resolution > 0:
             raise InputError(f"robotdiffuse.resolution is {self.resolution}; it must be positive")
-
-
-@cache
-def bundled_model(robot_name: str) -> MotionModel | None:
-    """The model that comes with the package for a robot of this name, or None."""
-    folder = BUNDLED / robot_name
-    return load_model(folder) if folder.is_dir() else None
 
 
 class Candidates(NamedTuple):
@@ -97,32 +68,11 @@ class Candidates(NamedTuple):
     stage: str
 
 
-class RobotDiffuse:
+class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
     """Diffusion model, guidance, refinement; search where they fail."""
 
     name = "robotdiffuse"
-
-    def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
-        """Raises InputError if the weights that the settings name cannot be read."""
-        self.settings = settings or RobotDiffuseSettings()
-        self._model = load_model(self.settings.weights) if self.settings.weights else None
-
-    def model(self, robot: Robot) -> MotionModel | None:
-        """The model for a robot; None if none comes with the package.
-
-        Raises InputError if the settings name weights of another robot.
-        """
-        if self._model is not None:
-            self._model.config.check_robot(robot, str(self.settings.weights))
-            return self._model
-        model = bundled_model(robot.name)
-        if model is None:
-            return None
-        try:
-            model.config.check_robot(robot, robot.name)
-        except InputError:
-            return None
-        return model
+    settings_class = RobotDiffuseSettings
 
     def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
         """See `planners.base.Planner`."""
@@ -179,35 +129,8 @@ class RobotDiffuse:
         goals: Float[ndarray, "k dof"],
         rng: np.random.Generator,
     ) -> Candidates:
-        """The network alone: a batch of samples under guidance, shared out among the nearest goals."""
-        settings = self.settings
-        guidance = CollisionGuidance(checker, settings.guidance)
-        order = np.argsort(np.linalg.norm(goals - start, axis=1))[: max(settings.samples // 4, 1)]
-        counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(order))]
-
-        clearances = link_clearances(checker, model.config)
-
-        def guide(q: ndarray, _level: float) -> ndarray:
-            return guidance(q, settings.guidance_steps)[0]
-
-        parts = [
-            model.sample(
-                code,
-                start,
-                goals[i],
-                count,
-                rng,
-                clearances,
-                settings.sampling_steps,
-                guide if settings.guidance_steps else None,
-                settings.eta,
-                settings.guidance_scale,
-                settings.sampler,
-                settings.guided_share,
-            )
-            for i, count in zip(order, counts, strict=True)
-        ]
-        return self.candidates(checker, np.concatenate(parts), "network")
+        """The network alone: a batch of samples under guidance."""
+        return self.candidates(checker, self.draw(model, checker, code, start, goals, rng), "network")
 
     def refine(self, checker: CollisionChecker, q: Float[ndarray, "count frames dof"]) -> Candidates:
         """More gradient steps on trajectories, whether sampled or not."""
@@ -240,13 +163,6 @@ class RobotDiffuse:
             if call.remaining <= 0 and quick is None:
                 return None
         return None
-
-
-def encode(
-    model: MotionModel, checker: CollisionChecker, points: int, rng: np.random.Generator
-) -> Float[ndarray, "code"]:
-    """z of a scene: its point cloud through the frozen encoder."""
-    return model.encode(sample_surface(checker.scene, points, rng, model.config.encoder_settings.region), rng)
 
 
 def unlearned_starts(

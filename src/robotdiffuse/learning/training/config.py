@@ -122,6 +122,8 @@ class PlannerTraining:
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
     sampler: str = "ddim"
     """That planning will use: ddpm (the paper's), ddim, dpm_solver or euler."""
+    sampling_steps: int | None = 6
+    """Calls of the denoiser that planning will use; None: all levels of the schedule (the paper's)."""
     frames: int = 48
     """Frames of a trajectory (paper: 254)."""
     parametrization: str = "frames"
@@ -151,7 +153,10 @@ class PlannerTraining:
             raise unknown_name("sampler", self.sampler, SAMPLERS)
         if self.target not in TARGETS:
             raise unknown_name("target", self.target, TARGETS)
-        objective_for(self.objective, NoiseSchedule(self.schedule))
+        schedule = NoiseSchedule(self.schedule)
+        objective_for(self.objective, schedule)
+        if self.sampling_steps is not None:
+            schedule.sampling_levels(self.sampling_steps)
         if self.frames < 3:
             raise InputError(f"frames is {self.frames}; it must be at least 3")
         parametrization(self.parametrization, self.frames, self.rows or self.frames)

@@ -51,6 +51,7 @@ CONFIGS: dict[str, Config] = {
             "target": "absolute",
             "smooth_noise": False,
             "sampler": "ddpm",
+            "sampling_steps": None,
             "denoiser_settings": PAPER_SIZE["transformer"],
             **_ROW,
         },

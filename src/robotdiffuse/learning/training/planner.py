@@ -150,6 +150,7 @@ def _model_config(settings: PlannerTraining, robot: Robot, encoder: Encoder) -> 
         null_condition=settings.condition_drop > 0,
         schedule=settings.schedule,
         sampler=settings.sampler,
+        sampling_steps=settings.sampling_steps,
         frames=settings.frames,
         parametrization=settings.parametrization,
         rows=settings.rows,

@@ -18,6 +18,8 @@ from robotdiffuse.scenes.shapes import Box
 
 FLOOR = Scene([Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")])
 """Part of every scene of the data, as in ROP."""
+SAMPLING_STEPS = 6
+"""Of every network alike, so that all of the levels do not take longer than the training."""
 BETWEEN = 6
 """Places that are checked in each step from frame to frame."""
 
@@ -55,7 +57,9 @@ def _sampled_free(
         code = data.codes[row]
     start, goal = q[0].astype(np.float64), q[-1].astype(np.float64)
     clearances = link_clearances(checker, model.config)
-    return free_in(checker, model.sample(code.astype(np.float32), start, goal, candidates, rng, clearances))
+    steps = min(SAMPLING_STEPS, model.schedule.steps)
+    q = model.sample(code.astype(np.float32), start, goal, candidates, rng, clearances, steps)
+    return free_in(checker, q)
 
 
 def row_checker(robot: Robot, kinds: ndarray, params: ndarray) -> CollisionChecker:

@@ -1,0 +1,218 @@
+"""The paper's method and nothing else: encoder, sampling, guidance.
+
+The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
+collision guidance; every sample goes to the judge as it is, and the shortest valid one is the answer. Where
+none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line, no
+search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance solve.
+Around it, `planners.robotdiffuse` puts what makes a motion dependable.
+
+Unless the settings say otherwise, the weights are used with the sampler and the steps that they name, and
+without guidance this is the network alone: `guidance_steps` 0.
+"""
+
+from dataclasses import dataclass, field
+from functools import cache
+from typing import ClassVar, Generic, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.learning.checkpoint import BUNDLED, load_model
+from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.types import Path, PlanResult
+from robotdiffuse.verify import VerifySettings, verifier
+
+SAMPLES_PER_GOAL = 4
+"""So many samples are drawn at least for each goal that has a share of a batch."""
+
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """How batches of trajectories are drawn from a trained model."""
+
+    planner: ClassVar[str]
+    """Whose settings they are, in messages."""
+    weights: str | None = None
+    """Folder of a trained model; None: the one that comes with the package for the robot."""
+    samples: int = 16
+    """Trajectories per batch."""
+    sampling_steps: int | None = None
+    """Calls of the denoiser per batch; None: as many as the weights name."""
+    sampler: str | None = None
+    """Name in `learning.samplers.SAMPLERS`; None: the one that the weights name."""
+    eta: float = 0.0
+    """Fresh noise per denoising step: 0 is DDIM, 1 is ancestral sampling."""
+    guidance_steps: int = 8
+    """Gradient steps at each guided denoising step."""
+    guided_share: float = 0.5
+    """Share of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
+    guidance_scale: float = 1.0
+    """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further.
+    Other than 1 needs weights that were trained with a condition_drop above 0."""
+    points: int = 320
+    """Points of the cloud that the encoder sees (paper: 1,400)."""
+    guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "sampling_steps", "points"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"{self.planner}.{name} is {value}; it must be at least 1")
+        if self.sampler is not None and self.sampler not in SAMPLERS:
+            raise unknown_name(f"{self.planner}.sampler", self.sampler, SAMPLERS)
+        if self.guidance_steps < 0:
+            raise InputError(f"{self.planner}.guidance_steps is {self.guidance_steps}; it must be at least 0")
+        if not 0 <= self.guided_share <= 1:
+            raise InputError(
+                f"{self.planner}.guided_share is {self.guided_share}; it must be between 0 and 1"
+            )
+
+
+@dataclass(frozen=True)
+class DiffusionSettings(SamplingSettings):
+    planner: ClassVar[str] = "diffusion"
+    optimize_time: float = 0.0
+    """Time in which further batches are drawn after the first that has a valid sample [s]; the shortest of
+    all is the answer."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.optimize_time >= 0:
+            raise InputError(f"diffusion.optimize_time is {self.optimize_time}; it must be at least 0")
+
+
+Settings = TypeVar("Settings", bound=SamplingSettings)
+
+
+@cache
+def bundled_model(robot_name: str) -> MotionModel | None:
+    """The model that comes with the package for a robot of this name, or None."""
+    folder = BUNDLED / robot_name
+    return load_model(folder) if folder.is_dir() else None
+
+
+class ModelSampler(Generic[Settings]):
+    """What planners around the diffusion model share: to load it, and to draw batches by the settings."""
+
+    settings_class: type[Settings]
+
+    def __init__(self, settings: Settings | None = None) -> None:
+        """Raises InputError if the weights that the settings name cannot be read."""
+        self.settings = self.settings_class() if settings is None else settings
+        self._model = load_model(self.settings.weights) if self.settings.weights else None
+
+    def model(self, robot: Robot) -> MotionModel | None:
+        """The model for a robot; None if none comes with the package.
+
+        Raises InputError if the settings name weights of another robot.
+        """
+        if self._model is not None:
+            self._model.config.check_robot(robot, str(self.settings.weights))
+            return self._model
+        model = bundled_model(robot.name)
+        if model is None:
+            return None
+        try:
+            model.config.check_robot(robot, robot.name)
+        except InputError:
+            return None
+        return model
+
+    def draw(
+        self,
+        model: MotionModel,
+        checker: CollisionChecker,
+        code: Float[ndarray, "code"],
+        start: Float[ndarray, "dof"],
+        goals: Float[ndarray, "k dof"],
+        rng: np.random.Generator,
+    ) -> Float[ndarray, "count frames dof"]:
+        """A batch of samples under guidance, shared out among the nearest goals; `code` as by `encode`."""
+        settings = self.settings
+        guidance = CollisionGuidance(checker, settings.guidance)
+        order = np.argsort(np.linalg.norm(goals - start, axis=1))
+        order = order[: max(settings.samples // SAMPLES_PER_GOAL, 1)]
+        counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(order))]
+        clearances = link_clearances(checker, model.config)
+
+        def guide(q: ndarray, _level: float) -> ndarray:
+            return guidance(q, settings.guidance_steps)[0]
+
+        parts = [
+            model.sample(
+                code,
+                start,
+                goals[i],
+                count,
+                rng,
+                clearances,
+                settings.sampling_steps,
+                guide if settings.guidance_steps else None,
+                settings.eta,
+                settings.guidance_scale,
+                settings.sampler,
+                settings.guided_share,
+            )
+            for i, count in zip(order, counts, strict=True)
+        ]
+        return np.concatenate(parts)
+
+
+def encode(
+    model: MotionModel, checker: CollisionChecker, points: int, rng: np.random.Generator
+) -> Float[ndarray, "code"]:
+    """z of a scene: its point cloud through the frozen encoder."""
+    return model.encode(sample_surface(checker.scene, points, rng, model.config.encoder_settings.region), rng)
+
+
+class Diffusion(ModelSampler[DiffusionSettings]):
+    """The paper's method as a planner; see the head of this file."""
+
+    name = "diffusion"
+    settings_class = DiffusionSettings
+
+    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+        """See `planners.base.Planner`. Raises InputError if there are no weights for the robot."""
+        model = self.model(problem.robot)
+        if model is None:
+            raise InputError(
+                f"no weights of diffusion come with the package for {problem.robot.name}; train them: "
+                "robotdiffuse train planner --data FOLDER --encoder FOLDER --out FOLDER"
+            )
+        call = Call(self.name, problem, time_limit, seed)
+        rng = np.random.default_rng(seed)
+        ends = usable_ends(call, rng)
+        return ends if isinstance(ends, PlanResult) else self._batches(call, ends, model, rng)
+
+    def _batches(self, call: Call, ends: Ends, model: MotionModel, rng: np.random.Generator) -> PlanResult:
+        start, goals = ends.rows()
+        code = encode(model, ends.checker, self.settings.points, rng)
+        judge, names = verifier(call.problem, VerifySettings()), call.problem.robot.joint_names
+        every, valid, until = list[Path](), list[Path](), call.time_limit
+        while not every or call.elapsed < until:
+            batch = self.draw(model, ends.checker, code, start, goals, rng)
+            paths = [Path(names, ends.complete(q)) for q in batch]
+            passed = [path for path in paths if judge.path(path).valid]
+            for path in passed:
+                call.improved(path.length)
+            if passed and not valid:
+                until = min(call.elapsed + self.settings.optimize_time, call.time_limit)
+            every, valid = every + paths, valid + passed
+        reason = f"{len(valid)} of {len(every)} samples of the network are valid"
+        # where none is, the judge is asked about one once more, so that the result says what is wrong with it
+        for path in sorted(valid or every[-1:], key=lambda path: path.length):
+            result = call.finish(path.positions, "network", f"solved by network: {reason}")
+            if result is not None:
+                return result
+        return call.timeout(reason)
