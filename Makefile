@@ -4,12 +4,13 @@
 # make table1    every planner on the same problems, in runs/table1; MBM=FOLDER adds MotionBenchMaker's
 # make install   the development environment with all extras in .venv
 # make test      all tests          make lint   ruff and pyright          make bench   all benchmarks
+# make docs      the documentation in site/; any warning is an error
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: install demo test lint bench weights baselines table1 clean
+.PHONY: install demo test lint docs bench weights baselines table1 clean
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
@@ -34,6 +35,10 @@ lint: .venv/dev.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+# the variable silences an advertisement of the theme's authors
+docs: .venv/dev.stamp
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 # not benchmarks but parts of them, and curves of runs that are to be named
 BENCHMARKS := $(filter-out %/report.py %/problems.py %/curves.py,$(wildcard benchmarks/*.py))
@@ -68,4 +73,4 @@ table1: .venv/dev.stamp
 	$(BIN)/robotdiffuse bench report runs/table1
 
 clean:
-	rm -rf .venv build dist .pytest_cache .ruff_cache .hypothesis demo.png demo.html
+	rm -rf .venv build dist site .pytest_cache .ruff_cache .hypothesis demo.png demo.html

@@ -1,0 +1,177 @@
+"""The code blocks of Markdown pages, and how each kind is tried.
+
+All blocks of a page are tried in order, in one empty folder and with one set of Python names. Comments before a
+block say more of it; they show nowhere:
+
+    <!-- file: NAME -->    the block is the content of this file, for what comes after it
+    <!-- needs: NAME -->   one of PREPARED is put into the folder first
+    <!-- test: run -->     commands are run, not only looked at
+
+Python runs. Problems in YAML are loaded. Commands are given to the parser of the command line, targets to make.
+`text` is output. Anything else is an error, so that no block goes untested in silence.
+"""
+
+import re
+import shlex
+import shutil
+import subprocess
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from robotdiffuse.cli import build_parser, main
+from robotdiffuse.problems.files import load_problem
+
+ROOT = Path(__file__).parents[2]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CONVENTIONS.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
+]
+FENCE = re.compile(r"^( *)```(\S*)\s*$")
+MARK = re.compile(r"^ *<!-- (file|needs|test): (.+?) -->\s*$")
+
+
+@dataclass(frozen=True)
+class Block:
+    where: str
+    line: int
+    """Of its first line of code, from 1."""
+    language: str
+    code: str
+    marks: dict[str, str]
+
+
+def code_blocks(page: Path) -> list[Block]:
+    """All fenced blocks of a page, in order."""
+    blocks: list[Block] = []
+    marks: dict[str, str] = {}
+    opened: tuple[int, str, int] | None = None
+    lines = page.read_text(encoding="utf-8").split("\n")
+    for i, text in enumerate(lines):
+        fence, mark = FENCE.match(text), MARK.match(text)
+        if opened is None and fence:
+            opened = i + 1, fence.group(2), len(fence.group(1))
+        elif opened is not None and fence:
+            begin, language, indent = opened
+            code = "".join(line[indent:] + "\n" for line in lines[begin:i])
+            where = f"{page.relative_to(ROOT)}:{begin + 1}"
+            blocks.append(Block(where, begin + 1, language, code, marks))
+            opened, marks = None, {}
+        elif opened is None and mark:
+            marks[mark.group(1)] = mark.group(2)
+        elif opened is None and text.strip():
+            assert not marks, f"{page}:{i + 1}: the comment before it belongs to a code block"
+    assert opened is None, f"{page}: a code block has no end"
+    return blocks
+
+
+def a_cloud(folder: Path) -> None:
+    """cloud.ply: the points of a wall beside the arm."""
+    import trimesh
+
+    side = np.linspace(-0.3, 0.3, 30)
+    points = np.stack(np.meshgrid([0.8], side, side + 0.4), axis=-1).reshape(-1, 3)
+    trimesh.PointCloud(points).export(folder / "cloud.ply")
+
+
+@cache
+def _rop(home: Path) -> Path:
+    generate = "data generate --trajectories 24 --shard 8 --workers 1 --seed 1 --out".split()
+    assert main([*generate, str(home / "rop")]) == 0
+    return home / "rop"
+
+
+def rop_data(folder: Path) -> None:
+    """rop: a data set of 24 motions."""
+    shutil.copytree(_rop(folder.parent), folder / "rop")
+
+
+PREPARED: dict[str, Callable[[Path], None]] = {"cloud.ply": a_cloud, "rop": rop_data}
+
+
+@dataclass
+class Notebook:
+    """A page as it is tried: its folder, and the names that its Python has made so far."""
+
+    folder: Path
+    names: dict[str, Any] = field(default_factory=lambda: {"__name__": "__main__"})
+
+    def try_block(self, block: Block) -> None:
+        """Raises whatever is wrong with a block."""
+        if "needs" in block.marks:
+            PREPARED[block.marks["needs"]](self.folder)
+        if "file" in block.marks:
+            (self.folder / block.marks["file"]).write_text(block.code, encoding="utf-8")
+        elif block.language not in TRIED:
+            raise AssertionError(f"no test for {block.language!r}; known: {', '.join(TRIED)}")
+        if block.language in TRIED:
+            TRIED[block.language](self, block)
+
+
+def _python(page: Notebook, block: Block) -> None:
+    if "file" in block.marks:
+        compile(block.code, block.where, "exec")
+    else:
+        exec(compile("\n" * (block.line - 1) + block.code, block.where, "exec"), page.names)
+
+
+def _yaml(page: Notebook, block: Block) -> None:
+    data = yaml.safe_load(block.code)
+    if isinstance(data, dict) and "robot" in data:
+        file = page.folder / block.marks.get("file", "block.yaml")
+        file.write_text(block.code, encoding="utf-8")
+        load_problem(file)
+    else:
+        assert "file" in block.marks, "neither a problem nor a file for what comes after it"
+
+
+def _sh(page: Notebook, block: Block) -> None:
+    for line in block.code.replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        if words:
+            _command(words, block.marks.get("test") == "run")
+
+
+def _command(words: list[str], run: bool) -> None:
+    program = Path(words[0]).name
+    if "robotdiffuse" in words and program in ("python", "torchrun"):
+        at = words.index("robotdiffuse")
+        assert words[at - 1] == "-m", f"{' '.join(words)}: robotdiffuse is a module"
+        program, words = "robotdiffuse", words[at:]
+    if program == "robotdiffuse":
+        build_parser().parse_args(words[1:])
+        if run:
+            assert main(words[1:]) == 0, " ".join(words)
+        return
+    assert not run, f"{program} is not run by tests"
+    if program == "make":
+        subprocess.run(["make", "-n", *words[1:]], cwd=ROOT, check=True, capture_output=True)
+    elif program == "pip":
+        _pip(words)
+    elif program == "python":
+        assert (ROOT / words[1]).is_file(), f"{words[1]} does not exist"
+    else:
+        raise AssertionError(f"no test for the command {program!r}")
+
+
+def _pip(words: list[str]) -> None:
+    """Its extras exist."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for word in words:
+        for extra in re.findall(r"\[(.+)\]", word):
+            missing = {*extra.split(",")} - {*project["optional-dependencies"]}
+            assert not missing, f"{word}: there is no extra {', '.join(missing)}"
+
+
+TRIED: dict[str, Callable[[Notebook, Block], None]] = {
+    "python": _python,
+    "yaml": _yaml,
+    "sh": _sh,
+    "text": lambda page, block: None,
+}
