@@ -1,4 +1,4 @@
-"""Parts of pages that come from the code, so that they cannot go stale: `<!-- generated: NAME -->` in a page."""
+"""Parts of pages that come from the code, so that they cannot go stale: `<!-- generated: NAME -->`."""
 
 import argparse
 import re
@@ -9,6 +9,8 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
+READING_ORDER = ("planners", "problems", "robots", "scenes", "types", "verify", "paths", "data", "errors")
+"""Of the rooms that public names are from."""
 MARK = re.compile(r"^<!-- generated: (.+) -->$", re.MULTILINE)
 
 
@@ -38,14 +40,13 @@ def _command(parser: argparse.ArgumentParser) -> str:
     if len(shown) > len(needed):
         words.append("[OPTIONS]")
     parts = [f"## {parser.prog}", parser.description or "", f"```text\n{' '.join(words)}\n```"]
-    for group in parser._action_groups:
-        rows = [action for action in group._group_actions if action in shown]
-        if not rows:
-            continue
-        if group.title not in ("positional arguments", "options"):
-            parts.append(f"*{(group.title or '').capitalize()}*")
-        table = "".join(f"| {_names(action)} | {_cell(_help(action))} |\n" for action in rows)
-        parts.append(f"| argument | meaning |\n|---|---|\n{table}")
+    groups = [(group.title or "", group._group_actions) for group in parser._action_groups]
+    titles = {action: title for title, actions in groups[2:] for action in actions}
+    for title in ("", *dict.fromkeys(titles.values())):
+        rows = [action for action in shown if titles.get(action, "") == title]
+        if rows:
+            table = "".join(f"| {_names(action)} | {_cell(_help(action))} |\n" for action in rows)
+            parts.append(f"| {title or 'argument'} | |\n|---|---|\n{table}")
     return "\n\n".join(part.rstrip() for part in parts if part)
 
 
@@ -73,16 +74,31 @@ def public_names() -> str:
     """A directive for each public name of the package, at its home."""
     import robotdiffuse
 
-    return "\n\n".join(f"::: {home}.{name}" for name, home in robotdiffuse._HOME.items())
+    rooms: dict[str, list[str]] = {}
+    for name, home in robotdiffuse._HOME.items():
+        rooms.setdefault(home.split(".")[1], []).append(f"::: {home}.{name}")
+    order = sorted(rooms, key=lambda room: (*READING_ORDER, room).index(room))
+    return "\n\n".join(f"## {room.capitalize()}\n\n" + "\n\n".join(rooms[room]) for room in order)
 
 
-PARTS: dict[str, Callable[[], str]] = {"commands": commands, "public names": public_names}
+def planners() -> str:
+    from robotdiffuse.planners import PLANNERS
+
+    rows = "".join(f"| `{name}` | {_cell(entry.description)} |\n" for name, entry in PLANNERS.items())
+    return f"| name | what it is |\n|---|---|\n{rows}"
+
+
+PARTS: dict[str, Callable[[], str]] = {
+    "commands": commands,
+    "planners": planners,
+    "public names": public_names,
+}
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
     def part(match: re.Match[str]) -> str:
         if match.group(1) not in PARTS:
-            raise PluginError(f"{page.file.src_uri}: no generated part {match.group(1)!r}; known: {', '.join(PARTS)}")
+            raise PluginError(f"{page.file.src_uri}: no part {match.group(1)!r}; known: {', '.join(PARTS)}")
         return PARTS[match.group(1)]()
 
     return MARK.sub(part, markdown)

@@ -1,7 +1,7 @@
-"""Pages of the site from files outside of docs/: root files, reports; links to them work in the repository too.
+"""Pages of the site from files outside of docs/, and links to them that work in the repository too.
 
-A page links to `../benchmarks/results/network.txt` as the repository has it. In the site a text report becomes
-a page of its own, so such links are turned to where their file is there.
+A page links to `../benchmarks/results/network.txt` as the repository has it. In the site a text report is a
+page of its own, so such links are turned to where their file is there.
 """
 
 import posixpath
@@ -56,6 +56,8 @@ def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Fil
     places = {site_place(file): file for file in outside_files()}
     here = page.file.src_uri
     own = places.get(here, f"docs/{here}")
+    if here.startswith(REPORTS):
+        page.meta["hide"] = ["toc"]  # reports have wide tables
 
     def turned(match: re.Match[str]) -> str:
         target, anchor = match.groups()

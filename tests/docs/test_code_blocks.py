@@ -1,9 +1,10 @@
-"""Every code block of the README and of the documentation does what it says; helpers/code_blocks.py says how."""
+"""Every code block of the README and of the documentation does what it says; see helpers/code_blocks.py."""
 
 import shutil
 from pathlib import Path
 
 import pytest
+
 from helpers.code_blocks import PAGES, ROOT, Notebook, code_blocks
 
 
@@ -11,6 +12,7 @@ from helpers.code_blocks import PAGES, ROOT, Notebook, code_blocks
 def test_code_blocks_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
     shutil.copytree(ROOT / "examples", tmp_path / "examples")
     notebook = Notebook(tmp_path)
     for block in code_blocks(page):

@@ -1,14 +1,14 @@
 """The code blocks of Markdown pages, and how each kind is tried.
 
-All blocks of a page are tried in order, in one empty folder and with one set of Python names. Comments before a
-block say more of it; they show nowhere:
+All blocks of a page are tried in order, in one empty folder and with one set of Python names. Comments before
+a block say more of it; they show nowhere:
 
     <!-- file: NAME -->    the block is the content of this file, for what comes after it
     <!-- needs: NAME -->   one of PREPARED is put into the folder first
     <!-- test: run -->     commands are run, not only looked at
 
-Python runs. Problems in YAML are loaded. Commands are given to the parser of the command line, targets to make.
-`text` is output. Anything else is an error, so that no block goes untested in silence.
+Python runs. Problems in YAML are loaded. Commands are given to the parser of the command line, targets to
+make. `text` is output. Anything else is an error, so that no block goes untested in silence.
 """
 
 import re
@@ -27,6 +27,9 @@ import yaml
 
 from robotdiffuse.cli import build_parser, main
 from robotdiffuse.problems.files import load_problem
+from robotdiffuse.robots.add import add_robot
+from robotdiffuse.robots.allowed_collisions import SamplingSettings
+from robotdiffuse.robots.sphere_fitting import SphereSettings
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -45,12 +48,14 @@ class Block:
     language: str
     code: str
     marks: dict[str, str]
+    needs: tuple[str, ...] = ()
 
 
 def code_blocks(page: Path) -> list[Block]:
     """All fenced blocks of a page, in order."""
     blocks: list[Block] = []
     marks: dict[str, str] = {}
+    needs: list[str] = []
     opened: tuple[int, str, int] | None = None
     lines = page.read_text(encoding="utf-8").split("\n")
     for i, text in enumerate(lines):
@@ -61,12 +66,14 @@ def code_blocks(page: Path) -> list[Block]:
             begin, language, indent = opened
             code = "".join(line[indent:] + "\n" for line in lines[begin:i])
             where = f"{page.relative_to(ROOT)}:{begin + 1}"
-            blocks.append(Block(where, begin + 1, language, code, marks))
-            opened, marks = None, {}
+            blocks.append(Block(where, begin + 1, language, code, marks, tuple(needs)))
+            opened, marks, needs = None, {}, []
+        elif opened is None and mark and mark.group(1) == "needs":
+            needs.append(mark.group(2))
         elif opened is None and mark:
             marks[mark.group(1)] = mark.group(2)
         elif opened is None and text.strip():
-            assert not marks, f"{page}:{i + 1}: the comment before it belongs to a code block"
+            assert not marks and not needs, f"{page}:{i + 1}: the comment before it belongs to a code block"
     assert opened is None, f"{page}: a code block has no end"
     return blocks
 
@@ -82,17 +89,43 @@ def a_cloud(folder: Path) -> None:
 
 @cache
 def _rop(home: Path) -> Path:
-    generate = "data generate --trajectories 24 --shard 8 --workers 1 --seed 1 --out".split()
-    assert main([*generate, str(home / "rop")]) == 0
+    size = ["--trajectories", "12", "--shard", "4"]
+    assert main(["data", "generate", *size, "--workers", "1", "--out", str(home / "rop")]) == 0
     return home / "rop"
 
 
 def rop_data(folder: Path) -> None:
-    """rop: a data set of 24 motions."""
+    """rop: a data set of 12 motions."""
     shutil.copytree(_rop(folder.parent), folder / "rop")
 
 
-PREPARED: dict[str, Callable[[Path], None]] = {"cloud.ply": a_cloud, "rop": rop_data}
+def bench_arm(folder: Path) -> None:
+    """The robot of arm.urdf, with few spheres and few samples: `robot add` itself takes a minute."""
+    coarse = SphereSettings(first_half=0.06, second_half=0.06, candidates=200, rounds=3, starts=1)
+    add_robot(
+        "arm.urdf", base="base", limits="joint_limits.yaml", spheres=coarse, sampling=SamplingSettings(500)
+    )
+
+
+def shelf(folder: Path) -> None:
+    """shelf.stl: a board."""
+    import trimesh
+
+    trimesh.creation.box((0.3, 0.8, 0.02)).export(folder / "shelf.stl")
+
+
+def motion_bench_maker(folder: Path) -> None:
+    """motion_bench_maker: scenes and requests of MoveIt."""
+    shutil.copytree(ROOT / "tests" / "files" / "motion_bench_maker", folder / "motion_bench_maker")
+
+
+PREPARED: dict[str, Callable[[Path], None]] = {
+    "bench_arm": bench_arm,
+    "cloud.ply": a_cloud,
+    "motion_bench_maker": motion_bench_maker,
+    "rop": rop_data,
+    "shelf.stl": shelf,
+}
 
 
 @dataclass
@@ -104,8 +137,8 @@ class Notebook:
 
     def try_block(self, block: Block) -> None:
         """Raises whatever is wrong with a block."""
-        if "needs" in block.marks:
-            PREPARED[block.marks["needs"]](self.folder)
+        for name in block.needs:
+            PREPARED[name](self.folder)
         if "file" in block.marks:
             (self.folder / block.marks["file"]).write_text(block.code, encoding="utf-8")
         elif block.language not in TRIED:
@@ -129,6 +162,10 @@ def _yaml(page: Notebook, block: Block) -> None:
         load_problem(file)
     else:
         assert "file" in block.marks, "neither a problem nor a file for what comes after it"
+
+
+def _content(page: Notebook, block: Block) -> None:
+    assert "file" in block.marks, "not a file for what comes after it"
 
 
 def _sh(page: Notebook, block: Block) -> None:
@@ -174,4 +211,5 @@ TRIED: dict[str, Callable[[Notebook, Block], None]] = {
     "yaml": _yaml,
     "sh": _sh,
     "text": lambda page, block: None,
+    "xml": _content,
 }
