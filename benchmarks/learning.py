@@ -42,7 +42,7 @@ from scipy.stats import binomtest, wilcoxon
 from problems import PANDA, SEED, draw_cases, goal_of
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.metrics import LinkPathLength
+from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.generation.shard_maker import resample
 from robotdiffuse.learning.motion_model import MotionModel
@@ -252,7 +252,7 @@ class Judge:
 
 
 def compare(tasks: list[Task], planner: RobotDiffuse, title: str) -> dict[str, Found]:
-    links = LinkPathLength(PANDA)
+    links = Kinematics(PANDA).link_length
     shape = len(tasks), len(MARKS)
     found = {
         name: Found(*(np.full(shape, np.nan) for _ in range(3)), answered=np.zeros(shape)) for name in METHODS

@@ -11,7 +11,8 @@ from typing import TypeVar
 import numpy as np
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+
+from robotdiffuse.evaluation.tables import Column, Rows, Table, show
 
 Item = TypeVar("Item")
 
@@ -28,14 +29,9 @@ def header(*packages: str) -> str:
     )
 
 
-def print_table(title: str, columns: list[str], rows: list[list[str]]) -> None:
+def print_table(title: str, columns: Sequence[Column | str], rows: Rows, notes: Sequence[str] = ()) -> None:
     """A table that lines up; all columns but the first to the right."""
-    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
-    for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right")
-    for row in rows:
-        table.add_row(*row)
-    Console(width=120).print(table)
+    show(Table.of(title, columns, rows, notes), width=120)
 
 
 def progress(items: Sequence[Item], title: str) -> Iterable[Item]:

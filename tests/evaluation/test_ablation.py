@@ -9,7 +9,7 @@ from helpers.example_robots import planar_arm
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import ablation
-from robotdiffuse.evaluation.metrics import LinkPathLength
+from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.trials import Tried, goal_of, held_out_problems
 from robotdiffuse.learning.denoisers import DENOISERS, Transformer
@@ -66,7 +66,7 @@ def test_link_path_length_by_hand() -> None:
     turn = np.linspace(0.0, 1.0, 2001)
     q = np.stack([turn, 0 * turn], axis=1)
     # l1 turns in place; l2's origin is 0.5 m from the axis, the tip's 0.9 m
-    np.testing.assert_allclose(LinkPathLength(arm)(np.stack([q, q[::-1]])), 0.5 + 0.9, rtol=1e-6)
+    np.testing.assert_allclose(Kinematics(arm).link_length(np.stack([q, q[::-1]])), 0.5 + 0.9, rtol=1e-6)
 
 
 def test_bootstrap_covers_the_mean() -> None:

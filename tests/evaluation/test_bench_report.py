@@ -13,7 +13,9 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench import figures, page, plots, report
 from robotdiffuse.evaluation.bench.figures import GAVE_UP, LATER, RAN_OUT, counting, outcome
 from robotdiffuse.evaluation.bench.problem_sets import Case, family_problem, problem_record
-from robotdiffuse.evaluation.bench.records import Record
+from robotdiffuse.evaluation.bench.records import Record, record_from_json
+from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
+from robotdiffuse.types import Path as Motion
 
 RUN = {
     "date": "2026-01-02 03:04",
@@ -24,6 +26,15 @@ RUN = {
     "workers": 1,
     "problems": ["rop"],
     "seeds": 3,
+}
+MEASURES = {
+    "tip_length": 1.0,
+    "turning": 0.5,
+    "min_clearance": 0.01,
+    "duration": 2.0,
+    "jerk": 10.0,
+    "sparc_joint": -2.0,
+    "sparc_tip": -2.0,
 }
 
 
@@ -49,15 +60,7 @@ def solved(
         "reason": "solved",
         "time": progress[-1][0] if time is None else time,
         "progress": tuple(progress),
-        "joint_length": length,
-        "link_length": 3 * length,
-        "tip_length": 1.0,
-        "turning": 0.5,
-        "min_clearance": 0.01,
-        "duration": 2.0,
-        "jerk": 10.0,
-        "sparc_joint": -2.0,
-        "sparc_tip": -2.0,
+        "measures": MEASURES | {"joint_length": length, "link_length": 3 * length},
         "memory": 100.0,
         "positions": ((0.0,) * 7, (0.1,) * 7),
     }
@@ -248,6 +251,29 @@ def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) 
     assert star.ratios[-1] == 1.5
 
 
+def test_a_metric_is_declared_in_one_place(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is then in records, in the tables as Markdown and LaTeX, in the plots and in the page."""
+    pytest.importorskip("matplotlib")
+    waypoints = Metric("waypoint_count", "kilo", "less", ".4f", lambda m: len(m.path.positions), 1e-3)
+    monkeypatch.setitem(METRICS, waypoints.name, waypoints)
+    problem = family_problem("rop", 0)
+    line = np.stack([problem.start, problem.start + 0.1, problem.start])
+    measured = Measure(problem.robot)(Motion(problem.robot.joint_names, line))
+    record = solved("robotdiffuse", "rop/9", 1.0, [(0.1, 0.5)], measures=measured)
+    assert json.loads(record.line())["waypoint_count"] == 3
+    assert record_from_json(json.loads(record.line())) == record
+    bench = figures.read_bench(write(tmp_path / "run", [record]))
+    parts = figures.sections(bench, [1.0])
+    assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown(bench, parts))
+    assert "waypoint count kilo" in report.latex(bench, parts)
+    page.write_page(bench, parts, tmp_path / "index.html", None)
+    shown = (tmp_path / "index.html").read_text()
+    assert "<th>waypoint count kilo</th>" in shown and "<span>0.0030</span>" in shown
+    assert ">waypoint count [kilo], less is better<" in shown
+
+
 def test_latex_is_escaped_and_every_row_has_all_columns(small: Path) -> None:
     bench = figures.read_bench(small)
     text = report.latex(bench, figures.sections(bench))
@@ -267,7 +293,8 @@ def test_the_paper_stands_beside_ours(small: Path) -> None:
     whole, _ = figures.sections(bench)
     table = report.paper_table(whole, whole.main)
     assert table is not None
-    of = {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
+    headings = [column.heading for column in table.columns]
+    of = {row[0]: dict(zip(headings, row, strict=True)) for row in table.texts}
     assert of["ompl_rrt_star (RRT*)"]["paper: success"] == "73.3"
     assert of["ompl_rrt_star (RRT*)"]["paper: returns"] == "600"
     assert of["robotdiffuse (RobotDiffuse)"]["paper: ComScore"] == "0.765"

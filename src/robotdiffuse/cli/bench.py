@@ -10,8 +10,6 @@ from robotdiffuse.errors import InputError
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from numpy import ndarray
-
     from robotdiffuse.evaluation.bench.figures import Bench, Section
 
 
@@ -178,26 +176,12 @@ def _limits(text: str) -> list[float]:
 
 def print_bench(bench: "Bench", parts: "list[Section]") -> None:
     """For each problem set the table of the limit that most planners were run for."""
-    import sys
-
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     from robotdiffuse.evaluation.bench.report import main_table, missing_line
+    from robotdiffuse.evaluation.tables import show
 
-    console = Console(width=None if sys.stdout.isatty() else 150)
     for section in parts:
-        found = main_table(section, section.main, bench.reference)
-        table = Table(title=escape(found.title), title_justify="left", box=None, padding=(0, 1))
-        for i, column in enumerate(found.columns):
-            table.add_column(escape(column), justify="left" if i == 0 else "right")
-        for row in found.rows:
-            table.add_row(*(escape(cell) for cell in row))
-        console.print(table)
-        if section.main.missing:
-            console.print(escape(missing_line(section.main)))
-        console.print()
+        show(main_table(section, section.main, bench.reference))
+        print(missing_line(section.main), end="\n\n" if section.main.missing else "\n")
 
 
 def run_confirm(arguments: argparse.Namespace) -> int:
@@ -205,7 +189,8 @@ def run_confirm(arguments: argparse.Namespace) -> int:
 
     from rich.console import Console
     from rich.progress import Progress
-    from rich.table import Table
+
+    from robotdiffuse.evaluation.tables import Table, show
 
     try:
         from robotdiffuse.evaluation.bench.confirm import confirm
@@ -220,12 +205,8 @@ def run_confirm(arguments: argparse.Namespace) -> int:
             arguments.count,
             lambda done, total: bar.update(task, completed=done, total=total),
         )
-    table = Table("planner", box=None, pad_edge=False)
-    table.add_column("motions", justify="right")
-    table.add_column("in collision by PyBullet", justify="right")
-    for planner, confirmation in found.items():
-        table.add_row(planner, f"{confirmation.checked:,}", str(len(confirmation.refuted)))
-    Console().print(table)
+    rows = [(planner, of.checked, len(of.refuted)) for planner, of in found.items()]
+    show(Table.of("", ("planner", "motions", "in collision by PyBullet"), rows))
     refuted = [each for confirmation in found.values() for each in confirmation.refuted]
     for record, contact in refuted:
         print(
@@ -235,28 +216,11 @@ def run_confirm(arguments: argparse.Namespace) -> int:
     return 1 if refuted else 0
 
 
-def _share(values: "ndarray") -> tuple[str, str]:
-    """Mean of shares and its interval, in per cent."""
-    from robotdiffuse.evaluation.statistics import bootstrap_interval
-
-    low, high = (100 * x for x in bootstrap_interval(values))
-    return f"{100 * values.mean():.1f}", f"{low:.1f} to {high:.1f}"
-
-
-def _mean(values: "ndarray", form: str) -> str:
-    """Of those that are not nan."""
-    known = values[values == values]
-    return form.format(known.mean()) if len(known) else "-"
-
-
 def run_ablation(arguments: argparse.Namespace) -> int:
     import sys
 
-    import numpy as np
-    from rich.console import Console
-    from rich.table import Table
-
     from robotdiffuse.evaluation import ablation
+    from robotdiffuse.evaluation.tables import show
 
     names = ("data", "out", "samples", "encoder_samples", "problems")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
@@ -265,32 +229,5 @@ def run_ablation(arguments: argparse.Namespace) -> int:
     results = ablation.run_ablation(
         settings, rows, arguments.workers, lambda text: print(text, file=sys.stderr, flush=True)
     )
-    title = f"Table 2: {ablation.settings_line(settings)}"
-    table = Table(title=title, title_justify="left", box=None, padding=(0, 1))
-    table.add_column("row")
-    columns = "guided", "single %", "95 %", "best %", "collision %", "95 %", "length m", "to first", "CPU ms"
-    for column in (*columns, "unguided %", "95 %", "paper: suc", "col", "len", "s"):
-        table.add_column(column, justify="right")
-    first = results[0].as_in_paper
-    for result in results:
-        tried, row = result.as_in_paper, ablation.ROWS.get(result.name)
-        table.add_row(
-            result.name,
-            "yes" if tried is result.guided else "no",
-            *_share(tried.single),
-            f"{100 * tried.best.mean():.1f}",
-            *_share(tried.collided),
-            _mean(tried.length, "{:.3f}"),
-            _mean(tried.length / first.length, "{:.3f}"),
-            f"{1e3 * np.median(tried.seconds):.0f}",
-            *_share(result.alone.single),
-            *(["-"] * 4 if row is None else (f"{value:g}" for value in row.paper)),
-        )
-    Console(width=None if sys.stdout.isatty() else 170).print(table)
-    print(
-        "single: share of samples that pass the judge; best: of problems with at least one such sample.\n"
-        "length: of the shortest such sample, over the problems that have one; to first: the mean ratio to\n"
-        "that of the first row, over the problems that both solve. Intervals are over problems, of one\n"
-        "training each: another seed may move a row by more."
-    )
+    show(ablation.table(settings, results), width=None if sys.stdout.isatty() else 170)
     return 0

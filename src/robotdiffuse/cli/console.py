@@ -18,11 +18,8 @@ def clearances(motion: "PlanResult | Report") -> str:
 
 def print_result(result: "PlanResult") -> None:
     """The outcome of a call to plan(), as a table; status and reason also where there is no plan."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
+    from robotdiffuse.evaluation.tables import Table, show
 
-    table = Table(show_header=False, title=f"{result.robot}: {result.status.value}", title_justify="left")
     rows = [
         ("reason", result.reason),
         ("planner", f"{result.planner} ({result.stage})" if result.stage else result.planner),
@@ -37,6 +34,4 @@ def print_result(result: "PlanResult") -> None:
         rows.append(("motion", f"{result.trajectory.duration:.2f} s, {len(result.trajectory.times)} rows"))
     rows += [("note", note) for note in result.notes]
     rows.append(("seed", str(result.seed)))
-    for name, value in rows:
-        table.add_row(name, escape(value))
-    Console().print(table)
+    show(Table.pairs(f"{result.robot}: {result.status.value}", rows))

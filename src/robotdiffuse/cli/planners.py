@@ -9,13 +9,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from rich.console import Console
-    from rich.table import Table
-
+    from robotdiffuse.evaluation.tables import Column, Table, show
     from robotdiffuse.planners import PLANNERS
 
-    table = Table("planner", "what it does")
-    for name, entry in PLANNERS.items():
-        table.add_row(name, entry.description)
-    Console().print(table)
+    rows = [(name, entry.description) for name, entry in PLANNERS.items()]
+    show(Table.of("", ("planner", Column("what it does", left=True)), rows))
     return 0

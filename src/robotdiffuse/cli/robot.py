@@ -61,8 +61,8 @@ def run_info(arguments: argparse.Namespace) -> int:
 def run_add(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
-    from rich.table import Table
 
+    from robotdiffuse.evaluation.tables import Column, Table, show
     from robotdiffuse.robots.add import add_robot
 
     console = Console(stderr=True)
@@ -82,47 +82,36 @@ def run_add(arguments: argparse.Namespace) -> int:
                 task, description=what, completed=step, total=steps
             ),
         )
-    table = Table("link", "spheres", "sticking out [mm]", "covered")
-    for link in report.links:
-        covered = "yes" if link.covered else "no"
-        table.add_row(link.link, str(link.spheres), f"{1e3 * link.stick_out:.1f}", covered)
-    Console().print(table)
+    columns = ("link", "spheres", Column("sticking out", "mm", ".1f", scale=1e3), "covered")
+    rows = [(of.link, of.spheres, of.stick_out, "yes" if of.covered else "no") for of in report.links]
+    show(Table.of("", columns, rows))
     print_robot(report.robot)
     print(f"wrote {report.folder}")
     return 0
 
 
 def print_robot(robot: "Robot") -> None:
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
+    from robotdiffuse.evaluation.tables import Column, Table, show
     from robotdiffuse.transforms import inverse
 
-    console = Console()
-    headings = ("joint", "kind", "lower", "upper", "velocity", "accel.", "jerk")
-    joints = Table(*headings, title=robot.name, title_justify="left")
-    for joint in robot.planned_joints:
-        limits = (joint.lower, joint.upper, joint.velocity, joint.acceleration, joint.jerk)
-        joints.add_row(escape(joint.name), joint.kind, *(f"{value:g}" for value in limits))
-    console.print(joints)
+    columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
+    joints = [
+        (j.name, j.kind, j.lower, j.upper, j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints
+    ]
     spheres = sum(len(rows) for rows in robot.spheres.values())
     meshes = sum(len(pieces) for pieces in robot.meshes.values())
-    table = Table(show_header=False)
-    table.add_row("base, tip", escape(f"{robot.base}, {robot.tip}"))
+    pairs = [("base, tip", f"{robot.base}, {robot.tip}")]
     if robot.root not in ("", robot.base):
         at = "on a joint that moves it" if robot.T_base_root is None else _place(inverse(robot.T_base_root))
-        table.add_row(f"base in {escape(robot.root)}", at)
-    table.add_row("links", str(len(robot.link_names)))
-    table.add_row(
-        "collision model", f"{spheres} spheres on {len(robot.spheres)} links, {meshes} convex meshes"
-    )
-    table.add_row("checked pairs of links", str(len(robot.checked_pairs())))
-    for name, value in robot.locked.items():
-        table.add_row("locked", escape(f"{name} = {value:g}"))
-    for note in robot.notes:
-        table.add_row("note", escape(note))
-    console.print(table)
+        pairs.append((f"base in {robot.root}", at))
+    pairs += [
+        ("links", f"{len(robot.link_names)}"),
+        ("collision model", f"{spheres} spheres on {len(robot.spheres)} links, {meshes} convex meshes"),
+        ("checked pairs of links", f"{len(robot.checked_pairs())}"),
+        *(("locked", f"{name} = {value:g}") for name, value in robot.locked.items()),
+        *(("note", note) for note in robot.notes),
+    ]
+    show(Table.of(robot.name, columns, joints), Table.pairs("", pairs))
 
 
 def _place(T: "Float[ndarray, '4 4']") -> str:

@@ -59,20 +59,39 @@ def run(arguments: argparse.Namespace) -> int:
 
 def print_replay(robot: str, duration: float, done: "Replay") -> None:
     """Tracking errors and contacts, as tables."""
-    from rich.console import Console
-    from rich.table import Table
+    from robotdiffuse.evaluation.tables import Column, Table, show
 
-    console = Console()
     title = f"{robot}: {'free' if done.free else 'contact'}, {duration:.2f} s"
-    table = Table("", "greatest", "RMS", title=title, title_justify="left")
-    for name, most, rms in zip(done.joint_names, done.max_errors, done.rms_errors, strict=True):
-        table.add_row(f"error of {name}", f"{1e3 * most:.3f} mrad", f"{1e3 * rms:.3f} mrad")
     rms = float((done.tip_errors**2).mean() ** 0.5)
-    table.add_row("error of the tip", f"{1e3 * done.tip_errors.max():.3f} mm", f"{1e3 * rms:.3f} mm")
-    console.print(table)
+    show(
+        Table.of(
+            title,
+            ("", "greatest", "RMS"),
+            [
+                *(
+                    (f"error of {name}", f"{1e3 * most:.3f} mrad", f"{1e3 * rms:.3f} mrad")
+                    for name, most, rms in zip(
+                        done.joint_names, done.max_errors, done.rms_errors, strict=True
+                    )
+                ),
+                ("error of the tip", f"{1e3 * done.tip_errors.max():.3f} mm", f"{1e3 * rms:.3f} mm"),
+            ],
+        )
+    )
     if not done.free:
-        table = Table("link", "touches", "at", "depth")
-        for contact in done.contacts:
-            depth = f"{1e3 * contact.depth:.1f} mm" if contact.depth > 0 else "none: closer than 2 mm"
-            table.add_row(contact.link, contact.other, f"{contact.time:.2f} s", depth)
-        console.print(table)
+        columns = ("link", Column("touches", left=True), "at", "depth")
+        show(
+            Table.of(
+                "",
+                columns,
+                [
+                    (
+                        contact.link,
+                        contact.other,
+                        f"{contact.time:.2f} s",
+                        f"{1e3 * contact.depth:.1f} mm" if contact.depth > 0 else "none: closer than 2 mm",
+                    )
+                    for contact in done.contacts
+                ],
+            )
+        )

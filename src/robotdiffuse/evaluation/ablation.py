@@ -14,11 +14,15 @@ from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.data.shards import read_manifest
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.evaluation.metrics import LinkPathLength
+from robotdiffuse.evaluation.metrics import Kinematics
+from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.evaluation.tables import Column, Table
 from robotdiffuse.evaluation.trials import (
     NETWORK_ALONE,
     SEED,
@@ -210,7 +214,7 @@ def _try(
     known = Tried.load(file, key)
     if known is not None:
         return config, guided, known
-    measure = LinkPathLength(robot)
+    measure = Kinematics(robot).link_length
     draw = without_network(planner, CONTROL_FRAMES) if config is None else from_network(planner)
     single, collided, lengths, seconds = [], [], [], []
     for i, problem in enumerate(problems):
@@ -239,9 +243,61 @@ def _planner_settings(settings: AblationSettings, config: str | None, guided: bo
     return replace(alone, weights=weights, points=points)
 
 
-def settings_line(settings: AblationSettings) -> str:
-    """The budget, for the head of a report."""
+NOTES = (
+    "single: share of samples that pass the judge; best: of problems with at least one such sample.",
+    "length: of the shortest such sample, over the problems that have one; to first: the mean ratio to that "
+    "of the first row, over the problems that both solve. Intervals are over problems, of one training each: "
+    "another seed may move a row by more.",
+)
+
+
+def table(settings: AblationSettings, results: list[RowResult]) -> Table:
+    """Table 2, the paper's figures beside."""
     known = asdict(settings)
-    return ", ".join(
-        f"{name} {known[name]:,}" for name in ("samples", "encoder_samples", "problems", "candidates")
+    budget = ("samples", "encoder_samples", "problems", "candidates")
+    title = f"Table 2: {', '.join(f'{name} {known[name]:,}' for name in budget)}"
+    shares = Column("single", "%", ".1f", "more", scale=100.0), Column("95 %", dim=True)
+    columns = (
+        "row",
+        "guided",
+        *shares,
+        Column("best", "%", ".1f", "more", scale=100.0),
+        Column("collision", "%", ".1f", "less", scale=100.0),
+        Column("95 %", dim=True),
+        Column("length", "m", ".3f", "less"),
+        Column("to first", "", ".3f", "less"),
+        Column("CPU", "ms", ".0f", "less", scale=1000.0),
+        replace(shares[0], heading="unguided"),
+        shares[1],
+        *("paper: suc", "col", "len", "s"),
     )
+    first, rows = results[0].as_in_paper, []
+    for result in results:
+        tried, of = result.as_in_paper, ROWS.get(result.name)
+        rows.append(
+            (
+                result.name,
+                "yes" if tried is result.guided else "no",
+                *_share(tried.single),
+                float(tried.best.mean()),
+                *_share(tried.collided),
+                _mean(tried.length),
+                _mean(tried.length / first.length),
+                float(np.median(tried.seconds)),
+                *_share(result.alone.single),
+                *((None,) * 4 if of is None else of.paper),
+            )
+        )
+    return Table.of(title, columns, rows, NOTES)
+
+
+def _share(values: Float[ndarray, "n"]) -> tuple[float, str]:
+    """Mean of shares and its interval, in per cent."""
+    low, high = (100 * x for x in bootstrap_interval(values))
+    return float(values.mean()), f"{low:.1f} to {high:.1f}"
+
+
+def _mean(values: Float[ndarray, "n"]) -> float | None:
+    """Of those that are not nan."""
+    known = values[values == values]
+    return float(known.mean()) if len(known) else None

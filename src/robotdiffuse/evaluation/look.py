@@ -40,6 +40,24 @@ h1 { margin: 0; font-size: 27px; font-weight: 680; letter-spacing: -.018em; }
 .card svg text { font-family: system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial,
   sans-serif !important; }
 .w4 { grid-column: span 4; } .w6 { grid-column: span 6; } .w12 { grid-column: span 12; }
+.wide { overflow-x: auto; margin: 2px -20px 0; padding: 0 20px 6px; }
+.card .wide svg { min-width: 470px; }
+.card.w12 .wide svg { min-width: 880px; }
+table { width: 100%; border-collapse: collapse; font-size: 12.8px; font-variant-numeric: tabular-nums; }
+th { padding: 5px 8px; border-bottom: 1px solid #ccd2d9; color: var(--soft); font-weight: 500;
+  font-size: 12px; line-height: 1.25; text-align: right; vertical-align: bottom; }
+td { padding: 3.5px 8px; border-bottom: 1px solid #f0f2f4; text-align: right; white-space: nowrap; }
+th:first-child, td:first-child { position: sticky; left: 0; padding-left: 0; background: white;
+  text-align: left; }
+td:first-child i { display: inline-block; width: 9px; height: 9px; margin-right: 8px; border-radius: 3px; }
+tr.ours td { font-weight: 640; }
+tbody tr:hover td { background: #f7f8fa; }
+td.best { color: #0a7d5e; font-weight: 640; }
+td.dim { color: var(--soft); }
+.bar { display: inline-block; width: 74px; height: 8px; margin-right: 8px; border-radius: 4px;
+  background: #eef0f3; vertical-align: 1px; overflow: hidden; text-align: left; }
+.bar b { display: block; height: 100%; border-radius: 4px; }
+.bar + span { display: inline-block; min-width: 40px; }
 footer { margin-top: 20px; color: var(--soft); font-size: 12px; }
 @media (max-width: 900px) { .w4, .w6 { grid-column: span 12; } }
 """

@@ -1,6 +1,9 @@
-"""Figures of motions: lengths and smoothness."""
+"""What is measured of a motion: METRICS. A new line there is in records, tables, plots and pages."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 import torch
@@ -9,7 +12,8 @@ from numpy import ndarray
 
 from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.types import Path, Trajectory
+from robotdiffuse.types import Path, PlanResult, Trajectory
+from robotdiffuse.verify import Report
 
 STEP = 0.02
 """Longest step [rad, joint-space L2] of a path whose links are followed; an arc is then 2e-5 too short."""
@@ -20,73 +24,155 @@ STILL = 1e-6
 CUTOFF, THRESHOLD, PADDING = 10.0, 0.05, 4
 """Of the spectral arc length, from its paper: highest frequency [Hz]; least amplitude, as a share of that at
 frequency 0; zeros are appended up to 2 to this power times the length, or up to twice as many."""
+EVEN_PLACES = 129
+"""Along a path, from which bending is measured."""
+DIGITS = 7
+"""Of a value in records."""
 
 
-class LinkPathLength:
-    """The paper's path length: the sum over all moving links of the way that the origin travels [m]."""
+Verdict = Report | PlanResult
+"""What says how near a motion that passed comes to things."""
+
+
+class Kinematics:
+    """Of one robot: the ways of its links."""
 
     def __init__(self, robot: Robot) -> None:
-        self._kinematics = ForwardKinematics(robot, torch.float64)
+        self._kinematics, self._tip = ForwardKinematics(robot, torch.float64), robot.tip
         self._links = [i for i, link in enumerate(robot.link_names) if robot.link_frame(link) > 0]
 
-    def __call__(self, q: Float[ndarray, "n frames dof"]) -> Float[ndarray, "n"]:
-        """Of motions through these configurations [rad]."""
+    def link_length(self, q: Float[ndarray, "n frames dof"]) -> Float[ndarray, "n"]:
+        """The paper's path length: the sum over all moving links of the way that the origin travels [m]."""
         with torch.inference_mode():
             T = self._kinematics.links(torch.from_numpy(np.asarray(q, np.float64)))
         at = T[..., self._links, :3, 3].numpy()
         return np.linalg.norm(np.diff(at, axis=-3), axis=-1).sum(axis=(-2, -1))
 
-
-@dataclass(frozen=True)
-class Measures:
-    """Figures of one motion: the lengths and the turning of its path, the rest of its trajectory."""
-
-    joint_length: float
-    """Euclidean length in joint space [rad]."""
-    link_length: float
-    """The paper's path length: the way of the origins of all moving links together [m]."""
-    tip_length: float
-    """Way of the origin of the robot's tip [m]."""
-    turning: float
-    """Sum of the angles between successive segments in joint space [rad]; 0 for a straight line."""
-    duration: float
-    """[s]"""
-    jerk: float
-    """Logarithm of the dimensionless jerk in joint space, see `log_dimensionless_jerk`; less is smoother."""
-    sparc_joint: float
-    """Spectral arc length of the joint-space speed, see `spectral_arc_length`; nearer to 0 is smoother."""
-    sparc_tip: float
-    """Of the speed of the origin of the robot's tip."""
-
-
-class MotionMeasures:
-    """Measures motions of one robot."""
-
-    def __init__(self, robot: Robot) -> None:
-        self._kinematics, self._tip = ForwardKinematics(robot, torch.float64), robot.tip
-        self._link_length = LinkPathLength(robot)
-
-    def __call__(self, path: Path, trajectory: Trajectory) -> Measures:
-        """Of a path and the same motion with times.
-
-        Motions that stand still have the value 0 in everything but the duration.
-        """
-        q = _fine(path.positions)
-        even, step = _evenly(trajectory)
+    def tip_length(self, q: Float[ndarray, "frames dof"]) -> float:
+        """The way of the origin of the robot's tip [m]."""
         with torch.inference_mode():
             tip = self._kinematics.link(torch.from_numpy(q), self._tip)[:, :3, 3].numpy()
-            jacobian = self._kinematics.jacobian(torch.from_numpy(even.positions), self._tip)[:, :3].numpy()
-        tip_velocities = np.einsum("nij,nj->ni", jacobian, even.velocities)
-        return Measures(
-            joint_length=path.length,
-            link_length=float(self._link_length(q[None])[0]),
-            tip_length=float(np.linalg.norm(np.diff(tip, axis=0), axis=1).sum()),
-            turning=turning(path.positions),
-            duration=trajectory.duration,
-            jerk=log_dimensionless_jerk(trajectory),
-            sparc_joint=spectral_arc_length(np.linalg.norm(even.velocities, axis=1), step),
-            sparc_tip=spectral_arc_length(np.linalg.norm(tip_velocities, axis=1), step),
-        )
+        return float(np.linalg.norm(np.diff(tip, axis=0), axis=1).sum())
+
+    def tip_speed(self, motion: Trajectory) -> Float[ndarray, "n"]:
+        """Of the origin of the robot's tip at each row [m/s]."""
+        with torch.inference_mode():
+            rows = torch.from_numpy(motion.positions)
+            jacobian = self._kinematics.jacobian(rows, self._tip)[:, :3].numpy()
+        return np.linalg.norm(np.einsum("nij,nj->ni", jacobian, motion.velocities), axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What metrics are taken of; what several of them need is made once."""
+
+    kinematics: Kinematics
+    path: Path
+    trajectory: Trajectory | None
+    """The same motion with times; None of a path alone, which has no metrics of time."""
+    verdict: Verdict | None
+
+    @cached_property
+    def fine(self) -> Float[ndarray, "n dof"]:
+        return _fine(self.path.positions)
+
+    @cached_property
+    def even(self) -> tuple[Trajectory, float] | None:
+        return None if self.trajectory is None else _evenly(self.trajectory)
+
+
+@dataclass(frozen=True)
+class Metric:
+    """A figure of a motion."""
+
+    name: str
+    """In records; with spaces, in tables."""
+    unit: str
+    """That it is shown in."""
+    better: Literal["more", "less", ""]
+    format: str
+    """Of a number, as `.2f`."""
+    of: Callable[[Motion], float | None]
+    """Its value in SI units, which records keep; None where the motion has none."""
+    scale: float = 1.0
+    """Shown units in an SI unit."""
+
+    @property
+    def heading(self) -> str:
+        return self.name.replace("_", " ")
+
+
+def _clearance(motion: Motion) -> float | None:
+    return None if motion.verdict is None else motion.verdict.min_clearance
+
+
+def _duration(motion: Motion) -> float | None:
+    return None if motion.trajectory is None else motion.trajectory.duration
+
+
+def _jerk(motion: Motion) -> float | None:
+    return None if motion.trajectory is None else log_dimensionless_jerk(motion.trajectory)
+
+
+def _sparc_joint(motion: Motion) -> float | None:
+    if motion.even is None:
+        return None
+    even, step = motion.even
+    return spectral_arc_length(np.linalg.norm(even.velocities, axis=1), step)
+
+
+def _sparc_tip(motion: Motion) -> float | None:
+    if motion.even is None:
+        return None
+    even, step = motion.even
+    return spectral_arc_length(motion.kinematics.tip_speed(even), step)
+
+
+_METRICS = (
+    # Euclidean, in joint space; the paper's: the ways of the origins of all moving links together
+    Metric("joint_length", "rad", "less", ".3f", lambda m: m.path.length),
+    Metric("link_length", "m", "less", ".2f", lambda m: m.kinematics.link_length(m.fine[None])[0]),
+    Metric("tip_length", "m", "less", ".2f", lambda m: m.kinematics.tip_length(m.fine)),
+    # angles between successive segments in joint space together; 0 for a straight line
+    Metric("turning", "rad", "less", ".2f", lambda m: turning(m.path.positions)),
+    Metric("bending", "", "less", ".0f", lambda m: bending(m.path.positions)),
+    # lower bounds
+    Metric("min_clearance", "mm", "more", ".1f", _clearance, 1000.0),
+    Metric("duration", "s", "less", ".2f", _duration),
+    Metric("jerk", "", "less", ".2f", _jerk),
+    Metric("sparc_joint", "", "more", ".2f", _sparc_joint),
+    Metric("sparc_tip", "", "more", ".2f", _sparc_tip),
+)
+METRICS = {metric.name: metric for metric in _METRICS}
+"""In the order of tables."""
+
+
+class Measure:
+    """Measures motions of one robot by all of METRICS."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.kinematics = Kinematics(robot)
+
+    def __call__(
+        self, path: Path, trajectory: Trajectory | None = None, verdict: Verdict | None = None
+    ) -> dict[str, float]:
+        """By their names; those that the motion has. One that stands still has 0 in all but the duration."""
+        motion = Motion(self.kinematics, path, trajectory, verdict)
+        values = {name: metric.of(motion) for name, metric in METRICS.items()}
+        return {name: float(f"{x:.{DIGITS}g}") for name, x in values.items() if x is not None}
+
+
+def bending(positions: Float[ndarray, "n dof"]) -> float:
+    """The integral of |q''(u)|^2 du over u in [0, 1], over the squared length, of a path at EVEN_PLACES;
+    0 for a straight line."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    length = float(steps.sum())
+    if length < STILL:
+        return 0.0
+    at, u = np.concatenate([[0.0], np.cumsum(steps) / length]), np.linspace(0.0, 1.0, EVEN_PLACES)
+    even = np.stack([np.interp(u, at, column) for column in positions.T], axis=1)
+    second = np.diff(even, 2, axis=0) * (EVEN_PLACES - 1) ** 2
+    return float((second**2).sum() / (EVEN_PLACES - 1) / length**2)
 
 
 def turning(positions: Float[ndarray, "n dof"]) -> float:

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench.problem_sets import read_cases
 from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED, Record, read_records
 from robotdiffuse.evaluation.comscore import Indicators, comscores
+from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
 from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.problems.families import FAMILIES
@@ -107,6 +108,22 @@ class Outcome:
         return GAVE_UP if record.ended_by_itself and record.time < self.returned else RAN_OUT
 
 
+class Mean(NamedTuple):
+    """Over the motions that have the metric; NaN without any."""
+
+    value: float
+    half: float
+    """Of its 95 % interval, by the standard error."""
+
+    @classmethod
+    def of(cls, values: Iterable[float]) -> "Mean":
+        known = np.array(list(values))
+        if not len(known):
+            return cls(np.nan, np.nan)
+        half = 1.96 * float(known.std(ddof=1)) / len(known) ** 0.5 if len(known) > 1 else np.nan
+        return cls(float(known.mean()), half)
+
+
 @dataclass(frozen=True)
 class Row:
     """A planner's figures at a time limit. Means are over the problems that it solved; NaN without any."""
@@ -127,14 +144,8 @@ class Row:
     """Among the rows of this table."""
     paired: Paired | None
     """Against the reference, by joint-space lengths; None for itself and where it has no row."""
-    clearance: float
-    """Mean of the least clearance of a motion [m]; this and what follows is of the returned motions."""
-    turning: float
-    tip_length: float
-    duration: float
-    jerk: float
-    sparc_joint: float
-    sparc_tip: float
+    measures: dict[str, Mean]
+    """Of the returned motions, by the names of METRICS."""
     memory: float
     """Most memory of the process [MB]."""
     failures: dict[str, int]
@@ -274,7 +285,7 @@ def outcome(record: Record, limit: float) -> Outcome:
     if not by_then:
         return Outcome(record, np.inf, limit, np.nan, np.nan)
     length, final = by_then[-1][1], record.joint_length
-    link = np.nan if record.link_length is None else record.link_length
+    link = record.measures.get("link_length", np.nan)
     factor = length / final if final else 1.0
     return Outcome(record, min(by_then[0][0], limit), min(record.time, limit), length, link * factor)
 
@@ -387,10 +398,7 @@ def _row(
     solved = [o for o in outcomes if o.solved]
     success = len(solved) / len(outcomes)
     indicators = _indicators(outcomes)
-
-    def mean(field: str) -> float:
-        return _mean(getattr(o.record, field) for o in solved)
-
+    found = [o.record.measures for o in solved]
     return Row(
         planner=planner,
         success=success,
@@ -402,13 +410,7 @@ def _row(
         returned=indicators.time,
         comscore=comscore,
         paired=paired,
-        clearance=mean("min_clearance"),
-        turning=mean("turning"),
-        tip_length=mean("tip_length"),
-        duration=mean("duration"),
-        jerk=mean("jerk"),
-        sparc_joint=mean("sparc_joint"),
-        sparc_tip=mean("sparc_tip"),
+        measures={name: Mean.of(x[name] for x in found if name in x) for name in METRICS},
         memory=max((o.record.memory for o in outcomes if o.record.memory is not None), default=np.nan),
         failures=dict(Counter(o.failure for o in outcomes if not o.solved)),
     )

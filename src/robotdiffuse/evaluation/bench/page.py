@@ -24,8 +24,9 @@ from robotdiffuse.evaluation.bench.figures import (
 )
 from robotdiffuse.evaluation.bench.problem_sets import Case, read_cases
 from robotdiffuse.evaluation.bench.records import Record
-from robotdiffuse.evaluation.bench.report import TextTable
 from robotdiffuse.evaluation.look import STYLE
+from robotdiffuse.evaluation.tables import Table
+from robotdiffuse.evaluation.tables import html as html_table
 from robotdiffuse.files import write_atomically
 from robotdiffuse.paths.export import check_output
 from robotdiffuse.problems.problem import JointGoal
@@ -41,24 +42,6 @@ OWN_STYLE = """
 .pick button:hover { box-shadow: 0 0 0 1px rgba(34, 43, 56, .28); }
 .pick button[aria-pressed=true] { background: var(--ink); color: white; }
 .cards + .cards { margin-top: 14px; }
-.wide { overflow-x: auto; margin: 2px -20px 0; padding: 0 20px 6px; }
-.card .wide svg { min-width: 470px; }
-.card.w12 .wide svg { min-width: 880px; }
-table { width: 100%; border-collapse: collapse; font-size: 12.8px; font-variant-numeric: tabular-nums; }
-th { padding: 5px 8px; border-bottom: 1px solid #ccd2d9; color: var(--soft); font-weight: 500;
-  font-size: 12px; line-height: 1.25; text-align: right; vertical-align: bottom; }
-td { padding: 3.5px 8px; border-bottom: 1px solid #f0f2f4; text-align: right; white-space: nowrap; }
-th:first-child, td:first-child { position: sticky; left: 0; padding-left: 0; background: white;
-  text-align: left; }
-td:first-child i { display: inline-block; width: 9px; height: 9px; margin-right: 8px; border-radius: 3px; }
-tr.ours td { font-weight: 640; }
-tbody tr:hover td { background: #f7f8fa; }
-td.best { color: #0a7d5e; font-weight: 640; }
-td.dim { color: var(--soft); }
-.bar { display: inline-block; width: 74px; height: 8px; margin-right: 8px; border-radius: 4px;
-  background: #eef0f3; vertical-align: 1px; overflow: hidden; text-align: left; }
-.bar b { display: block; height: 100%; border-radius: 4px; }
-.bar + span { display: inline-block; min-width: 40px; }
 iframe { display: block; width: 100%; height: min(760px, 82vh); margin-top: 4px;
   border: 1px solid var(--line); border-radius: 12px; }
 .wrong td { text-align: left; white-space: normal; }
@@ -238,65 +221,26 @@ def _section(bench: Bench, section: Section, planners: list[str]) -> str:
 
 def _comparison(bench: Bench, section: Section, comparison: Comparison) -> str:
     main, *others = report.tables(section, comparison, bench.reference)
-    text = html.escape(report.missing_line(comparison))
-    cards = [_card(html.escape(main.title), 12, text, _main_rows(main, comparison, bench))]
+    text, planners = html.escape(report.missing_line(comparison)), list(bench.records)
+
+    def drawn(table: Table, ours: str = "") -> str:
+        names = {str(row[0]): str(row[0]).partition(" ")[0] for row in table.rows}
+        colors = {text: plots.color_of(name, planners) for text, name in names.items()}
+        return html_table(table, colors, ours)
+
+    cards = [_card(html.escape(main.title), 12, text, drawn(main, bench.reference))]
     for table in others:
         heading, _, rest = table.title.partition("; ")
-        short = len(table.columns) < 8
+        wide = len(table.columns) >= 8 and not heading.startswith("Failures")
         if heading.startswith("Failures"):
-            short = True
-            drawn = plots.failures(section, comparison, list(bench.records))
-            cards.append(_card("Failures", 6, html.escape(rest), f'<div class="wide">{drawn}</div>'))
-        cards.append(_card(html.escape(heading), 6 if short else 12, html.escape(rest), _rows(table, bench)))
+            plot = plots.failures(section, comparison, planners)
+            cards.append(_card("Failures", 6, html.escape(rest), f'<div class="wide">{plot}</div>'))
+        cards.append(_card(html.escape(heading), 12 if wide else 6, html.escape(rest), drawn(table)))
+        if heading.startswith("Quality"):
+            plot = plots.metrics(section, comparison, planners)
+            text = "Means of the solved problems with their 95 % intervals; nothing, where nothing was solved"
+            cards.append(_card("Quality", 12, text, f'<div class="wide">{plot}</div>'))
     return "".join(cards)
-
-
-def _rows(table: TextTable, bench: Bench) -> str:
-    head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
-    body = "".join(
-        f"<tr>{_name(row[0], bench)}{''.join(f'<td>{html.escape(cell)}</td>' for cell in row[1:])}</tr>"
-        for row in table.rows
-    )
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-
-
-def _name(text: str, bench: Bench) -> str:
-    planner = text.partition(" ")[0]
-    color = plots.color_of(planner, list(bench.records))
-    return f'<td><i style="background:{color}"></i>{html.escape(text)}</td>'
-
-
-def _main_rows(table: TextTable, comparison: Comparison, bench: Bench) -> str:
-    """With a bar for the success, and figures in green that are the best and not common."""
-    rows = comparison.rows
-    figures: dict[int, tuple[list[float], bool]] = {
-        1: ([row.success for row in rows], True),
-        3: ([row.collision for row in rows], False),
-        7: ([row.first for row in rows], False),
-        8: ([row.returned for row in rows], False),
-        9: ([row.comscore for row in rows], True),
-    }
-    best: dict[int, set[int]] = {}
-    for i, (values, high) in figures.items():
-        if not np.isnan(values).all():
-            top = (np.nanmax if high else np.nanmin)(values)
-            level = {j for j, value in enumerate(values) if value == top}
-            best[i] = level if 2 * len(level) <= len(rows) else set()
-    body = []
-    for j, (row, cells) in enumerate(zip(rows, table.rows, strict=True)):
-        color = plots.color_of(row.planner, list(bench.records))
-        texts = [_name(cells[0], bench)]
-        for i, cell in enumerate(cells[1:], start=1):
-            kind = "best" if j in best.get(i, ()) else "dim" if i in (2, 6) else ""
-            share = f"{100 * row.success:.1f}%;background:{color}"
-            bar = f'<span class="bar"><b style="width:{share}"></b></span>' if i == 1 else ""
-            texts.append(f'<td class="{kind}">{bar}<span>{html.escape(cell)}</span></td>')
-        ours = ' class="ours"' if row.planner == bench.reference else ""
-        body.append(f"<tr{ours}>{''.join(texts)}</tr>")
-    head = "".join(f"<th>{html.escape(column)}</th>" for column in table.columns)
-    return (
-        f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{"".join(body)}</tbody></table></div>'
-    )
 
 
 def _crashes(bench: Bench) -> str:

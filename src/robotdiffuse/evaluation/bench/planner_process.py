@@ -16,14 +16,13 @@ import sys
 import threading
 import time
 import traceback
-from dataclasses import asdict
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
 from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
-from robotdiffuse.evaluation.metrics import MotionMeasures
+from robotdiffuse.evaluation.metrics import Measure
 from robotdiffuse.planners import check_planner, load_planner
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.problems.files import Robots, problem_from_record
@@ -163,13 +162,13 @@ def serve(planner: Planner, tasks: TextIO, answers: TextIO) -> None:
     lines: queue.Queue[str] = queue.Queue()
     threading.Thread(target=_read, args=(tasks, lines), daemon=True).start()
     robots: Robots = {}
-    measures: dict[Robot, MotionMeasures] = {}
+    measures: dict[Robot, Measure] = {}
     answer("")
     while True:
         task = json.loads(lines.get())
         problem = problem_from_record(task["problem"], robots)
         if problem.robot not in measures:
-            measures[problem.robot] = MotionMeasures(problem.robot)
+            measures[problem.robot] = Measure(problem.robot)
             _warm_up(planner, problem, measures[problem.robot])
         answer("")
         answer(json.dumps(_call(planner, problem, task, measures[problem.robot])))
@@ -182,7 +181,7 @@ def _read(tasks: TextIO, lines: "queue.Queue[str]") -> None:
     os._exit(0)
 
 
-def _warm_up(planner: Planner, problem: Problem, measure: MotionMeasures) -> None:
+def _warm_up(planner: Planner, problem: Problem, measure: Measure) -> None:
     """Calls that compile, load and fill caches: nothing in the way, and balls where the straight line is."""
     robot, ways = problem.robot, []
     if isinstance(problem.goal, JointGoal):
@@ -198,9 +197,7 @@ def _warm_up(planner: Planner, problem: Problem, measure: MotionMeasures) -> Non
             traceback.print_exc()
 
 
-def _call(
-    planner: Planner, problem: Problem, task: dict[str, Any], measure: MotionMeasures
-) -> dict[str, Any]:
+def _call(planner: Planner, problem: Problem, task: dict[str, Any], measure: Measure) -> dict[str, Any]:
     began = time.perf_counter()
     try:
         result = planner.plan(problem, time_limit=task["time_limit"], seed=task["seed"])
@@ -212,7 +209,7 @@ def _call(
     return fields_of(result, measure) | {"memory": round(memory, 1)}
 
 
-def fields_of(result: PlanResult, measure: MotionMeasures) -> dict[str, Any]:
+def fields_of(result: PlanResult, measure: Measure) -> dict[str, Any]:
     """What a record keeps of a result."""
     found: dict[str, Any] = {
         "status": result.status.value,
@@ -223,9 +220,7 @@ def fields_of(result: PlanResult, measure: MotionMeasures) -> dict[str, Any]:
         "progress": [[round(at, 6), round(length, 6)] for at, length in result.progress],
     }
     if result.path is not None and result.trajectory is not None:
-        figures = asdict(measure(result.path, result.trajectory))
-        found |= {name: float(f"{value:.7g}") for name, value in figures.items()}
-        found["min_clearance"] = result.min_clearance
+        found |= measure(result.path, result.trajectory, result)
         found["positions"] = np.round(result.path.positions, 9).tolist()
     return found
 

@@ -9,6 +9,7 @@ import numpy as np
 from robotdiffuse.evaluation.bench.figures import FAILURES, Comparison, Section
 from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.look import FAINT, INK, LINE, SOFT, as_svg, make_figure
+from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.statistics import wilson_interval
 
 if TYPE_CHECKING:
@@ -179,6 +180,33 @@ def failures(section: Section, comparison: Comparison, planners: Sequence[str]) 
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside upper left", ncols=5, columnspacing=1.1, handletextpad=0.4)
     return _svg(figure, f"failures {section.name} {comparison.limit:g}")
+
+
+def metrics(section: Section, comparison: Comparison, planners: Sequence[str]) -> str:
+    """A panel for each metric of motions: the means of all planners, with their 95 % intervals."""
+    rows = {row.planner: row for row in comparison.rows}
+    shown = [name for name in planners if name in rows]
+    across = 4
+    down = -(-len(METRICS) // across)
+    figure = make_figure(12, (0.165 * len(shown) + 0.5) * down + 0.1)
+    panels = figure.subplots(down, across, squeeze=False, sharey=True).reshape(-1)
+    for panel in panels[len(METRICS) :]:
+        panel.set_axis_off()
+    for i, (panel, metric) in enumerate(zip(panels, METRICS.values(), strict=False)):
+        for y, planner in enumerate(shown):
+            value, half = (metric.scale * x for x in rows[planner].measures[metric.name])
+            color = color_of(planner, planners)
+            panel.plot([value - half, value + half], [y, y], color=color, linewidth=1.1)
+            panel.plot(value, y, "o", color=color, markersize=3.2)
+        better = f", {metric.better} is better" if metric.better else ""
+        panel.set_title(f"{metric.heading}{f' [{metric.unit}]' if metric.unit else ''}{better}", loc="left")
+        panel.grid(axis="x", color=FAINT, linewidth=0.8)
+        panel.spines[["left", "bottom"]].set_visible(False)
+        panel.tick_params(axis="x", length=0)
+        panel.set_ylim(len(shown) - 0.4, -0.6)
+        panel.set_yticks(range(len(shown)), shown)
+        panel.tick_params(axis="y", labelcolor=INK, labelsize=LABEL, labelleft=i % across == 0)
+    return _svg(figure, f"metrics {section.name} {comparison.limit:g}")
 
 
 def _svg(figure: "Figure", name: str) -> str:

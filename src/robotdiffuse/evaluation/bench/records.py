@@ -3,7 +3,7 @@
 import json
 import os
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -43,21 +43,8 @@ class Record:
     stage: str = ""
     progress: tuple[tuple[float, float], ...] = ()
     """When each shorter path was found [s], and its joint-space length [rad]."""
-    joint_length: float | None = None
-    """[rad]; this and what follows is of the returned motion, None without one."""
-    link_length: float | None = None
-    """The paper's path length [m]."""
-    tip_length: float | None = None
-    """[m]"""
-    turning: float | None = None
-    """Angles between the segments together [rad]."""
-    min_clearance: float | None = None
-    """A lower bound [m]."""
-    duration: float | None = None
-    """Of the timed trajectory [s]; this and what follows as in `metrics.Measures`."""
-    jerk: float | None = None
-    sparc_joint: float | None = None
-    sparc_tip: float | None = None
+    measures: dict[str, float] = field(default_factory=dict)
+    """Of the returned motion, by the names of `metrics.METRICS`; in files they stand beside the fields."""
     memory: float | None = None
     """Most memory that the planner's process had so far [MB]."""
     positions: tuple[tuple[float, ...], ...] = ()
@@ -67,6 +54,11 @@ class Record:
     def key(self) -> tuple[str, str, int, float]:
         """What of a planner's calls this is."""
         return self.problem_set, self.name, self.seed, self.time_limit
+
+    @property
+    def joint_length(self) -> float | None:
+        """Of the returned path [rad]."""
+        return self.measures.get("joint_length")
 
     @property
     def solved(self) -> bool:
@@ -89,16 +81,23 @@ class Record:
     def line(self) -> str:
         """As JSON without the fields that have their defaults, which are most of a failure's."""
         defaults = {f.name: f.default for f in fields(self)}
-        values = {name: value for name, value in asdict(self).items() if value != defaults[name]}
-        return json.dumps(values) + "\n"
+        values = asdict(self)
+        kept = {name: x for name, x in values.items() if name != "measures" and x != defaults[name]}
+        return json.dumps({**kept, **values["measures"]}) + "\n"
 
 
 def record_from_json(values: dict[str, Any]) -> Record:
-    """The record of a line. Raises TypeError for other fields."""
+    """The record of a line. Numbers that are no fields are measures. Raises TypeError for other fields."""
+    of = {f.name for f in fields(Record)}
+    found: dict[str, Any] = {name: value for name, value in values.items() if name in of}
+    measures = {name: value for name, value in values.items() if name not in of}
+    for name, value in measures.items():
+        if not isinstance(value, int | float):
+            raise TypeError(f"{name} is no field of a record and no number")
     for name in ("progress", "positions"):
-        if name in values:
-            values[name] = tuple(tuple(row) for row in values[name])
-    return Record(**values)
+        if name in found:
+            found[name] = tuple(tuple(row) for row in found[name])
+    return Record(**found, measures=measures)
 
 
 def read_records(file: FilePath) -> list[Record]:

@@ -1,7 +1,7 @@
-"""The tables of a bench's report, as Markdown and LaTeX."""
+"""The tables of a bench's report, and the report as Markdown and LaTeX."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +14,11 @@ from robotdiffuse.evaluation.bench.figures import (
     Section,
 )
 from robotdiffuse.evaluation.comscore import PAPER_TABLE_1, Indicators, comscores
+from robotdiffuse.evaluation.metrics import METRICS
+from robotdiffuse.evaluation.statistics import Paired
+from robotdiffuse.evaluation.tables import Cell, Column, Figure, Table, plain, tex
+from robotdiffuse.evaluation.tables import latex as latex_table
+from robotdiffuse.evaluation.tables import markdown as markdown_table
 
 IN_PAPER = {
     "ompl_rrt_star": "RRT*",
@@ -23,7 +28,6 @@ IN_PAPER = {
     "robotdiffuse": "RobotDiffuse",
 }
 """Our planners that are rows of the paper's Table 1."""
-NONE = "–"
 NOTES = (
     "A call counts for a limit if its own was at least as long, or if it ended by itself before: more time "
     "changes nothing then. Compared are the problems on which all planners of a table have such a call.",
@@ -49,33 +53,30 @@ NOTES = (
 )
 
 
-@dataclass(frozen=True)
-class TextTable:
-    """A table of finished texts; all columns but the first are figures."""
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+Spec = Sequence[tuple[Column, Callable[[Row], Cell]]]
+"""Columns of a table on planners, and what stands there."""
 
 
-def number(value: float, digits: int = 2, scale: float = 1.0) -> str:
-    """With a true minus sign; NONE for NaN."""
-    return NONE if value != value else f"{scale * value:.{digits}f}".replace("-", "−")
+def _table(heading: str, section: Section, comparison: Comparison, spec: Spec) -> Table:
+    whole = (Column("planner"), lambda row: row.planner), *spec
+    rows = [[of(row) for _, of in whole] for row in comparison.rows]
+    name = title(section, comparison)
+    return Table.of(f"{heading}; {name}" if heading else name, [column for column, _ in whole], rows)
 
 
-def seconds(value: float) -> str:
+def seconds(value: float) -> Cell:
     """Two digits that matter: times go from 0.1 ms to a minute."""
     if not np.isfinite(value):
-        return NONE
-    return f"{value:.{max(0, 1 - int(np.floor(np.log10(max(value, 1e-4)))))}f}"
+        return None
+    return Figure(f"{value:.{max(0, 1 - int(np.floor(np.log10(max(value, 1e-4)))))}f}", value)
 
 
 def interval(low: float, high: float, digits: int) -> str:
     return f"{low:.{digits}f} to {high:.{digits}f}"
 
 
-def probability(p: float) -> str:
-    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+def percents(shares: tuple[float, float]) -> str:
+    return interval(100 * shares[0], 100 * shares[1], 1)
 
 
 def title(section: Section, comparison: Comparison) -> str:
@@ -86,121 +87,83 @@ def title(section: Section, comparison: Comparison) -> str:
     return f"{section.name}, {comparison.limit:g} s: {comparison.problems}{of} {plural}{seeds}"
 
 
-def main_table(section: Section, comparison: Comparison, reference: str) -> TextTable:
+def main_table(section: Section, comparison: Comparison, reference: str) -> Table:
     """The paper's columns, with intervals and the ratio of lengths to the reference's."""
-    columns = (
-        "planner",
-        "success %",
-        "95 %",
-        "collision %",
-        "length m",
-        f"ratio to {reference}",
-        "95 % ",
-        "first s",
-        "returns s",
-        "ComScore",
+    spec: Spec = (
+        (Column("success", "%", ".1f", "more", scale=100.0, bar=True), lambda row: row.success),
+        (Column("95 %", dim=True), lambda row: percents(row.success_interval)),
+        (Column("collision", "%", ".1f", "less", scale=100.0), lambda row: row.collision),
+        (Column("length", "m", ".2f"), lambda row: row.link_length),
+        *_ratio(reference),
+        (Column("first", "s", better="less"), lambda row: seconds(row.first)),
+        (Column("returns", "s", better="less"), lambda row: seconds(row.returned)),
+        (Column("ComScore", "", ".3f", "more"), lambda row: row.comscore),
     )
-    rows = []
-    for row in comparison.rows:
-        low, high = (100 * x for x in row.success_interval)
-        rows.append(
+    return _table("", section, comparison, spec)
+
+
+def _ratio(reference: str) -> Spec:
+    def ratio(row: Row) -> Cell:
+        return "1" if row.planner == reference else row.paired and row.paired.ratio
+
+    def of_ratio(row: Row) -> Cell:
+        return row.paired and row.paired.ratio_interval and interval(*row.paired.ratio_interval, 3)
+
+    return (Column(f"ratio to {reference}", "", ".3f"), ratio), (Column("95 % ", dim=True), of_ratio)
+
+
+def quality_table(section: Section, comparison: Comparison) -> Table:
+    """All metrics of the motions, and memory."""
+    spec: Spec = (
+        *(
             (
-                row.planner,
-                number(row.success, 1, 100.0),
-                interval(low, high, 1),
-                number(row.collision, 1, 100.0),
-                number(row.link_length),
-                *_ratio(row, reference),
-                seconds(row.first),
-                seconds(row.returned),
-                number(row.comscore, 3),
+                Column(metric.heading, metric.unit, metric.format, metric.better, scale=metric.scale),
+                lambda row, name=metric.name: row.measures[name].value,
             )
-        )
-    return TextTable(title(section, comparison), columns, tuple(rows))
-
-
-def _ratio(row: Row, reference: str) -> tuple[str, str]:
-    if row.planner == reference:
-        return "1", NONE
-    if row.paired is None or row.paired.ratio is None or row.paired.ratio_interval is None:
-        return NONE, NONE
-    return number(row.paired.ratio, 3), interval(*row.paired.ratio_interval, 3)
-
-
-def quality_table(section: Section, comparison: Comparison) -> TextTable:
-    """What a user asks besides: clearance, smoothness, memory."""
-    columns = (
-        "planner",
-        "clearance mm",
-        "turning rad",
-        "tip m",
-        "duration s",
-        "jerk",
-        "SPARC joints",
-        "SPARC tip",
-        "memory MB",
+            for metric in METRICS.values()
+            if any(
+                row.measures[metric.name].value == row.measures[metric.name].value for row in comparison.rows
+            )
+        ),
+        (Column("memory", "MB", ".0f", "less"), lambda row: row.memory),
     )
-    rows = tuple(
-        (
-            row.planner,
-            number(row.clearance, 1, 1000.0),
-            number(row.turning),
-            number(row.tip_length),
-            number(row.duration),
-            number(row.jerk),
-            number(row.sparc_joint),
-            number(row.sparc_tip),
-            number(row.memory, 0),
-        )
-        for row in comparison.rows
-    )
-    return TextTable(f"Quality of the motions; {title(section, comparison)}", columns, rows)
+    return _table("Quality of the motions", section, comparison, spec)
 
 
-def paired_table(section: Section, comparison: Comparison, reference: str) -> TextTable:
+def paired_table(section: Section, comparison: Comparison, reference: str) -> Table:
     """Every planner against the reference on the same problems."""
-    columns = (
-        "planner",
-        "alone solves",
-        f"{reference} alone",
-        "both",
-        "neither",
-        "p of success",
-        "ratio of lengths",
-        "95 %",
-        "p of length",
+
+    def p_of_length(pair: Paired) -> Cell:
+        return probability(pair.p_length) if pair.both else None
+
+    others = replace(comparison, rows=tuple(row for row in comparison.rows if row.paired is not None))
+    spec: Spec = (
+        (Column("alone solves"), lambda row: row.paired and row.paired.a_only),
+        (Column(f"{reference} alone"), lambda row: row.paired and row.paired.b_only),
+        (Column("both"), lambda row: row.paired and row.paired.both),
+        (Column("neither"), lambda row: row.paired and row.paired.neither),
+        (Column("p of success"), lambda row: row.paired and probability(row.paired.p_success)),
+        *_ratio(reference),
+        (Column("p of length"), lambda row: row.paired and p_of_length(row.paired)),
     )
-    rows = tuple(
-        (
-            row.planner,
-            *(str(n) for n in (row.paired.a_only, row.paired.b_only, row.paired.both, row.paired.neither)),
-            probability(row.paired.p_success),
-            *_ratio(row, reference),
-            probability(row.paired.p_length) if row.paired.both else NONE,
-        )
-        for row in comparison.rows
-        if row.paired is not None
-    )
-    return TextTable(f"Against {reference}, in pairs; {title(section, comparison)}", columns, rows)
+    return _table(f"Against {reference}, in pairs", section, others, spec)
 
 
-def failure_table(section: Section, comparison: Comparison) -> TextTable:
+def probability(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def failure_table(section: Section, comparison: Comparison) -> Table:
     """How many calls failed why; reasons that do not occur are left out."""
     kinds = [kind for kind in FAILURES if any(kind in row.failures for row in comparison.rows)]
-    rows = tuple(
-        (
-            row.planner,
-            str(sum(row.failures.values())),
-            *(str(row.failures[kind]) if kind in row.failures else NONE for kind in kinds),
-        )
-        for row in comparison.rows
+    spec: Spec = (
+        (Column("failures"), lambda row: sum(row.failures.values())),
+        *((Column(kind), lambda row, kind=kind: row.failures.get(kind)) for kind in kinds),
     )
-    return TextTable(
-        f"Failures by reason; {title(section, comparison)}", ("planner", "failures", *kinds), rows
-    )
+    return _table("Failures by reason", section, comparison, spec)
 
 
-def paper_table(section: Section, comparison: Comparison) -> TextTable | None:
+def paper_table(section: Section, comparison: Comparison) -> Table | None:
     """The rows of the paper's Table 1, ours beside the printed ones; None if there are none of them.
 
     ComScore is that among these rows alone.
@@ -210,28 +173,31 @@ def paper_table(section: Section, comparison: Comparison) -> TextTable | None:
         return None
     indicators = [Indicators(100 * r.success, 100 * r.collision, r.link_length, r.returned) for r in rows]
     paper = {row.name: row for row in PAPER_TABLE_1}
-    cells = []
-    for row, score in zip(rows, comscores(indicators).tolist(), strict=True):
+    cells: list[tuple[Cell, ...]] = []
+    for row, ours, score in zip(rows, indicators, comscores(indicators).tolist(), strict=True):
         printed = paper[IN_PAPER[row.planner]]
         theirs = printed.indicators
         cells.append(
             (
                 f"{row.planner} ({printed.name})",
-                *(number(row.success, 1, 100.0), number(theirs.success, 1)),
-                *(number(row.collision, 1, 100.0), number(theirs.collision, 1)),
-                *(number(row.link_length), number(theirs.length)),
-                *(seconds(row.returned), f"{theirs.time:g}"),
-                *(number(score, 3), f"{printed.comscore:g}"),
+                *(ours.success, theirs.success, ours.collision, theirs.collision, ours.length, theirs.length),
+                *(seconds(ours.time), theirs.time, score, printed.comscore),
             )
         )
-    names = ("success %", "collision %", "length m", "returns s", "ComScore")
-    columns = tuple(text for name in names for text in (name, f"paper: {name.split()[0]}"))
-    return TextTable(
-        f"Beside the paper's Table 1; {title(section, comparison)}", ("planner", *columns), tuple(cells)
-    )
+    names = (("success", "%", ".1f"), ("collision", "%", ".1f"), ("length", "m", ".2f"), ("returns", "s", ""))
+    columns = [
+        column
+        for name, unit, digits in (*names, ("ComScore", "", ".3f"))
+        for column in (
+            Column(name, unit, digits),
+            Column(f"paper: {name}", "", "g" if digits == ".3f" else digits),
+        )
+    ]
+    heading = f"Beside the paper's Table 1; {title(section, comparison)}"
+    return Table.of(heading, [Column("planner"), *columns], cells)
 
 
-def tables(section: Section, comparison: Comparison, reference: str) -> list[TextTable]:
+def tables(section: Section, comparison: Comparison, reference: str) -> list[Table]:
     """All of a section at a limit; tables that would say nothing are left out."""
     paper = paper_table(section, comparison)
     found = [main_table(section, comparison, reference)]
@@ -279,43 +245,20 @@ def crashes(bench: Bench) -> list[str]:
 
 def markdown(bench: Bench, parts: Sequence[Section]) -> str:
     """The report with all tables."""
-    lines = [f"# Bench {_plain(bench.folder.resolve().name)}", ""]
-    lines += [f"- {_plain(line)}" for line in about(bench)]
+    lines = [f"# Bench {plain(bench.folder.resolve().name)}", ""]
+    lines += [f"- {plain(line)}" for line in about(bench)]
     for section in parts:
-        lines += ["", f"## {_plain(section.name)}"]
+        lines += ["", f"## {plain(section.name)}"]
         for comparison in section.comparisons:
             for i, table in enumerate(tables(section, comparison, bench.reference)):
-                lines += ["", f"{'###' if i == 0 else '####'} {_plain(table.title)}", ""]
-                lines += _markdown_rows(table)
+                lines += ["", f"{'###' if i == 0 else '####'} {plain(table.title)}", ""]
+                lines += markdown_table(table)
                 if i == 0 and comparison.missing:
-                    lines += ["", _plain(missing_line(comparison))]
+                    lines += ["", plain(missing_line(comparison))]
     if broken := crashes(bench):
-        lines += ["", "## Crashes and exceptions", "", *(f"- {_plain(line)}" for line in broken)]
+        lines += ["", "## Crashes and exceptions", "", *(f"- {plain(line)}" for line in broken)]
     lines += ["", "## How to read the tables", "", *(f"- {note}" for note in NOTES)]
     return "\n".join(lines) + "\n"
-
-
-def _plain(text: str) -> str:
-    """For Markdown: what would be formatting or a column."""
-    for sign in ("\\", "|", "*", "_", "<", "`"):
-        text = text.replace(sign, "\\" + sign)
-    return text
-
-
-def _markdown_rows(table: TextTable) -> list[str]:
-    widths = [max(len(row[i]) for row in (table.columns, *table.rows)) for i in range(len(table.columns))]
-
-    def line(cells: Sequence[str]) -> str:
-        padded = (
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(cells, widths, strict=True))
-        )
-        return f"| {' | '.join(padded)} |"
-
-    rule = "|".join(
-        "-" * (width + 2) if i == 0 else "-" * (width + 1) + ":" for i, width in enumerate(widths)
-    )
-    return [line(table.columns), f"|{rule}|", *(line(row) for row in table.rows)]
 
 
 def latex(bench: Bench, parts: Sequence[Section]) -> str:
@@ -329,56 +272,15 @@ def latex(bench: Bench, parts: Sequence[Section]) -> str:
         r"\setlength{\tabcolsep}{4pt}",
         r"\begin{document}",
         r"\footnotesize",
-        rf"\section*{{Bench {escaped(bench.folder.resolve().name)}}}",
-        *(escaped(line) + r"\par" for line in about(bench)),
+        rf"\section*{{Bench {tex(bench.folder.resolve().name)}}}",
+        *(tex(line) + r"\par" for line in about(bench)),
     ]
     for section in parts:
-        lines.append(rf"\section*{{{escaped(section.name)}}}")
+        lines.append(rf"\section*{{{tex(section.name)}}}")
         for comparison in section.comparisons:
             for table in tables(section, comparison, bench.reference):
-                lines += [rf"\subsection*{{{escaped(table.title)}}}", *_latex_rows(table)]
+                lines += [rf"\subsection*{{{tex(table.title)}}}", *latex_table(table)]
             if comparison.missing:
-                lines += ["", escaped(missing_line(comparison))]
-    lines += [r"\section*{How to read the tables}", *(escaped(note) + r"\par" for note in NOTES)]
+                lines += ["", tex(missing_line(comparison))]
+    lines += [r"\section*{How to read the tables}", *(tex(note) + r"\par" for note in NOTES)]
     return "\n".join([*lines, r"\end{document}"]) + "\n"
-
-
-def _latex_rows(table: TextTable) -> list[str]:
-    def line(cells: Sequence[str]) -> str:
-        return " & ".join(escaped(cell) for cell in cells) + r" \\"
-
-    return [
-        rf"\begin{{tabular}}{{l{'r' * (len(table.columns) - 1)}}}",
-        r"\toprule",
-        line(table.columns),
-        r"\midrule",
-        *(line(row) for row in table.rows),
-        r"\bottomrule",
-        r"\end{tabular}",
-    ]
-
-
-TEX = str.maketrans(
-    {
-        "\\": r"\textbackslash{}",
-        "_": r"\_",
-        "%": r"\%",
-        "&": r"\&",
-        "#": r"\#",
-        "$": r"\$",
-        "{": r"\{",
-        "}": r"\}",
-        "~": r"\textasciitilde{}",
-        "^": r"\textasciicircum{}",
-        "<": "$<$",
-        ">": "$>$",
-        "–": "--",
-        "−": "$-$",
-        "*": "$*$",
-    }
-)
-
-
-def escaped(text: str) -> str:
-    """For LaTeX."""
-    return text.translate(TEX)

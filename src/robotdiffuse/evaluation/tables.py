@@ -1,0 +1,259 @@
+"""Tables, for the terminal, Markdown, LaTeX and HTML."""
+
+import html as markup
+import re
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+if TYPE_CHECKING:
+    from rich.table import Table as RichTable
+
+NONE = "–"
+"""Where there is no value."""
+WIDTH = 150
+"""Of tables where there is no terminal."""
+
+
+@dataclass(frozen=True)
+class Column:
+    heading: str
+    unit: str = ""
+    format: str = ""
+    """Of numbers, as `.2f`; without one, as many digits as they have."""
+    better: Literal["more", "less", ""] = ""
+    """Which values are the best and are marked."""
+    left: bool = False
+    """Whether texts stand at the left, as in the first column."""
+    scale: float = 1.0
+    """Shown units in that of the values."""
+    bar: bool = False
+    """Whether pages draw a bar beside the figure, which is a percentage."""
+    dim: bool = False
+    """Whether pages print it faintly, as what is said of the column before."""
+
+    @property
+    def title(self) -> str:
+        return f"{self.heading} {self.unit}".strip()
+
+
+class Figure(NamedTuple):
+    """A text, and the number that it stands for, which says which figure is the best."""
+
+    text: str
+    value: float
+
+
+Cell = str | int | float | Figure | None
+Rows = Sequence[Sequence[Cell]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of texts and numbers. The first column has their names."""
+
+    title: str
+    columns: tuple[Column, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+    notes: tuple[str, ...] = ()
+    """Lines below."""
+
+    @classmethod
+    def of(
+        cls, title: str, columns: Sequence[Column | str], rows: Rows, notes: Sequence[str] = ()
+    ) -> "Table":
+        """A column can be named by its heading alone."""
+        of_columns = (Column(column) if isinstance(column, str) else column for column in columns)
+        return cls(title, tuple(of_columns), tuple(tuple(row) for row in rows), tuple(notes))
+
+    @classmethod
+    def pairs(cls, title: str, rows: Sequence[tuple[str, str]]) -> "Table":
+        """Names and what is said of them, without headings."""
+        return cls.of(title, ("", Column("", left=True)), rows)
+
+    @property
+    def headed(self) -> bool:
+        return any(column.title for column in self.columns)
+
+    @property
+    def texts(self) -> list[list[str]]:
+        """All cells, finished."""
+        return [
+            [_text(cell, column) for cell, column in zip(row, self.columns, strict=True)] for row in self.rows
+        ]
+
+    @property
+    def best(self) -> set[tuple[int, int]]:
+        """Row and column of the best figures of each column, as they are shown; none where more than half of
+        the rows have it."""
+        found: set[tuple[int, int]] = set()
+        for j, column in enumerate(self.columns):
+            values = {i: _value(row[j]) for i, row in enumerate(self.rows)}
+            known = {i: value for i, value in values.items() if value == value}
+            if column.better and known:
+                top = (max if column.better == "more" else min)(known.values())
+                shown = {_text(self.rows[i][j], column) for i, value in known.items() if value == top}
+                level = [i for i in known if _text(self.rows[i][j], column) in shown]
+                found |= {(i, j) for i in level if 2 * len(level) <= len(self.rows)}
+        return found
+
+    def at_left(self, j: int) -> bool:
+        return j == 0 or self.columns[j].left
+
+
+def _value(cell: Cell) -> float:
+    """NaN for a text."""
+    if isinstance(cell, Figure):
+        return cell.value
+    return float("nan") if cell is None or isinstance(cell, str) else float(cell)
+
+
+def _text(cell: Cell, column: Column) -> str:
+    if isinstance(cell, str):
+        return cell
+    if isinstance(cell, Figure):
+        return cell.text
+    if cell is None or cell != cell:
+        return NONE
+    text = f"{cell:,}" if isinstance(cell, int) else format(column.scale * cell, column.format or "g")
+    return text.replace("-", "−")
+
+
+def terminal(table: Table) -> "RichTable":
+    """For rich's console."""
+    from rich.markup import escape
+    from rich.table import Table as RichTable
+
+    found = RichTable(
+        title=escape(table.title) or None,
+        title_justify="left",
+        caption=escape("\n".join(table.notes)) or None,
+        caption_justify="left",
+        show_header=table.headed,
+        box=None,
+        pad_edge=False,
+        padding=(0, 1),
+    )
+    for j, column in enumerate(table.columns):
+        found.add_column(escape(column.title), justify="left" if table.at_left(j) else "right")
+    for i, texts in enumerate(table.texts):
+        marked = (
+            f"[bold]{escape(t)}[/bold]" if (i, j) in table.best else escape(t) for j, t in enumerate(texts)
+        )
+        found.add_row(*marked)
+    return found
+
+
+def show(*tables: Table, width: int | None = None) -> None:
+    """Print tables; as wide as the terminal, or as WIDTH where there is none."""
+    from rich.console import Console
+
+    console = Console(width=width or (None if sys.stdout.isatty() else WIDTH))
+    for i, table in enumerate(tables):
+        console.print(*([""] if i else []), terminal(table), sep="\n")
+
+
+def markdown(table: Table) -> list[str]:
+    """Lines, without the title."""
+    best = table.best
+    texts = [
+        [f"**{plain(text)}**" if (i, j) in best else plain(text) for j, text in enumerate(row)]
+        for i, row in enumerate(table.texts)
+    ]
+    headings = [plain(column.title) for column in table.columns]
+    widths = [max(3, *(len(row[j]) for row in (headings, *texts))) for j in range(len(headings))]
+
+    def line(cells: Sequence[str]) -> str:
+        padded = (
+            cell.ljust(width) if table.at_left(j) else cell.rjust(width)
+            for j, (cell, width) in enumerate(zip(cells, widths, strict=True))
+        )
+        return f"| {' | '.join(padded)} |"
+
+    rule = "|".join(
+        "-" * (width + 2) if table.at_left(j) else "-" * (width + 1) + ":" for j, width in enumerate(widths)
+    )
+    notes = [line for note in table.notes for line in ("", plain(note))]
+    return [line(headings), f"|{rule}|", *(line(row) for row in texts), *notes]
+
+
+def plain(text: str) -> str:
+    """For Markdown: what would be formatting or a column. An underscore within a word is neither."""
+    return re.sub(r"[\\|*<`]|(?<!\w)_|_(?!\w)", r"\\\g<0>", text)
+
+
+def latex(table: Table) -> list[str]:
+    """Lines of a tabular, without the title; it needs booktabs."""
+    best = table.best
+
+    def line(cells: Sequence[str]) -> str:
+        return " & ".join(cells) + r" \\"
+
+    places = "".join("l" if table.at_left(j) else "r" for j in range(len(table.columns)))
+    rows = [
+        line([rf"\textbf{{{tex(t)}}}" if (i, j) in best else tex(t) for j, t in enumerate(texts)])
+        for i, texts in enumerate(table.texts)
+    ]
+    return [
+        rf"\begin{{tabular}}{{{places}}}",
+        r"\toprule",
+        line([tex(column.title) for column in table.columns]),
+        r"\midrule",
+        *rows,
+        r"\bottomrule",
+        r"\end{tabular}",
+        *(tex(note) for note in table.notes),
+    ]
+
+
+TEX = str.maketrans(
+    {
+        "\\": r"\textbackslash{}",
+        "_": r"\_",
+        "%": r"\%",
+        "&": r"\&",
+        "#": r"\#",
+        "$": r"\$",
+        "{": r"\{",
+        "}": r"\}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "<": "$<$",
+        ">": "$>$",
+        "–": "--",
+        "−": "$-$",
+        "±": r"$\pm$",
+        "*": "$*$",
+    }
+)
+
+
+def tex(text: str) -> str:
+    """For LaTeX."""
+    return text.translate(TEX)
+
+
+def html(table: Table, colors: Mapping[str, str] | None = None, ours: str = "") -> str:
+    """A table element, without the title; its look is in `look.STYLE`.
+
+    colors: of rows, by the text of their first cell; `ours`: that of a row that stands out.
+    """
+    head = "".join(f"<th>{markup.escape(column.title)}</th>" for column in table.columns)
+    body, best = [], table.best
+    for i, texts in enumerate(table.texts):
+        color = (colors or {}).get(texts[0], "")
+        swatch = f'<i style="background:{color}"></i>' if color else ""
+        cells = [f"<td>{swatch}{markup.escape(texts[0])}</td>"]
+        for j, (text, column) in enumerate(zip(texts[1:], table.columns[1:], strict=True), start=1):
+            kind = "best" if (i, j) in best else "dim" if column.dim else ""
+            bar = _bar(column.scale * _value(table.rows[i][j]), color) if column.bar else ""
+            cells.append(f'<td class="{kind}">{bar}<span>{markup.escape(text)}</span></td>')
+        body.append(f"<tr{' class=ours' if ours and texts[0] == ours else ''}>{''.join(cells)}</tr>")
+    notes = "".join(f"<p>{markup.escape(note)}</p>" for note in table.notes)
+    whole = f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
+    return f'<div class="wide">{whole}</div>{notes}'
+
+
+def _bar(percent: float, color: str) -> str:
+    return f'<span class="bar"><b style="width:{percent:.1f}%;background:{color or "#6b7684"}"></b></span>'

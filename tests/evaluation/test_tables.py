@@ -1,0 +1,75 @@
+"""One table, four renderers: every cell is there, what would be formatting is escaped, the best is marked."""
+
+import re
+from io import StringIO
+
+from rich.console import Console
+
+from robotdiffuse.evaluation import tables
+from robotdiffuse.evaluation.tables import Column, Figure, Table
+
+COLUMNS = (
+    "planner",
+    Column("success", "%", ".1f", "more", scale=100.0, bar=True),
+    Column("a & b", "s", better="less"),
+)
+ROWS = (
+    ("rrt_star*", 0.25, Figure("0.0010", 0.001)),
+    ("b|c [x]", 0.75, 2.0),
+    ("<d>", float("nan"), None),
+)
+TABLE = Table.of("Title [of] it", COLUMNS, ROWS, ("note_1 < 2",))
+
+
+def test_numbers_are_formatted_and_what_is_not_known_is_a_dash() -> None:
+    assert [row[1:] for row in TABLE.texts] == [["25.0", "0.0010"], ["75.0", "2"], ["–", "–"]]
+    assert Table.of("", ["", ""], [("x", -3)]).texts == [["x", "−3"]]
+
+
+def test_the_best_are_those_that_look_like_it_and_are_not_common() -> None:
+    assert TABLE.best == {(1, 1), (0, 2)}
+    column = Column("x", format=".1f", better="less")
+    assert Table.of("", ["", column], [("a", 1.01), ("b", 1.02), ("c", 2), ("d", 3)]).best == {(0, 1), (1, 1)}
+    assert not Table.of("", ["", column], [("a", 1), ("b", 1), ("c", 2)]).best
+
+
+def test_markdown() -> None:
+    assert tables.markdown(TABLE) == [
+        "| planner    | success % |    a & b s |",
+        "|------------|----------:|-----------:|",
+        r"| rrt_star\* |      25.0 | **0.0010** |",
+        r"| b\|c [x]   |  **75.0** |          2 |",
+        r"| \<d>       |         – |          – |",
+        "",
+        r"note_1 \< 2",
+    ]
+
+
+def test_latex() -> None:
+    lines = tables.latex(TABLE)
+    assert lines[0] == r"\begin{tabular}{lrr}"
+    assert r"planner & success \% & a \& b s \\" in lines
+    assert r"rrt\_star$*$ & 25.0 & \textbf{0.0010} \\" in lines
+    assert lines[-1] == r"note\_1 $<$ 2"
+
+
+def test_html() -> None:
+    text = tables.html(TABLE, {"<d>": "#123456"}, ours="b|c [x]")
+    assert text.count("<tr>") == 3 and "<tr class=ours><td>b|c [x]</td>" in text
+    assert '<td><i style="background:#123456"></i>&lt;d&gt;</td>' in text
+    assert '<td class="best"><span class="bar"><b style="width:75.0%' in text
+    assert "<p>note_1 &lt; 2</p>" in text
+
+
+def test_terminal() -> None:
+    out = StringIO()
+    Console(file=out, width=80).print(tables.terminal(TABLE))
+    lines = [re.sub(" +", " ", line).strip() for line in out.getvalue().splitlines()]
+    assert lines == [
+        "Title [of] it",
+        "planner success % a & b s",
+        "rrt_star* 25.0 0.0010",
+        "b|c [x] 75.0 2",
+        "<d> – –",
+        "note_1 < 2",
+    ]
