@@ -2,7 +2,9 @@
 
 import os
 import signal
+import sys
 import time
+from pathlib import Path
 
 from robotdiffuse.evaluation.bench import planner_process
 from robotdiffuse.planners import PLANNERS, Entry
@@ -29,8 +31,9 @@ class Faulty:
         return RRTConnect().plan(problem, time_limit, seed)
 
 
-ENTRY = Entry("faulty_planner:Faulty", "for tests")
+ENTRY = Entry("helpers.faulty_planner:Faulty", "for tests")
 
 if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))
     PLANNERS["faulty"] = ENTRY
     planner_process.main()
