@@ -193,6 +193,20 @@ def test_a_joint_that_does_not_move_the_tip() -> None:
     assert found["link_length"] > 0  # the fingers turn
 
 
+def test_clearance_to_the_scene_and_to_itself_apart() -> None:
+    """A ball 5 cm above the hand's way, and the arm nearer to itself than that."""
+    rows = np.stack([START, START + 0.01])
+    top = link_pose(PANDA, START, "panda_link4")[:3, 3]
+    problem = Problem(PANDA, Scene([Sphere(top + np.array([0, 0, 0.4]), 0.1)]), START, JointGoal(rows[1:]))
+    path = Path(PANDA.joint_names, rows)
+    verdict = verify(problem, path)
+    found = Measure(PANDA)(path, None, verdict)
+    apart = found["scene_clearance"], found["self_clearance"]
+    assert apart == pytest.approx((verdict.scene_clearance, verdict.self_clearance), rel=1e-6)
+    assert found["min_clearance"] == min(apart) and 0.05 < apart[0] < 0.3
+    assert "scene_clearance" not in Measure(PANDA)(path)
+
+
 def test_figures_do_not_depend_on_the_rows_of_a_trajectory() -> None:
     coarse, fine = (minimum_jerk(1.234, START, END, rows) for rows in (200, 2000))
     a, b = (Measure(PANDA)(path_of(m), m) for m in (coarse, fine))

@@ -102,8 +102,9 @@ class Metric:
         return self.name.replace("_", " ")
 
 
-def _clearance(motion: Motion) -> float | None:
-    return None if motion.verdict is None else motion.verdict.min_clearance
+def _clearance(name: str) -> Callable[[Motion], float | None]:
+    """A field of the verdict: lower bounds of distances along the motion [m]."""
+    return lambda motion: getattr(motion.verdict, name, None)
 
 
 def _duration(motion: Motion) -> float | None:
@@ -136,8 +137,10 @@ _METRICS = (
     # angles between successive segments in joint space together; 0 for a straight line
     Metric("turning", "rad", "less", ".2f", lambda m: turning(m.path.positions)),
     Metric("bending", "", "less", ".0f", lambda m: bending(m.path.positions)),
-    # lower bounds
-    Metric("min_clearance", "mm", "more", ".1f", _clearance, 1000.0),
+    # the lesser of the two that follow: to obstacles, and of the arm to itself
+    Metric("min_clearance", "mm", "more", ".1f", _clearance("min_clearance"), 1000.0),
+    Metric("scene_clearance", "mm", "more", ".1f", _clearance("scene_clearance"), 1000.0),
+    Metric("self_clearance", "mm", "more", ".1f", _clearance("self_clearance"), 1000.0),
     Metric("duration", "s", "less", ".2f", _duration),
     Metric("jerk", "", "less", ".2f", _jerk),
     Metric("sparc_joint", "", "more", ".2f", _sparc_joint),

@@ -19,7 +19,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench.problem_sets import read_cases
 from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED, Record, read_records
 from robotdiffuse.evaluation.comscore import Indicators, comscores
-from robotdiffuse.evaluation.metrics import METRICS
+from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
 from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.problems.families import FAMILIES
@@ -166,6 +166,11 @@ class Comparison:
     families: dict[str, dict[str, tuple[int, int]]]
     """Solved calls and all calls, by family and planner."""
     keys: tuple[Key, ...]
+
+    @property
+    def metrics(self) -> list[Metric]:
+        """Those that some row has."""
+        return [m for m in METRICS.values() if any(row.measures[m.name].value < np.inf for row in self.rows)]
 
 
 @dataclass(frozen=True, eq=False)

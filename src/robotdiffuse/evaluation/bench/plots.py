@@ -9,7 +9,6 @@ import numpy as np
 from robotdiffuse.evaluation.bench.figures import FAILURES, Comparison, Section
 from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.look import FAINT, INK, LINE, SOFT, as_svg, make_figure
-from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.statistics import wilson_interval
 
 if TYPE_CHECKING:
@@ -187,12 +186,12 @@ def metrics(section: Section, comparison: Comparison, planners: Sequence[str]) -
     rows = {row.planner: row for row in comparison.rows}
     shown = [name for name in planners if name in rows]
     across = 4
-    down = -(-len(METRICS) // across)
+    down = -(-len(comparison.metrics) // across)
     figure = make_figure(12, (0.165 * len(shown) + 0.5) * down + 0.1)
     panels = figure.subplots(down, across, squeeze=False, sharey=True).reshape(-1)
-    for panel in panels[len(METRICS) :]:
+    for panel in panels[len(comparison.metrics) :]:
         panel.set_axis_off()
-    for i, (panel, metric) in enumerate(zip(panels, METRICS.values(), strict=False)):
+    for i, (panel, metric) in enumerate(zip(panels, comparison.metrics, strict=False)):
         for y, planner in enumerate(shown):
             value, half = (metric.scale * x for x in rows[planner].measures[metric.name])
             color = color_of(planner, planners)

@@ -14,7 +14,6 @@ from robotdiffuse.evaluation.bench.figures import (
     Section,
 )
 from robotdiffuse.evaluation.comscore import PAPER_TABLE_1, Indicators, comscores
-from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.evaluation.statistics import Paired
 from robotdiffuse.evaluation.tables import Cell, Column, Figure, Table, plain, tex
 from robotdiffuse.evaluation.tables import latex as latex_table
@@ -45,9 +44,11 @@ NOTES = (
     "anytime planners use up the limit, and an unsolved problem counts it.",
     "ComScore: as in the paper, from success, collision, length and time until it returns; each from 0 for "
     "the worst row of the table to 1 for the best. It depends on which rows there are.",
-    "clearance, turning, tip, duration, jerk and SPARC are means over the solved problems, of the motions "
-    "that the calls returned at their end. jerk: logarithm of the dimensionless jerk, less is smoother; "
-    "SPARC: spectral arc length of the joints' and the tip's speed, nearer to 0 is smoother.",
+    "Quality: means over the solved problems, of the motions that the calls returned at their end. "
+    "clearance: a lower bound, to obstacles (scene), of the arm to itself (self), and the lesser of the two. "
+    "bending: the integral of the squared second derivative of the path, over its squared length. jerk: "
+    "logarithm of the dimensionless jerk, less is smoother; sparc: spectral arc length of the joints' and "
+    "the tip's speed, nearer to 0 is smoother.",
     "p of success: McNemar's exact test; p of length: Wilcoxon's signed ranks; neither is corrected for the "
     "number of comparisons. With several seeds, a problem counts as solved if more than half of them are.",
 )
@@ -120,10 +121,7 @@ def quality_table(section: Section, comparison: Comparison) -> Table:
                 Column(metric.heading, metric.unit, metric.format, metric.better, scale=metric.scale),
                 lambda row, name=metric.name: row.measures[name].value,
             )
-            for metric in METRICS.values()
-            if any(
-                row.measures[metric.name].value == row.measures[metric.name].value for row in comparison.rows
-            )
+            for metric in comparison.metrics
         ),
         (Column("memory", "MB", ".0f", "less"), lambda row: row.memory),
     )
