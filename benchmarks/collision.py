@@ -29,9 +29,10 @@ from rich.progress import track
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.collision.kernels.lanes import W, make_workspace
+from robotdiffuse.collision.kernels.motions import Space, motion_free
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.collision.signed_distance import SignedDistance
-from robotdiffuse.planners.rrt_connect.kernel import Space, motion_free
-from robotdiffuse.planners.rrt_connect.planner import RRTConnectSettings, search_space
+from robotdiffuse.planners.rrt_connect.planner import RRTConnectSettings
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, sample_scene
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.problems.rop_problems import base_spheres

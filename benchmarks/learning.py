@@ -41,11 +41,15 @@ from scipy.stats import binomtest, wilcoxon
 
 from problems import PANDA, SEED, draw_cases, goal_of
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.generation.shard_maker import resample
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.robotdiffuse import (
     Candidates,
@@ -53,8 +57,6 @@ from robotdiffuse.planners.robotdiffuse import (
     encode,
     unlearned_starts,
 )
-from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import load_motion_bench_maker
@@ -108,13 +110,13 @@ class Arena:
         """The straight line, if it is free."""
         line = np.stack([self.start, self.goals[0]])
         space = search_space(self.checker, self.planner.settings.resolution)
-        return line if kernel.motions_free(space, line).all() else None
+        return line if motions_free(space, line).all() else None
 
     def shortened(self, found: Candidates) -> Iterator[ndarray]:
         """The shortest of the free candidates after shortcuts, as RobotDiffuse takes them."""
         settings = self.planner.settings
-        for path in sorted(found.q[found.free], key=kernel.path_length)[: settings.shortened]:
-            yield kernel.shortcut(self.space, path, settings.shortcuts, self.state)
+        for path in sorted(found.q[found.free], key=path_length)[: settings.shortened]:
+            yield shortcut(self.space, path, settings.shortcuts, self.state)
 
 
 Method = Callable[[Arena], Iterator[ndarray | None]]
@@ -230,7 +232,7 @@ def answers(task: Task, arena: Arena, method: Method) -> list[Answer]:
     judge, whole = Judge(task.seen, arena), Judge(task.whole, arena)
     at_marks = []
     for mark in MARKS:
-        there = sorted((path for spent, path in paths if spent <= mark), key=kernel.path_length)
+        there = sorted((path for spent, path in paths if spent <= mark), key=path_length)
         answer = next((path for path in there if judge.passes(path)), None)
         at_marks.append(Answer(answer, answer is not None and whole.passes(answer)))
     return at_marks
@@ -268,7 +270,7 @@ def compare(tasks: list[Task], planner: RobotDiffuse, title: str) -> dict[str, F
                 found[name].answered[i, m] = path is not None
                 if path is not None and free:
                     even = resample(path.astype(np.float64), FRAMES)
-                    length = float(kernel.path_length(path))
+                    length = float(path_length(path))
                     found[name].length[i, m] = length
                     found[name].links[i, m] = links(even[None])[0]
                     second = np.diff(even, 2, axis=0) * (FRAMES - 1) ** 2

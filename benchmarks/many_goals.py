@@ -28,10 +28,13 @@ from report import header, print_table, progress
 
 from problems import PANDA, SEED, draw_cases
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import Space, motions_free, path_length
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.evaluation.trials import NETWORK_ALONE
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, encode, unlearned_starts
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.rop import RopSettings
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -50,7 +53,7 @@ SHORTCUTS = 25
 class Scene(NamedTuple):
     problem: Problem
     checker: CollisionChecker
-    space: kernel.Space
+    space: Space
     start: Float[ndarray, "dof"]
     goals: Float[ndarray, "k dof"]
     rng: np.random.Generator
@@ -71,7 +74,7 @@ def prepare(problem: Problem, rules: RopSettings, count: int, resolution: float,
         if goal is None:
             break
         goal = goal.astype(np.float32)
-        if kernel.motions_free(space, np.stack([start, goal])).all():
+        if motions_free(space, np.stack([start, goal])).all():
             continue
         if len(search(space, start, goal, state)):
             goals.append(goal)
@@ -81,7 +84,7 @@ def prepare(problem: Problem, rules: RopSettings, count: int, resolution: float,
     return None
 
 
-def search(space: kernel.Space, start: ndarray, goal: ndarray, state: ndarray) -> Float[ndarray, "n dof"]:
+def search(space: Space, start: ndarray, goal: ndarray, state: ndarray) -> Float[ndarray, "n dof"]:
     """No rows if a pair of trees is full without a path."""
     return kernel.search(space, kernel.make_trees(start, goal[None], NODES), REACH, 2 * NODES, state)
 
@@ -120,7 +123,7 @@ def shortest_free(planner: RobotDiffuse, scene: Scene, q: ndarray, free: ndarray
     paths: Paths = []
     for g in range(len(scene.goals)):
         candidates = q[free & (goal_of == g)]
-        paths.append(min(candidates, key=kernel.path_length) if len(candidates) else None)
+        paths.append(min(candidates, key=path_length) if len(candidates) else None)
     return paths
 
 
@@ -128,7 +131,7 @@ def by_search(_planner: RobotDiffuse, scene: Scene, _seconds: float) -> Paths:
     paths: Paths = []
     for goal in scene.goals:
         path = search(scene.space, scene.start, goal, scene.state)
-        paths.append(kernel.shortcut(scene.space, path, SHORTCUTS, scene.state) if len(path) else None)
+        paths.append(shortcut(scene.space, path, SHORTCUTS, scene.state) if len(path) else None)
     return paths
 
 
@@ -141,10 +144,10 @@ def by_long_search(_planner: RobotDiffuse, scene: Scene, seconds: float) -> Path
             path = search(scene.space, scene.start, goal, scene.state)
             if not len(path):
                 break
-            path = kernel.shortcut(scene.space, path, SHORTCUTS, scene.state)
-            if best is None or kernel.path_length(path) < kernel.path_length(best):
+            path = shortcut(scene.space, path, SHORTCUTS, scene.state)
+            if best is None or path_length(path) < path_length(best):
                 best = path
-            best = kernel.shortcut(scene.space, best, SHORTCUTS, scene.state)
+            best = shortcut(scene.space, best, SHORTCUTS, scene.state)
         paths.append(best)
     return paths
 
@@ -204,7 +207,7 @@ def main() -> None:
             spent = spent or took
             for g, path in enumerate(paths):
                 if path is not None and passes(scene, path):
-                    lengths[name][i, g] = kernel.path_length(path)
+                    lengths[name][i, g] = path_length(path)
     every = np.isfinite(np.stack(list(lengths.values()))).all(axis=0)
     rows = []
     for name, found in lengths.items():

@@ -18,7 +18,11 @@ from report import header, print_table, progress, share
 
 from problems import PANDA, RUNS, SEARCH_TIME, SEED, Case, Drawn, draw_cases, families_of, goal_of, judged
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import path_length
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.evaluation.trials import NETWORK_ALONE, Draw, from_network, without_network
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.robotdiffuse import (
     Candidates,
     RobotDiffuse,
@@ -26,8 +30,6 @@ from robotdiffuse.planners.robotdiffuse import (
     encode,
     unlearned_starts,
 )
-from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.simulation.oracle import PyBulletOracle
@@ -55,7 +57,7 @@ def tried(draw: Draw, cases: list[Case], title: str) -> list[str]:
         single.append(passed.mean())
         best.append(passed.any())
         if passed.any():
-            lengths.append(min(kernel.path_length(path) for path in q[passed]) / case.reference)
+            lengths.append(min(path_length(path) for path in q[passed]) / case.reference)
     shares = [f"{100 * np.mean(single):.1f} ± {100 * half_width(single):.1f} %", share(best)]
     return [title, *shares, f"{np.mean(lengths):.3f}" if lengths else "", ms(seconds)]
 
@@ -82,11 +84,11 @@ def shortest(
     planner: RobotDiffuse, problem: Problem, checker: CollisionChecker, found: Candidates, began: float
 ) -> Outcome:
     space, state = search_space(checker, planner.settings.resolution), random_state(SEED)
-    paths = sorted(found.q[found.free], key=kernel.path_length)[: planner.settings.shortened]
-    paths = [kernel.shortcut(space, path, planner.settings.shortcuts, state) for path in paths]
-    for path in sorted(paths, key=kernel.path_length):
+    paths = sorted(found.q[found.free], key=path_length)[: planner.settings.shortened]
+    paths = [shortcut(space, path, planner.settings.shortcuts, state) for path in paths]
+    for path in sorted(paths, key=path_length):
         if judged(problem, path[None])[0]:
-            return Outcome(True, float(kernel.path_length(path)), time.process_time() - began)
+            return Outcome(True, float(path_length(path)), time.process_time() - began)
     return Outcome(False, np.nan, time.process_time() - began)
 
 

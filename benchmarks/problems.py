@@ -22,12 +22,16 @@ from rich.console import Console
 from rich.progress import Progress
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import path_length
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import trials
 from robotdiffuse.evaluation.bench.problem_sets import family_problem, line_solves
 from robotdiffuse.evaluation.trials import SEARCH_TIME, SEED, goal_of
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import RRTConnect, random_state, search_space
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
@@ -110,7 +114,7 @@ def shortest_of_runs(problem: Problem, search_time: float) -> float:
         trees = kernel.make_trees(start, goals, 20_000)
         path = kernel.search(space, trees, np.float32(1.5), 1_000_000, state)
         if len(path):
-            lengths.append(float(kernel.path_length(kernel.shortcut(space, path, 120, state))))
+            lengths.append(float(path_length(shortcut(space, path, 120, state))))
     return min(lengths)
 
 

@@ -18,15 +18,13 @@ from rich.progress import track
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import path_length
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import (
-    Ends,
-    RRTConnect,
-    RRTConnectSettings,
-    random_state,
-    search_space,
-)
+from robotdiffuse.planners.rrt_connect.planner import Ends, RRTConnect, RRTConnectSettings
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, RopSettings
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -49,9 +47,9 @@ def search_seconds(problem: Problem, settings: RRTConnectSettings) -> float:
     for _ in range(settings.searches):
         trees = kernel.make_trees(start, goals, settings.capacity)
         path = kernel.search(space, trees, np.float32(settings.reach), 1_000_000, state)
-        if best is None or kernel.path_length(path) < kernel.path_length(best):
+        if best is None or path_length(path) < path_length(best):
             best = path
-    kernel.shortcut(space, best, settings.shortcuts, state)
+    shortcut(space, best, settings.shortcuts, state)
     return time.process_time() - began
 
 

@@ -23,10 +23,11 @@ from scipy.stats import wilcoxon
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels import lanes
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import Space, motions_free
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.generation.problems import draw_problem
 from robotdiffuse.generation.settings import GenerationSettings
-from robotdiffuse.planners.rrt_connect import kernel as connect
-from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal
@@ -55,7 +56,7 @@ def one_goal(count: int) -> list[Problem]:
         assert isinstance(problem.goal, JointGoal)
         checker = CollisionChecker(PANDA, problem.scene)
         ends = np.concatenate([problem.start[None], problem.goal.positions]).astype(np.float32)
-        if connect.motions_free(search_space(checker, RESOLUTION), ends)[0]:
+        if motions_free(search_space(checker, RESOLUTION), ends)[0]:
             continue
         search = SharedTreeSearch(checker, ends[0], ends[1:], TOUCHING, random_state(SEED, index))
         run(search, OMPL_TIME, stop_at_first=True)
@@ -77,7 +78,7 @@ def many_goals(count: int) -> list[Problem]:
         line = np.stack([drawn.start, drawn.goals[nearest]])
         if (
             len(drawn.goals) == settings.goals
-            and not connect.motions_free(search_space(checker, RESOLUTION), line).all()
+            and not motions_free(search_space(checker, RESOLUTION), line).all()
         ):
             found.append((checker, drawn.start, drawn.goals))
     return found
@@ -89,7 +90,7 @@ def run(search: SharedTreeSearch, seconds: float, stop_at_first: bool = False) -
 
 
 class Validity(ob.StateValidityChecker):
-    def __init__(self, information: ob.SpaceInformation, space: connect.Space) -> None:
+    def __init__(self, information: ob.SpaceInformation, space: Space) -> None:
         super().__init__(information)
         self.space, self.q = space, np.empty((1, PANDA.dof), np.float32)
 
@@ -100,14 +101,14 @@ class Validity(ob.StateValidityChecker):
 
 
 class Motions(ob.MotionValidator):
-    def __init__(self, information: ob.SpaceInformation, space: connect.Space) -> None:
+    def __init__(self, information: ob.SpaceInformation, space: Space) -> None:
         super().__init__(information)
         self.space, self.q = space, np.empty((2, PANDA.dof), np.float32)
 
     def checkMotion(self, a: ob.State, b: ob.State) -> bool:
         for j in range(PANDA.dof):
             self.q[0, j], self.q[1, j] = a[j], b[j]
-        return bool(connect.motions_free(self.space, self.q)[0])
+        return bool(motions_free(self.space, self.q)[0])
 
 
 def ompl_cost(name: str, problem: Problem, seconds: float) -> float:

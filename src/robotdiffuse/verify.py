@@ -1,6 +1,6 @@
 """The judge: is a motion free of collision, within limits, and from the start to the goal?
 
-Collision between waypoints is settled by a certificate, not by sampling: see collision/continuous.py. The
+Collision between waypoints is settled by a certificate, not by sampling: see collision/motion.py. The
 judge knows nothing of planners.
 """
 
@@ -10,8 +10,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.collision.continuous import Contact, ContinuousCollision
 from robotdiffuse.collision.exact import describe_contact
+from robotdiffuse.collision.motion import Contact, ContinuousCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose

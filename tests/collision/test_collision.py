@@ -17,9 +17,9 @@ from robotdiffuse.collision.arrays import compile_scene, robot_groups
 from robotdiffuse.collision.exact import ExactCollision, forward_frames
 from robotdiffuse.collision.kernels.lane_clearance import block_clearances
 from robotdiffuse.collision.kernels.lanes import block_hits, free_many
+from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.collision.points import THINNING, build_grid, cover, thin
 from robotdiffuse.errors import InputError
-from robotdiffuse.planners.rrt_connect.kernel import motion_free
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, sample_scene
 from robotdiffuse.problems.rop_problems import base_spheres
 from robotdiffuse.robots import load_robot

@@ -11,6 +11,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners.lattice.planner import (
     AStar,
@@ -22,8 +24,6 @@ from robotdiffuse.planners.lattice.planner import (
     LatticeSettings,
     Outcome,
 )
-from robotdiffuse.planners.rrt_connect.kernel import motions_free
-from robotdiffuse.planners.rrt_connect.planner import search_space
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene

@@ -9,6 +9,7 @@ import torch
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import path_length
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.base import JointRanges
 from robotdiffuse.learning.networks.checkpoint import save_baseline
@@ -23,7 +24,6 @@ from robotdiffuse.learning.training.batches import TrajectoryData, resample_even
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_code
-from robotdiffuse.planners.rrt_connect import kernel
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.packed import pack_scene
@@ -228,7 +228,7 @@ def test_contraction_never_lengthens_and_stays_free(weights: str) -> None:
         tried += 1
         shorter = one.contracted(path)
         assert one.segments_free(shorter).all() and len(shorter) < len(path)
-        assert kernel.path_length(shorter) <= kernel.path_length(path) * (1 + 1e-6)
+        assert path_length(shorter) <= path_length(path) * (1 + 1e-6)
         np.testing.assert_array_equal(shorter[[0, -1]], path[[0, -1]])
     assert tried > 5
 

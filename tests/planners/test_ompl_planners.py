@@ -16,7 +16,6 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import explain_collision
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import ompl_planners as planners
-from robotdiffuse.planners.rrt_connect import kernel
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
@@ -195,7 +194,7 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
         raise RuntimeError("broken kernel")
 
     with monkeypatch.context() as patched:
-        patched.setattr(kernel, "motions_free", broken)
+        patched.setattr(planners, "motions_free", broken)
         patched.setattr(planners.lanes, "free_many", broken)
         # what surrounds the search asks the kernel as well
         patched.setattr(planners, "usable_ends", FreeEnds)

@@ -5,15 +5,14 @@ import pytest
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import explain_collision
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.ends import retreat
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import (
-    RRTConnect,
-    RRTConnectSettings,
-    random_state,
-    search_space,
-)
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect, RRTConnectSettings
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.problems.rop_problems import sample_problem
@@ -90,10 +89,10 @@ def test_shortcuts_keep_ends_and_freedom_and_do_not_lengthen():
         state = random_state(seed)
         trees = kernel.make_trees(LEFT.astype(np.float32), RIGHT[None].astype(np.float32), 5000)
         path = kernel.search(space, trees, np.float32(1.0), 100_000, state)
-        short = kernel.shortcut(space, path, 50, state)
+        short = shortcut(space, path, 50, state)
         assert np.array_equal(short[[0, -1]], path[[0, -1]])
-        assert kernel.path_length(short) <= kernel.path_length(path) + 1e-4
-        assert kernel.motions_free(space, short).all()
+        assert path_length(short) <= path_length(path) + 1e-4
+        assert motions_free(space, short).all()
 
 
 def test_search_can_be_continued():

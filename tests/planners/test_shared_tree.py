@@ -11,9 +11,10 @@ from scipy.sparse.csgraph import dijkstra
 
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import load_planner
-from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
 from robotdiffuse.planners.shared_tree import kernel
 from robotdiffuse.planners.shared_tree.planner import SharedTreeRRTStar, SharedTreeSearch, SharedTreeSettings
 from robotdiffuse.problems.families.rop import ROP, ROP_DENSE

@@ -5,12 +5,13 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.generation.problems import TargetProblem, draw_problem
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.paths.timing import time_parameterize
-from robotdiffuse.planners.rrt_connect import kernel as connect
-from robotdiffuse.planners.rrt_connect.planner import random_state, search_space
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch
 from robotdiffuse.problems.families import floor_of
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -128,7 +129,7 @@ def _line_is_free(
     settings: GenerationSettings, checker: CollisionChecker, start: ndarray, goal: ndarray
 ) -> bool:
     space = search_space(checker, settings.search.resolution)
-    return bool(connect.motions_free(space, np.stack([start, goal]))[0])
+    return bool(motions_free(space, np.stack([start, goal]))[0])
 
 
 def _frames(

@@ -9,12 +9,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import Space, motions_free, path_length
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import search_space
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import PlanResult
@@ -113,8 +113,8 @@ class GuidedPrior(ABC):
         )
 
 
-def _attempt(space: kernel.Space, path: Float[ndarray, "frames dof"]) -> Attempt:
-    return Attempt(int((~kernel.motions_free(space, path)).sum()), float(kernel.path_length(path)), path)
+def _attempt(space: Space, path: Float[ndarray, "frames dof"]) -> Attempt:
+    return Attempt(int((~motions_free(space, path)).sum()), float(path_length(path)), path)
 
 
 def shared_out(

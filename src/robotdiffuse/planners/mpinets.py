@@ -24,13 +24,13 @@ from numpy import ndarray
 from torch import Tensor
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import Space, motions_free
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, RollOuts
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import search_space
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
@@ -162,13 +162,13 @@ class _Motion:
         """Whether it reaches the goal free of collision by the compiled check."""
         return self.arrived and not self.collided
 
-    def go(self, space: kernel.Space, q: Float32[ndarray, "dof"]) -> None:
-        self.collided |= not kernel.motions_free(space, np.stack([self.frames[-1], q]))[0]
+    def go(self, space: Space, q: Float32[ndarray, "dof"]) -> None:
+        self.collided |= not motions_free(space, np.stack([self.frames[-1], q]))[0]
         self.frames.append(q)
 
-    def try_to_arrive(self, space: kernel.Space) -> None:
+    def try_to_arrive(self, space: Space) -> None:
         """Go straight to the goal if that is free."""
-        if kernel.motions_free(space, np.stack([self.frames[-1], self.goal]))[0]:
+        if motions_free(space, np.stack([self.frames[-1], self.goal]))[0]:
             self.frames.append(self.goal)
             self.arrived = True
 

@@ -29,13 +29,16 @@ from numpy import ndarray
 from torch import Generator, Tensor
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.motion import finer, search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.networks.mpnet import MPNetNetwork
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import finer, random_state, search_space
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.types import PlanResult
@@ -169,7 +172,7 @@ class NeuralPlanning:
             paths = [self.contracted(self.search(paths[least]))]
             free = [self.segments_free(paths[0])]
         attempts = [Attempt(path, float((~f).sum())) for path, f in zip(paths, free, strict=True)]
-        return min(attempts, key=lambda a: (a.broken, float(kernel.path_length(a.path))))
+        return min(attempts, key=lambda a: (a.broken, float(path_length(a.path))))
 
     def reason(self, rounds: int) -> str:
         how = " and RRT-Connect" if self.searched else ""
@@ -247,10 +250,10 @@ class NeuralPlanning:
 
     def contracted(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
         """Lazy states contraction: without the states that free straight lines can skip."""
-        return kernel.shortcut(self.space, path, 0, self.state)
+        return shortcut(self.space, path, 0, self.state)
 
     def segments_free(self, path: Float[ndarray, "n dof"]) -> Bool[ndarray, "segments"]:
-        return kernel.motions_free(self.space, path)
+        return motions_free(self.space, path)
 
     def next_states(
         self, q: Float[ndarray, "n dof"], goal: Float[ndarray, "n dof"]

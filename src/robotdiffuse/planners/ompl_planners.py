@@ -29,11 +29,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels import lanes
+from robotdiffuse.collision.kernels.motions import Space, motions_free
+from robotdiffuse.collision.motion import finer, search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import finer, search_space
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, PlanResult
@@ -255,7 +255,7 @@ class _Watch:
 class _States(ob.StateValidityChecker):
     """Single states."""
 
-    def __init__(self, information: ob.SpaceInformation, space: kernel.Space, watch: _Watch) -> None:
+    def __init__(self, information: ob.SpaceInformation, space: Space, watch: _Watch) -> None:
         super().__init__(information)
         self._space, self._watch = space, watch
         self._joints = slice(0, len(space.lower))
@@ -273,7 +273,7 @@ class _States(ob.StateValidityChecker):
 class _Motions(ob.MotionValidator):
     """Straight motions: the end is checked and the way, not the start, which OMPL knows to be free."""
 
-    def __init__(self, information: ob.SpaceInformation, space: kernel.Space, watch: _Watch) -> None:
+    def __init__(self, information: ob.SpaceInformation, space: Space, watch: _Watch) -> None:
         super().__init__(information)
         self._space, self._watch = space, watch
         self._joints = slice(0, len(space.lower))
@@ -283,7 +283,7 @@ class _Motions(ob.MotionValidator):
         line = self._line
         try:
             line[0], line[1] = a[self._joints], b[self._joints]
-            return bool(kernel.motions_free(self._space, line)[0])
+            return bool(motions_free(self._space, line)[0])
         except BaseException as error:
             self._watch.caught(error)
             return False

@@ -14,19 +14,17 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, encode
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import (
-    RRTConnect,
-    RRTConnectSettings,
-    random_state,
-    search_space,
-)
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect, RRTConnectSettings
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, PlanResult
@@ -102,7 +100,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         start, goals = ends.rows()
         for goal in sorted(goals, key=lambda goal: float(np.linalg.norm(goal - start))):
             line = np.stack([start, goal])
-            if kernel.motions_free(space, line).all():
+            if motions_free(space, line).all():
                 result = call.finish(ends.complete(line), "straight_line")
                 if result is not None:
                     return result
@@ -143,15 +141,15 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         """Trajectories with the verdict of the compiled check."""
         space = search_space(checker, self.settings.resolution)
         q = np.ascontiguousarray(q, np.float32)
-        return Candidates(q, np.array([kernel.motions_free(space, path).all() for path in q]), stage)
+        return Candidates(q, np.array([motions_free(space, path).all() for path in q]), stage)
 
     def _best(self, call: Call, ends: Ends, candidates: Candidates, quick: Path | None) -> PlanResult | None:
         """The shortest that passes the judge of the free candidates, after shortcuts, and the quick path."""
         clearance = ends.kept_clearance(self.settings.search.clearance)
         space = search_space(ends.checker, self.settings.resolution, clearance)
         state = random_state(call.seed)
-        paths = sorted(candidates.q[candidates.free], key=kernel.path_length)[: self.settings.shortened]
-        short = [kernel.shortcut(space, path, self.settings.shortcuts, state) for path in paths]
+        paths = sorted(candidates.q[candidates.free], key=path_length)[: self.settings.shortened]
+        short = [shortcut(space, path, self.settings.shortcuts, state) for path in paths]
         names = call.problem.robot.joint_names
         found = [(Path(names, ends.complete(path)), candidates.stage) for path in short]
         if quick is not None:

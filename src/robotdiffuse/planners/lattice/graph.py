@@ -5,6 +5,8 @@ exact, heuristics are consistent to the last bit, and both searches find the sam
 
 An edge is free if both of its nodes are and the motion from the first to the second, in the order of the
 moves, is: so it is the same edge from either side.
+
+`space` is a `collision.kernels.motions.Space`.
 """
 
 from typing import NamedTuple
@@ -14,8 +16,8 @@ from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lanes import W, block_hits, make_workspace
+from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.planners.lattice.table import BLOCKED, FREE, NO_ROOM, UNKNOWN, find_or_add
-from robotdiffuse.planners.rrt_connect.kernel import motion_free
 
 UNITS = 1 << 20
 """Cost of one step of one joint."""

@@ -2,6 +2,8 @@
 
 A*: P. Hart, N. Nilsson and B. Raphael, "A formal basis for the heuristic determination of minimum cost
 paths", IEEE Trans. SSC 1968. D* Lite: S. Koenig and M. Likhachev, "D* Lite", AAAI 2002, optimized version.
+
+`space` is a `collision.kernels.motions.Space`.
 """
 
 import numpy as np

@@ -30,6 +30,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.motion import FINEST, finer, levers, search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import usable_ends
@@ -37,7 +38,6 @@ from robotdiffuse.planners.lattice import graph as lattice_graph
 from robotdiffuse.planners.lattice import kernel
 from robotdiffuse.planners.lattice import table as table
 from robotdiffuse.planners.lattice.graph import UNITS, Lattice
-from robotdiffuse.planners.rrt_connect.planner import FINEST, finer, levers, search_space
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

@@ -6,19 +6,18 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import path_length
+from robotdiffuse.collision.motion import finer, search_space
 from robotdiffuse.errors import InputError
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
 from robotdiffuse.planners.rrt_connect import kernel
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.reach import motion_radii
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, PlanResult
 from robotdiffuse.verify import VerifySettings, verifier
 
-FINEST = 0.002
-"""Least distance between two checks of a motion that is searched with [m]."""
 ITERATIONS = 2_000
 """Iterations between two looks at the clock."""
 
@@ -48,44 +47,6 @@ class RRTConnectSettings:
         for name in ("clearance", "shortcuts", "optimize_time"):
             if getattr(self, name) < 0:
                 raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must not be negative")
-
-
-def search_space(
-    checker: CollisionChecker,
-    resolution: float,
-    padding: float = 0.0,
-    near_ends: Float[ndarray, "m columns"] | None = None,
-) -> kernel.Space:
-    """What the compiled search needs; `resolution`, `padding` [m] and `near_ends` as in its docstring."""
-    robot = checker.robot
-    ends = np.zeros((0, robot.dof + 1)) if near_ends is None else near_ends.copy()
-    ends[:, -1] += checker.padding
-    return kernel.Space(
-        checker.robot_arrays,
-        checker.scene_arrays,
-        robot.lower.astype(np.float32),
-        robot.upper.astype(np.float32),
-        levers(robot),
-        np.float32(resolution),
-        checker.padding + np.float32(padding),
-        ends.astype(np.float32),
-    )
-
-
-def finer(resolution: float) -> float:
-    """For after a path that the judge refused: it found contact between two checks, so look twice as closely
-    [m]."""
-    return max(resolution / 2, FINEST)
-
-
-def levers(robot: Robot) -> Float[ndarray, "dof"]:
-    """Largest distance of any point of the arm from each joint's axis [m]."""
-    return motion_radii(robot).max(axis=0, initial=0.0).astype(np.float32)
-
-
-def random_state(seed: int, attempt: int = 0) -> ndarray:
-    """State of the compiled random numbers, well mixed."""
-    return np.random.SeedSequence([seed, attempt]).generate_state(1, np.uint64) | np.uint64(1)
 
 
 class RRTConnect:
@@ -147,9 +108,9 @@ class _Search:
         while self.call.elapsed < until:
             other = self.shortened(until)
             if other is not None:
-                if kernel.path_length(other) < kernel.path_length(best):
+                if path_length(other) < path_length(best):
                     best = other
-                best = kernel.shortcut(self.space, best, self.settings.shortcuts, self.state)
+                best = shortcut(self.space, best, self.settings.shortcuts, self.state)
         return best
 
     def shortened(self, until: float) -> Float[ndarray, "n dof"] | None:
@@ -159,11 +120,9 @@ class _Search:
             path = self._path(until)
             if path is None:
                 break
-            if best is None or kernel.path_length(path) < kernel.path_length(best):
+            if best is None or path_length(path) < path_length(best):
                 best = path
-        return (
-            None if best is None else kernel.shortcut(self.space, best, self.settings.shortcuts, self.state)
-        )
+        return None if best is None else shortcut(self.space, best, self.settings.shortcuts, self.state)
 
     def _path(self, until: float) -> Float[ndarray, "n dof"] | None:
         reach, capacity = np.float32(self.settings.reach), self.settings.capacity + len(self.goals)

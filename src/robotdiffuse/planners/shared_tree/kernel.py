@@ -1,13 +1,16 @@
-"""The compiled part of Shared-Tree Informed RRT*: one tree from the start, searched towards many goals."""
+"""The compiled part of Shared-Tree Informed RRT*: one tree from the start, searched towards many goals.
+
+`space` is a `collision.kernels.motions.Space`.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.compiled import allocation_free, random
 from robotdiffuse.collision.kernels.lanes import W, make_workspace
-from robotdiffuse.planners.rrt_connect.kernel import distance, motion_free, path_length, random
+from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
 from robotdiffuse.planners.shared_tree import kd_tree
 
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)

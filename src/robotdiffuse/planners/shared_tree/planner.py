@@ -29,11 +29,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.motion import finer, search_space
 from robotdiffuse.errors import InputError
+from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.base import Call
 from robotdiffuse.planners.ends import usable_ends
 from robotdiffuse.planners.rrt_connect import kernel as connect
-from robotdiffuse.planners.rrt_connect.planner import finer, random_state, search_space
 from robotdiffuse.planners.shared_tree import kernel
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.types import PlanResult
@@ -191,7 +194,7 @@ class SharedTreeSearch:
         self._space = search_space(self.checker, self.settings.resolution, self.safety_distance, near_ends)
         for g, goal in enumerate(self.goals):
             line = np.stack([self.start, goal])
-            if connect.motions_free(self._space, line)[0]:
+            if motions_free(self._space, line)[0]:
                 kernel.graft(self._tree, line, g)
 
     def _connect(self, targets: ndarray) -> None:
@@ -214,7 +217,7 @@ class SharedTreeSearch:
                 return
 
     def _graft(self, path: Float[ndarray, "n dof"], g: int) -> None:
-        shorter = connect.shortcut(self._space, path, self.settings.shortcuts, self.state)
+        shorter = shortcut(self._space, path, self.settings.shortcuts, self.state)
         self._make_room(len(shorter))
         kernel.graft(self._tree, shorter, g)
 

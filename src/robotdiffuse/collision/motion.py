@@ -1,10 +1,11 @@
-"""Collision of a whole motion: a certificate of freedom between the waypoints, or the first contact.
+"""Collision of motions: the space that searches check them in, and the judge's certificate.
 
-While the joints move by dq, no point of link l moves further than sum_j rho[l, j] |dq_j| (`motion_radii`).
-So a piece of the motion is free for link l if its clearance at some configuration exceeds that bound from
-there to both ends; otherwise the piece is split. Of two links, the further one is seen from the nearer one,
-so only the joints between them count. Clearances come from the covering spheres, many configurations at once,
-and from the exact meshes where the spheres are too coarse.
+The certificate says that a motion is free between its waypoints too, or where it first is not. While the
+joints move by dq, no point of link l moves further than sum_j rho[l, j] |dq_j| (`motion_radii`). So a piece
+of the motion is free for link l if its clearance at some configuration exceeds that bound from there to both
+ends; otherwise the piece is split. Of two links, the further one is seen from the nearer one, so only the
+joints between them count. Clearances come from the covering spheres, many configurations at once, and from
+the exact meshes where the spheres are too coarse.
 """
 
 from dataclasses import dataclass, replace
@@ -16,10 +17,13 @@ from numpy import ndarray
 
 from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.exact import Check, ExactCollision
+from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.robots.reach import motion_radii
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
+FINEST = 0.002
+"""Least distance between two checks of a motion that is searched with [m]."""
 CAP = 1.0
 """Clearances are not looked for beyond this [m]."""
 FLOAT32_SLACK = 1e-5
@@ -35,6 +39,39 @@ FIRST_CONTACT_TRAVEL = 1e-3
 """The first contact is located to within this motion bound [m]."""
 EPISODE_TRAVEL, EPISODE_SAMPLES = 0.01, 64
 """Step [m] and number of the configurations at which the depth of a contact is looked for."""
+
+
+def search_space(
+    checker: CollisionChecker,
+    resolution: float,
+    padding: float = 0.0,
+    near_ends: Float[ndarray, "m columns"] | None = None,
+) -> Space:
+    """What the compiled search needs; `resolution`, `padding` [m] and `near_ends` as in its docstring."""
+    robot = checker.robot
+    ends = np.zeros((0, robot.dof + 1)) if near_ends is None else near_ends.copy()
+    ends[:, -1] += checker.padding
+    return Space(
+        checker.robot_arrays,
+        checker.scene_arrays,
+        robot.lower.astype(np.float32),
+        robot.upper.astype(np.float32),
+        levers(robot),
+        np.float32(resolution),
+        checker.padding + np.float32(padding),
+        ends.astype(np.float32),
+    )
+
+
+def finer(resolution: float) -> float:
+    """For after a path that the judge refused: it found contact between two checks, so look twice as closely
+    [m]."""
+    return max(resolution / 2, FINEST)
+
+
+def levers(robot: Robot) -> Float[ndarray, "dof"]:
+    """Largest distance of any point of the arm from each joint's axis [m]."""
+    return motion_radii(robot).max(axis=0, initial=0.0).astype(np.float32)
 
 
 class Contact(NamedTuple):
@@ -96,7 +133,7 @@ class ContinuousCollision:
         shared = [(i, column.get(frozenset(check), -1)) for i, check in enumerate(self.exact.checks)]
         ours = np.array([pair for pair in shared if pair[1] >= 0], dtype=np.int64).reshape(-1, 2)
         self._ours, self._theirs = ours[:, 0], ours[:, 1]
-        self._levers = _levers(robot, self.exact.checks)
+        self._levers = _check_levers(robot, self.exact.checks)
 
     def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
         """Judge the motion along straight joint-space lines through the waypoints (at least one)."""
@@ -213,7 +250,7 @@ def _interpolated(rows: Float[ndarray, "n k"], at: Float[ndarray, "m"]) -> Float
     return rows[low] + (at - low)[:, None] * (rows[high] - rows[low])
 
 
-def _levers(robot: Robot, checks: tuple[Check, ...]) -> Float[ndarray, "dof checks"]:
+def _check_levers(robot: Robot, checks: tuple[Check, ...]) -> Float[ndarray, "dof checks"]:
     """Motion bound of each check's link, seen from what it is checked against, per unit of joint motion."""
     covered = _covered(robot)
     links = [link for link in covered.link_names if link in covered.spheres]

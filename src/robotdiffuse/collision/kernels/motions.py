@@ -1,0 +1,121 @@
+"""Straight motions in joint space, checked by the compiled kernel at places close enough to each other."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.lanes import W, block_hits, make_workspace
+
+_ZERO, _ONE = np.float32(0.0), np.float32(1.0)
+RELAXATION_SLOPE = np.float32(0.1)
+"""How the padding grows with the distance from an end that is closer to the scene [m/rad]."""
+RELAXATION_STEP = np.float32(0.1)
+"""Near such an end the padding changes in steps of this length [rad]."""
+
+
+class Space(NamedTuple):
+    """What a search needs to know about the robot and the scene."""
+
+    robot: tuple
+    """RobotArrays"""
+    scene: tuple
+    """SceneArrays"""
+    lower: np.ndarray
+    upper: np.ndarray
+    levers: np.ndarray
+    """[dof] largest distance of any point of the arm from each joint's axis [m], 1 for prismatic joints."""
+    resolution: np.float32
+    """No point of the arm moves further than this between two checks [m]."""
+    padding: np.float32
+    """Added to the radii of the spheres towards the scene [m]."""
+    near_ends: np.ndarray
+    """[m, dof + 1] ends that are closer to the scene than `padding`, and the padding that they allow [m]."""
+
+
+@allocation_free(fastmath=True)
+def distance(a, b):
+    total = np.float32(0.0)
+    for j in range(len(a)):
+        total += (a[j] - b[j]) * (a[j] - b[j])
+    return np.sqrt(total)
+
+
+@njit(cache=True)
+def path_length(path):
+    """Sum of the lengths of the segments [rad]."""
+    total = np.float32(0.0)
+    for i in range(len(path) - 1):
+        total += distance(path[i], path[i + 1])
+    return total
+
+
+@allocation_free()
+def motion_free(space, a, b, block, work):
+    """Whether the straight motion from a to b is free; b is checked, a is not.
+
+    Each block of 16 takes configurations spread over the whole motion, so that a collision anywhere tends to
+    show in the first block (the rake of W. Thomason et al., "Motions in Microseconds", ICRA 2024).
+    """
+    if len(space.near_ends) == 0:
+        return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, block, work)
+    length = distance(a, b)
+    pieces = max(int(np.ceil(length / RELAXATION_STEP)), 1)
+    half = np.float32(0.5) * length / np.float32(pieces)
+    first, first_padding = 0, padding_near(space, a, b, np.float32(0.5) / np.float32(pieces), half)
+    for k in range(1, pieces + 1):
+        padding = np.float32(-1.0)
+        if k < pieces:
+            padding = padding_near(space, a, b, (np.float32(k) + np.float32(0.5)) / np.float32(pieces), half)
+        if padding != first_padding:
+            s, t = np.float32(first) / np.float32(pieces), np.float32(k) / np.float32(pieces)
+            if not _stretch_free(space, a, b, s, t, first_padding, block, work):
+                return False
+            first, first_padding = k, padding
+    return True
+
+
+@allocation_free()
+def padding_near(space, a, b, share, around):
+    """The padding asked for within `around` [rad] of the place at a share of the way from a to b: near an end
+    that is closer to the scene, what that end allows and RELAXATION_SLOPE more for each radian from it."""
+    padding, dof = space.padding, len(a)
+    for m in range(len(space.near_ends)):
+        total = np.float32(0.0)
+        for j in range(dof):
+            d = a[j] + share * (b[j] - a[j]) - space.near_ends[m, j]
+            total += d * d
+        padding = min(
+            padding, space.near_ends[m, dof] + RELAXATION_SLOPE * max(np.sqrt(total) - around, _ZERO)
+        )
+    return padding
+
+
+@allocation_free()
+def _stretch_free(space, a, b, s, t, padding, block, work):
+    """Whether the part of the motion after the share s and up to the share t is free."""
+    dof = len(a)
+    travel = np.float32(0.0)
+    for j in range(dof):
+        travel += (t - s) * abs(b[j] - a[j]) * space.levers[j]
+    blocks = max(int(np.ceil(travel / space.resolution / np.float32(W))), 1)
+    step = (t - s) / np.float32(blocks * W)
+    for k in range(blocks):
+        for j in range(dof):
+            origin, delta = a[j] + s * (b[j] - a[j]), b[j] - a[j]
+            for i in range(W):
+                block[j, i] = origin + np.float32(i * blocks + (blocks - k)) * step * delta
+        if block_hits(space.robot, space.scene, block, padding, True, work):
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True)
+def motions_free(space, path):
+    """Whether each straight motion between the rows of path[n, dof] is free; ends are checked, not starts."""
+    work, block = make_workspace(space.robot, space.scene), np.empty((path.shape[1], W), np.float32)
+    out = np.empty(len(path) - 1, np.bool_)
+    for i in range(len(path) - 1):
+        out[i] = motion_free(space, path[i], path[i + 1], block, work)
+    return out
