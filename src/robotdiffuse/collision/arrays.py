@@ -14,7 +14,7 @@ from robotdiffuse.collision.points import EMPTY, build_grid, cover, thin
 from robotdiffuse.robots.reach import motion_radii
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere, pose
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated, pose
 
 ROUNDING = 4e-7
 """Obstacles grow by this share of their coordinates: more than float32 rounds off."""
@@ -148,8 +148,8 @@ def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> S
                 capsules.append(_oriented(shape, half, (2,), reach)[[*range(13), 14, 11]])
             case PointCloud():
                 points.append(thin(shape.points, shape.point_radius, reach))
-            case Mesh():
-                points.append(cover(shape.world_vertices[shape.faces], reach))
+            case Triangulated():
+                points.append(cover(shape.mesh.world_vertices[shape.mesh.faces], reach))
     cloud = np.concatenate(points) if points else EMPTY
     return SceneArrays(
         np.array(spheres, np.float32).reshape(-1, 4),

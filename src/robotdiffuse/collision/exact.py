@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, pose
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
 from robotdiffuse.transforms import transform
 
 CHUNK = 8192
@@ -156,8 +156,8 @@ def _obstacle(shape: Shape) -> _Obstacle | None:
         case Capsule():
             T, half, rounding = pose(shape), np.array([0.0, 0.0, shape.height / 2]), shape.radius
             geometry = coal.Capsule(shape.radius, shape.height)
-        case Mesh():
-            return _bounded(shape, shape.world_vertices, shape.faces, 0.0)
+        case Triangulated():
+            return _bounded(shape, shape.mesh.world_vertices, shape.mesh.faces, 0.0)
         case PointCloud():
             if len(shape.points) == 0:
                 return None

@@ -15,7 +15,7 @@ from numpy.random import Generator
 from robotdiffuse.errors import InputError
 from robotdiffuse.scenes.packed import BOX, SPHERE
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, Triangulated
 from robotdiffuse.transforms import rotation_from_quaternion
 
 ROUNDS = 6
@@ -83,13 +83,14 @@ def _capsule(shape: Capsule, n: int, rng: Generator) -> ndarray:
     return local @ shape.rotation.T + shape.center
 
 
-def _mesh(shape: Mesh, n: int, rng: Generator) -> ndarray:
-    edges = np.cumsum(shape.face_areas)
+def _triangles(shape: Triangulated, n: int, rng: Generator) -> ndarray:
+    mesh = shape.mesh
+    edges = np.cumsum(mesh.face_areas)
     face = np.searchsorted(edges[:-1], rng.random(n) * edges[-1], side="right")
     u, v = rng.random((2, n, 1))
     outside = u + v > 1
     u, v = np.where(outside, 1 - u, u), np.where(outside, 1 - v, v)
-    a, b, c = np.moveaxis(shape.world_vertices[shape.faces[face]], 1, 0)
+    a, b, c = np.moveaxis(mesh.world_vertices[mesh.faces[face]], 1, 0)
     return a + u * (b - a) + v * (c - a)
 
 
@@ -102,10 +103,10 @@ SAMPLERS: dict[type[Shape], Callable[..., ndarray]] = {
     Box: _box,
     Cylinder: _cylinder,
     Capsule: _capsule,
-    Mesh: _mesh,
+    Mesh: _triangles,
     PointCloud: _point_cloud,
 }
-"""By shape: n points, uniform by area, in the base frame."""
+"""By shape: n points, uniform by area, in the base frame; of a shape that is not here, on its triangles."""
 
 
 def sample_surface(
@@ -125,7 +126,8 @@ def sample_surface(
     missing, draw = count, 2 * count
     for _ in range(ROUNDS):
         parts = rng.multinomial(draw, shares)
-        drawn = [SAMPLERS[type(s)](s, int(n), rng) for s, n in zip(shapes, parts, strict=True) if n > 0]
+        samplers = [SAMPLERS.get(type(shape), _triangles) for shape in shapes]
+        drawn = [f(s, int(n), rng) for f, s, n in zip(samplers, shapes, parts, strict=True) if n > 0]
         points = np.concatenate(drawn)
         points = points[region.holds(points)]
         # The points come shape by shape; any first few of them would be of the first shape alone.

@@ -4,6 +4,7 @@ The constructors check their arguments and say what is wrong, so run-time type c
 are kept off these classes by `no_type_check`.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, no_type_check
@@ -64,7 +65,7 @@ def _form(array: ndarray | None) -> str:
     return "not numbers" if array is None else f"an array of {' x '.join(map(str, array.shape))}"
 
 
-class Shape:
+class Shape(ABC):
     """Base of all obstacles. `kind` is its name in problem files.
 
     The constructors take anything that NumPy reads as numbers and raise InputError for the rest.
@@ -74,14 +75,31 @@ class Shape:
     name: str
 
     @property
+    @abstractmethod
     def area(self) -> float:
         """Surface [m^2]."""
-        raise NotImplementedError
+
+    @property
+    @abstractmethod
+    def bounds(self) -> Float[ndarray, "2 3"]:
+        """Least and greatest corner of an axis-aligned box that holds the shape [m]."""
+
+
+class Triangulated(Shape):
+    """A shape that is planned around, judged, sampled and drawn as its triangles: a mesh, or a new shape."""
+
+    @property
+    @abstractmethod
+    def mesh(self) -> "Mesh":
+        """Around the shape, in the base frame."""
+
+    @property
+    def area(self) -> float:
+        return self.mesh.area
 
     @property
     def bounds(self) -> Float[ndarray, "2 3"]:
-        """Least and greatest corner of an axis-aligned box that holds the shape [m]."""
-        raise NotImplementedError
+        return self.mesh.bounds
 
 
 def _set(shape: Shape, **values: object) -> None:
@@ -240,7 +258,7 @@ class Capsule(_Axial):
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Mesh(Shape):
+class Mesh(Triangulated):
     """A triangle mesh; for collision, its surface."""
 
     vertices: Float[ndarray, "v 3"]
@@ -288,6 +306,10 @@ class Mesh(Shape):
             file: str | None = None,
             name: str = "mesh",
         ) -> None: ...
+
+    @property
+    def mesh(self) -> "Mesh":
+        return self
 
     @cached_property
     def world_vertices(self) -> Float[ndarray, "v 3"]:

@@ -10,7 +10,16 @@ from numpy import ndarray
 
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import (
+    IDENTITY,
+    Box,
+    Capsule,
+    Cylinder,
+    PointCloud,
+    Shape,
+    Sphere,
+    Triangulated,
+)
 from robotdiffuse.simulation.model import write_obj, write_points_urdf, write_shaded, write_urdf
 
 MARGIN = 0.001
@@ -141,12 +150,12 @@ class World:
     def _add(self, shape: Shape, color: tuple[int, int, int]) -> int:
         if isinstance(shape, PointCloud):
             return self._add_points(shape, color)
-        if isinstance(shape, Mesh):
+        if isinstance(shape, Triangulated):
             file = Path(self._folder.name) / "obstacle.obj"
-            write_obj(file, shape.vertices, shape.faces)
+            write_obj(file, shape.mesh.vertices, shape.mesh.faces)
             flags = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
             what = {"shapeType": pybullet.GEOM_MESH, "fileName": str(file), "flags": flags}
-            xyz, wxyz = shape.xyz, shape.wxyz
+            xyz, wxyz = shape.mesh.xyz, shape.mesh.wxyz
         elif isinstance(shape, Sphere):
             what = {"shapeType": pybullet.GEOM_SPHERE, "radius": shape.radius}
             xyz, wxyz = shape.center, IDENTITY
@@ -220,6 +229,6 @@ def _surface(shape: Shape) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
             solid = trimesh.creation.capsule(shape.height, shape.radius, count=(64, 64))
             solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
         case _:
-            assert isinstance(shape, Mesh)
-            return shape.vertices, shape.faces
+            assert isinstance(shape, Triangulated)
+            return shape.mesh.vertices, shape.mesh.faces
     return np.array(solid.vertices, np.float64), np.array(solid.faces, np.int64)

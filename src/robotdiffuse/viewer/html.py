@@ -17,7 +17,7 @@ from robotdiffuse.files import write_atomically
 from robotdiffuse.paths.export import check_output
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
+from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
 from robotdiffuse.types import Path, PlanResult, Trajectory
 from robotdiffuse.viewer import look
 from robotdiffuse.viewer.camera import VERTICAL_FIELD, best_view
@@ -164,8 +164,9 @@ def _shape(shape: Shape, color: tuple[int, int, int]) -> dict[str, Any]:
     if isinstance(shape, PointCloud):
         low, step, points = _quantised(look.thinned(shape.points))
         return record | {"radius": shape.point_radius, "low": low, "step": step, "points": points}
-    if isinstance(shape, Mesh):
-        return record | {"surface": _packed(look.shape_surface(shape, color), colored=False)}
+    if isinstance(shape, Triangulated):
+        surface = _packed(look.shape_surface(shape, color), colored=False)
+        return record | {"kind": "mesh", "surface": surface}
     for name in ("center", "size", "wxyz"):
         if hasattr(shape, name):
             record[name] = _rounded(getattr(shape, name), 6)

@@ -12,7 +12,7 @@ from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual import load_visual
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, pose
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
 from robotdiffuse.types import Path, PlanResult, Trajectory
 
 START, GOAL = (0x4F, 0x7F, 0xD9), (0x10, 0xA3, 0x7F)
@@ -149,8 +149,8 @@ def _extent(shape: Shape) -> float:
         return float(shape.size.max())
     if isinstance(shape, Cylinder | Capsule):
         return max(shape.height, 2 * shape.radius)
-    if isinstance(shape, Mesh):
-        return float(np.ptp(shape.vertices, axis=0).max())
+    if isinstance(shape, Triangulated):
+        return float(np.ptp(shape.mesh.vertices, axis=0).max())
     return 0.0
 
 
@@ -174,8 +174,8 @@ def shape_surface(shape: Shape, color: tuple[int, int, int]) -> Surface:
     elif isinstance(shape, PointCloud):
         return _point_surface(shape, color)
     else:
-        assert isinstance(shape, Mesh)
-        vertices, faces = decimated(shape.world_vertices, shape.faces)
+        assert isinstance(shape, Triangulated)
+        vertices, faces = decimated(shape.mesh.world_vertices, shape.mesh.faces)
         return creased(vertices, faces, np.tile(np.array(color) / 255.0, (len(faces), 1)))
     colors = np.tile(np.array(color) / 255.0, (len(solid.faces), 1))
     return creased(np.asarray(solid.vertices, np.float64), np.asarray(solid.faces, np.int64), colors).moved(T)
