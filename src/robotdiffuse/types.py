@@ -14,6 +14,8 @@ class Status(Enum):
     SOLVED = "solved"
     TIMEOUT = "timeout"
     """No path was found within the time limit."""
+    NO_PATH = "no_path"
+    """The search ended before that without a path."""
     INVALID_START = "invalid_start"
     """The start is out of limits or in collision."""
     INVALID_GOAL = "invalid_goal"

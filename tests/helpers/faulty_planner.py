@@ -15,7 +15,7 @@ from robotdiffuse.types import PlanResult
 SOLVES, RAISES, DIES, HANGS, TALKS = range(5)
 
 
-class Faulty:
+class Faulty(RRTConnect):
     name = "faulty"
 
     def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
@@ -28,7 +28,7 @@ class Faulty:
             time.sleep(1.0)
         if seed == TALKS:
             print("this is no answer", flush=True)
-        return RRTConnect().plan(problem, time_limit, seed)
+        return super().plan(problem, time_limit, seed)
 
 
 ENTRY = Entry("helpers.faulty_planner:Faulty", "for tests")

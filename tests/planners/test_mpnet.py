@@ -21,7 +21,7 @@ from robotdiffuse.learning.networks.mpnet import (
     squared_slope,
 )
 from robotdiffuse.learning.training.batches import TrajectoryData, resample_evenly
-from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_code
 from robotdiffuse.problems.problem import JointGoal, Problem

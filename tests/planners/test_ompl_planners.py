@@ -197,7 +197,7 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
         patched.setattr(planners, "motions_free", broken)
         patched.setattr(planners.lanes, "free_many", broken)
         # what surrounds the search asks the kernel as well
-        patched.setattr(planners, "usable_ends", FreeEnds)
+        patched.setattr("robotdiffuse.planners.base.usable_ends", FreeEnds)
         with pytest.raises(RuntimeError, match="broken kernel"):
             planner().plan(problem(RIGHT), time_limit=120.0)
     assert plan(planner, problem(RIGHT)).solved

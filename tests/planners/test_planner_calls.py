@@ -2,12 +2,13 @@
 
 import numpy as np
 
-from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.shared_tree.planner import SharedTreeRRTStar, SharedTreeSettings
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.types import Status
 
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 
@@ -49,11 +50,18 @@ def test_returned_path_keeps_the_time_at_which_it_was_found() -> None:
 
 def test_failure_tells_what_the_judge_refused() -> None:
     call = Call("test", blocked(), time_limit=10.0, seed=0)
-    assert call.timeout().refused == ""
+    assert call.unsolved().refused == ""
     assert call.finish(np.stack([START, turned(1.2)]), "test") is None
-    assert call.timeout().refused == "scene_collision"
+    assert call.unsolved().refused == "scene_collision"
     assert call.finish(np.stack([START, turned(0.1)]), "test") is None
-    assert call.timeout().refused == "goal"
+    assert call.unsolved().refused == "goal"
+
+
+def test_a_search_that_ended_is_told_from_one_that_ran_out_of_time() -> None:
+    ended = Call("test", blocked(), time_limit=10.0, seed=0).unsolved()
+    assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
+    late = Call("test", blocked(), time_limit=1e-9, seed=0).unsolved()
+    assert late.status is Status.TIMEOUT and "longer time limit" in late.reason
 
 
 def test_anytime_planner_reports_its_progress() -> None:

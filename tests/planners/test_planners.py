@@ -5,7 +5,7 @@ import pytest
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.trials import problem_number
-from robotdiffuse.planners import PLANNERS, load_planner
+from robotdiffuse.planners import PLANNERS, SEARCH, load_planner
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
@@ -69,6 +69,6 @@ def test_time_limit_and_seed_are_checked(name: str) -> None:
 
 
 def test_weights_are_for_learned_planners_alone(name: str) -> None:
-    learned = bool(PLANNERS[name].settings)
+    learned = PLANNERS[name].kind != SEARCH
     with pytest.raises(InputError, match="nowhere" if learned else "has no weights"):
         load_planner(name, weights="nowhere").plan(Problem(load_robot("panda"), Scene([]), START, GOAL))

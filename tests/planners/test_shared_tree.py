@@ -229,7 +229,7 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
 def test_solved_means_verified(family, index) -> None:
     problem = sample_problem(PANDA, family, np.random.default_rng([21, index]))
     result = SharedTreeRRTStar().plan(problem, time_limit=5.0)
-    assert result.status in (Status.SOLVED, Status.TIMEOUT)
+    assert result.status in (Status.SOLVED, Status.NO_PATH)
     if result.solved:
         assert result.path is not None and verify(problem, result.path).valid
         assert np.array_equal(result.path.positions[0], problem.start)

@@ -319,7 +319,7 @@ def test_solved_means_verified(planner: MPD | EDMP) -> None:
 
 def test_failure_says_what_was_wrong(planner: MPD | EDMP, monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples that all go through the ball."""
-    drawn = lines(planner.samples)
+    drawn = lines(planner.settings.samples)
     monkeypatch.setattr(planner, "draw", lambda *_arguments: drawn)
     planner.plan(PROBLEM, time_limit=0.1)  # compiles and loads
     result = planner.plan(PROBLEM, time_limit=2.0)

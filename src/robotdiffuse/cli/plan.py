@@ -64,11 +64,11 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
 
 def run_plan(arguments: argparse.Namespace) -> int:
     from robotdiffuse.paths.export import check_output, save_result
-    from robotdiffuse.planners import DEFAULT_PLANNER, check_planner
+    from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
     from robotdiffuse.problems.files import load_problem, problem_record
 
     name = arguments.planner or DEFAULT_PLANNER
-    check_planner(name)
+    PLANNERS.entry(name)
     outputs = [check_output(file, (".json", ".csv", *ENDINGS)) for file in arguments.out]
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))

@@ -1,10 +1,12 @@
 """The planners by name. A new planner is one file and one line in PLANNERS."""
 
+from collections.abc import Iterable
 from functools import cache
-from importlib import import_module
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.errors import InputError
+from robotdiffuse.registry import Entry, Registry
+from robotdiffuse.settings import Settings
 
 if TYPE_CHECKING:
     from robotdiffuse.planners.base import Planner
@@ -12,78 +14,83 @@ if TYPE_CHECKING:
     from robotdiffuse.types import PlanResult
 
 
-class Entry(NamedTuple):
-    location: str
-    """module:class, imported when the planner is loaded."""
-    description: str
-    settings: str = ""
-    """Of a learned planner, the class of its settings, which name the folder of its weights."""
+SEARCH, LEARNED, HYBRID = "search", "learned", "hybrid"
+"""Kinds of planners: without a network; a network's motions alone, with guidance or without; both."""
 
 
-_ROOM = "robotdiffuse.planners."
-PLANNERS = {
-    "robotdiffuse": Entry(
-        _ROOM + "robotdiffuse:RobotDiffuse",
-        "hybrid of the diffusion model under guidance, refinement and search (the default)",
-        "RobotDiffuseSettings",
-    ),
-    "diffusion": Entry(
-        _ROOM + "diffusion:Diffusion",
-        "the paper's method alone: encoder, sampling, guidance; no search, nothing shortened",
-        "DiffusionSettings",
-    ),
-    "rrt_connect": Entry(
-        _ROOM + "rrt_connect.planner:RRTConnect",
-        "two trees grown towards each other, then shortcuts",
-    ),
-    "shared_tree_rrt_star": Entry(
-        _ROOM + "shared_tree.planner:SharedTreeRRTStar",
-        "the paper's planner for data: one tree, all goals, near-optimal, 5 cm away from obstacles",
-    ),
-    "mpnet": Entry(
-        _ROOM + "mpnet:MPNet",
-        "MPNet: a network with dropout proposes waypoints from both ends",
-        "MPNetPlannerSettings",
-    ),
-    "mpinets": Entry(
-        _ROOM + "mpinets:MPiNets",
-        "MPiNets: a policy on points of scene, arm and target is rolled out",
-        "MPiNetsSettings",
-    ),
-    "mpd": Entry(
-        _ROOM + "mpd:MPD",
-        "MPD: an unconditional diffusion prior, guided by costs while it samples",
-        "MPDSettings",
-    ),
-    "edmp": Entry(
-        _ROOM + "edmp:EDMP",
-        "EDMP: such a prior, guided by an ensemble of costs",
-        "EDMPSettings",
-    ),
-    "a_star": Entry(_ROOM + "lattice.planner:AStar", "A* on a lattice of joint values"),
-    "d_star_lite": Entry(
-        _ROOM + "lattice.planner:DStarLite",
-        "D* Lite on a lattice of joint values; mends its search when the scene changes",
-    ),
-    "ompl_rrt": Entry(_ROOM + "ompl_planners:OmplRRT", "OMPL's RRT, then its path simplifier"),
-    "ompl_rrt_connect": Entry(
-        _ROOM + "ompl_planners:OmplRRTConnect", "OMPL's RRT-Connect, then its path simplifier"
-    ),
-    "ompl_prm": Entry(_ROOM + "ompl_planners:OmplPRM", "OMPL's PRM, then its path simplifier"),
-    "ompl_rrt_star": Entry(_ROOM + "ompl_planners:OmplRRTStar", "OMPL's RRT*, to the end of the time"),
-    "ompl_informed_rrt_star": Entry(
-        _ROOM + "ompl_planners:OmplInformedRRTStar", "OMPL's Informed RRT*, to the end of the time"
-    ),
-    "ompl_bit_star": Entry(_ROOM + "ompl_planners:OmplBITStar", "OMPL's BIT*, to the end of the time"),
-    "ompl_aorrtc": Entry(_ROOM + "ompl_planners:OmplAORRTC", "OMPL's AORRTC, to the end of the time"),
-}
+def _entry(location: str, settings: str, kind: str, description: str) -> Entry:
+    return Entry(f"robotdiffuse.planners.{location}", description, settings, kind)
+
+
+def _ompl(algorithm: str, description: str) -> Entry:
+    return _entry(f"ompl_planners:Ompl{algorithm}", "OmplSettings", SEARCH, f"OMPL's {description}")
+
+
+PLANNERS = Registry(
+    "planner",
+    {
+        "robotdiffuse": _entry(
+            "robotdiffuse:RobotDiffuse",
+            "RobotDiffuseSettings",
+            HYBRID,
+            "the diffusion model under guidance, refinement, and search around them (the default)",
+        ),
+        "diffusion": _entry(
+            "diffusion:Diffusion",
+            "DiffusionSettings",
+            LEARNED,
+            "the paper's method alone: encoder, sampling, guidance; no search, nothing shortened",
+        ),
+        "rrt_connect": _entry(
+            "rrt_connect.planner:RRTConnect",
+            "RRTConnectSettings",
+            SEARCH,
+            "two trees grown towards each other, then shortcuts",
+        ),
+        "shared_tree_rrt_star": _entry(
+            "shared_tree.planner:SharedTreeRRTStar",
+            "SharedTreeSettings",
+            SEARCH,
+            "the paper's planner for data: one tree, all goals, near-optimal, 5 cm away from obstacles",
+        ),
+        "mpnet": _entry(
+            "mpnet:MPNet",
+            "MPNetPlannerSettings",
+            LEARNED,
+            "MPNet: a network with dropout proposes waypoints from both ends",
+        ),
+        "mpinets": _entry(
+            "mpinets:MPiNets",
+            "MPiNetsSettings",
+            LEARNED,
+            "MPiNets: a policy on points of scene, arm and target is rolled out",
+        ),
+        "mpd": _entry(
+            "mpd:MPD",
+            "MPDSettings",
+            LEARNED,
+            "MPD: an unconditional diffusion prior, guided by costs while it samples",
+        ),
+        "edmp": _entry(
+            "edmp:EDMP", "EDMPSettings", LEARNED, "EDMP: such a prior, guided by an ensemble of costs"
+        ),
+        "a_star": _entry("lattice.planner:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"),
+        "d_star_lite": _entry(
+            "lattice.planner:DStarLite",
+            "DStarLiteSettings",
+            SEARCH,
+            "D* Lite on a lattice of joint values; mends its search when the scene changes",
+        ),
+        "ompl_rrt": _ompl("RRT", "RRT, then its path simplifier"),
+        "ompl_rrt_connect": _ompl("RRTConnect", "RRT-Connect, then its path simplifier"),
+        "ompl_prm": _ompl("PRM", "PRM, then its path simplifier"),
+        "ompl_rrt_star": _ompl("RRTStar", "RRT*, to the end of the time"),
+        "ompl_informed_rrt_star": _ompl("InformedRRTStar", "Informed RRT*, to the end of the time"),
+        "ompl_bit_star": _ompl("BITStar", "BIT*, to the end of the time"),
+        "ompl_aorrtc": _ompl("AORRTC", "AORRTC, to the end of the time"),
+    },
+)
 DEFAULT_PLANNER = "robotdiffuse"
-
-
-def check_planner(name: str) -> None:
-    """Raises InputError, listing the known planners, for an unknown name."""
-    if name not in PLANNERS:
-        raise unknown_name("planner", name, PLANNERS)
 
 
 def load_planner(name: str, settings: object | None = None, weights: str | None = None) -> "Planner":
@@ -95,19 +102,25 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
     Raises InputError for an unknown name, settings of another planner, weights that cannot be read or for a
     planner that has none.
     """
-    check_planner(name)
-    entry = PLANNERS[name]
-    location, _, planner = entry.location.partition(":")
-    module = import_module(location)
     if weights is not None:
         if settings is not None:
             raise InputError(f"planner {name} got settings and weights; name the weights in the settings")
-        if not entry.settings:
-            learned = ", ".join(other for other, its in PLANNERS.items() if its.settings)
+        if PLANNERS.entry(name).kind == SEARCH:
+            learned = ", ".join(other for other, its in PLANNERS.items() if its.kind != SEARCH)
             raise InputError(f"planner {name} has no weights; those that have: {learned}")
-        settings = getattr(module, entry.settings)(weights=weights)
-    cls = getattr(module, planner)
-    return cls() if settings is None else cls(settings)
+        settings = PLANNERS.settings(name)(weights=weights)  # type: ignore[misc]
+    return PLANNERS.make(name, settings)
+
+
+def planner_settings(name: str, assignments: Iterable[str]) -> Settings:
+    """The settings of a planner with some replaced: "reach=0.5", "guidance.margin=0.02".
+
+    Raises InputError for an unknown planner, a setting that it does not have and a value that it cannot be.
+    """
+    kind = PLANNERS.settings(name)
+    if kind is None:
+        raise InputError(f"planner {name} has no settings")
+    return kind().changed(assignments)
 
 
 @cache

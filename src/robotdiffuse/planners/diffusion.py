@@ -12,7 +12,7 @@ without guidance this is the network alone: `guidance_steps` 0.
 
 from dataclasses import dataclass, field
 from functools import cache
-from typing import ClassVar, Generic, TypeVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -25,11 +25,12 @@ from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.planners.base import Call
-from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.planners.base import Planner
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.settings import Settings
 from robotdiffuse.types import Path, PlanResult
 from robotdiffuse.verify import VerifySettings, verifier
 
@@ -38,7 +39,7 @@ SAMPLES_PER_GOAL = 4
 
 
 @dataclass(frozen=True)
-class SamplingSettings:
+class SamplingSettings(Settings):
     """How batches of trajectories are drawn from a trained model."""
 
     planner: ClassVar[str]
@@ -80,7 +81,7 @@ class SamplingSettings:
 
 
 @dataclass(frozen=True)
-class DiffusionSettings(SamplingSettings):
+class DiffusionSettings(SamplingSettings, name="diffusion"):
     planner: ClassVar[str] = "diffusion"
     optimize_time: float = 0.0
     """Time in which further batches are drawn after the first that has a valid sample [s]; the shortest of
@@ -92,7 +93,7 @@ class DiffusionSettings(SamplingSettings):
             raise InputError(f"diffusion.optimize_time is {self.optimize_time}; it must be at least 0")
 
 
-Settings = TypeVar("Settings", bound=SamplingSettings)
+Own = TypeVar("Own", bound=SamplingSettings)
 
 
 @cache
@@ -102,14 +103,12 @@ def bundled_model(robot_name: str) -> MotionModel | None:
     return load_model(folder) if folder.is_dir() else None
 
 
-class ModelSampler(Generic[Settings]):
+class ModelSampler(Planner[Own]):
     """What planners around the diffusion model share: to load it, and to draw batches by the settings."""
 
-    settings_class: type[Settings]
-
-    def __init__(self, settings: Settings | None = None) -> None:
+    def __init__(self, settings: Own | None = None) -> None:
         """Raises InputError if the weights that the settings name cannot be read."""
-        self.settings = self.settings_class() if settings is None else settings
+        super().__init__(settings)
         self._model = load_model(self.settings.weights) if self.settings.weights else None
 
     def model(self, robot: Robot) -> MotionModel | None:
@@ -182,20 +181,18 @@ class Diffusion(ModelSampler[DiffusionSettings]):
     name = "diffusion"
     settings_class = DiffusionSettings
 
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
-        """See `planners.base.Planner`. Raises InputError if there are no weights for the robot."""
-        model = self.model(problem.robot)
-        if model is None:
+    def prepare(self, robot: Robot) -> None:
+        """See `planners.base.Planner`."""
+        if self.model(robot) is None:
             raise InputError(
-                f"no weights of diffusion come with the package for {problem.robot.name}; train them: "
+                f"no weights of diffusion come with the package for {robot.name}; train them: "
                 "robotdiffuse train planner --data FOLDER --encoder FOLDER --out FOLDER"
             )
-        call = Call(self.name, problem, time_limit, seed)
-        rng = np.random.default_rng(seed)
-        ends = usable_ends(call, rng)
-        return ends if isinstance(ends, PlanResult) else self._batches(call, ends, model, rng)
 
-    def _batches(self, call: Call, ends: Ends, model: MotionModel, rng: np.random.Generator) -> PlanResult:
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planners.base.Planner`."""
+        model, rng = self.model(call.problem.robot), call.rng
+        assert model is not None  # by prepare
         start, goals = ends.rows()
         code = encode(model, ends.checker, self.settings.points, rng)
         judge, names = verifier(call.problem, VerifySettings()), call.problem.robot.joint_names
@@ -215,4 +212,4 @@ class Diffusion(ModelSampler[DiffusionSettings]):
             result = call.finish(path.positions, "network", f"solved by network: {reason}")
             if result is not None:
                 return result
-        return call.timeout(reason)
+        return call.unsolved(reason)

@@ -31,7 +31,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior, quadratic_levels
-from robotdiffuse.planners.guided_prior import GuidedPrior, collision_gradient, limited
+from robotdiffuse.planners.guided_prior import GuidedPrior, PriorSettings, collision_gradient, limited
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,7 @@ ENSEMBLE = tuple(
 
 
 @dataclass(frozen=True)
-class EDMPSettings:
-    weights: str | None = None
-    """Folder of a trained trajectory_prior; None: the one that comes with the package for the robot."""
+class EDMPSettings(PriorSettings, name="edmp"):
     samples: int = 24
     """Trajectories per batch, shared out evenly among the guides."""
     sampling_steps: int = 30
@@ -108,14 +106,11 @@ class EDMPSettings:
         return [slice(a, b) for a, b in pairwise(cuts)]
 
 
-class EDMP(GuidedPrior):
+class EDMP(GuidedPrior[EDMPSettings]):
     """The prior's samples under an ensemble of guides; see the head of this file."""
 
     name = "edmp"
-
-    def __init__(self, settings: EDMPSettings | None = None) -> None:
-        self.settings = settings or EDMPSettings()
-        super().__init__(self.settings.weights, self.settings.samples)
+    settings_class = EDMPSettings
 
     def draw(
         self,

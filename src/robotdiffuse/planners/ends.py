@@ -6,7 +6,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import explain_collision
-from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.call import Call
 from robotdiffuse.problems.problem import JointGoal, PoseGoal
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.types import PlanResult, Status
@@ -58,19 +58,19 @@ class Ends:
         return np.concatenate(rows)
 
 
-def usable_ends(call: Call, rng: np.random.Generator) -> Ends | PlanResult:
+def usable_ends(call: Call) -> Ends | PlanResult:
     """The ends that a search of this call can begin and end at, or the result that says why it cannot.
 
-    For a pose, up to GOAL_COUNT configurations by inverse kinematics from `rng`. Configurations that the
-    covering spheres call free come alone; where there are none, those that the exact meshes call free.
+    For a pose, up to GOAL_COUNT configurations by inverse kinematics. Configurations that the covering
+    spheres call free come alone; where there are none, those that the exact meshes call free.
     """
     checker = CollisionChecker(call.problem.robot, call.problem.scene)
-    goals = _usable_goals(call, checker, rng)
+    goals = _usable_goals(call, checker)
     if isinstance(goals, PlanResult):
         return goals
     ends = Ends(checker, call.problem.start, goals)
     if not ends.reachable:
-        return call.timeout("the start or every goal touches an obstacle too closely to plan from")
+        return call.unsolved("the start or every goal touches an obstacle too closely to plan from")
     return ends
 
 
@@ -92,9 +92,7 @@ def retreat(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> Float[ndarra
     return None
 
 
-def _usable_goals(
-    call: Call, checker: CollisionChecker, rng: np.random.Generator
-) -> Float[ndarray, "k dof"] | PlanResult:
+def _usable_goals(call: Call, checker: CollisionChecker) -> Float[ndarray, "k dof"] | PlanResult:
     robot, scene, start = call.problem.robot, call.problem.scene, call.problem.start
     if not checker.free(start[None])[0]:
         collision = explain_collision(robot, scene, start)
@@ -102,7 +100,7 @@ def _usable_goals(
             return call.fail(Status.INVALID_START, f"the start is in collision: {collision}")
     goal = call.problem.goal
     if isinstance(goal, PoseGoal):
-        return _pose_goals(call, goal, checker, rng)
+        return _pose_goals(call, goal, checker)
     return _free_goals(call, goal, checker)
 
 
@@ -121,9 +119,9 @@ def _free_goals(
 
 
 def _pose_goals(
-    call: Call, goal: PoseGoal, checker: CollisionChecker, rng: np.random.Generator
+    call: Call, goal: PoseGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    robot, scene = call.problem.robot, call.problem.scene
+    robot, scene, rng = call.problem.robot, call.problem.scene, call.rng
     found = inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=checker.free)
     if len(found):
         return found

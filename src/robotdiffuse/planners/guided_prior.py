@@ -1,8 +1,9 @@
 """What MPD and EDMP share: batches of guided samples of the trajectory prior, until one passes the judge."""
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -13,10 +14,11 @@ from robotdiffuse.collision.kernels.motions import Space, motions_free, path_len
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior
-from robotdiffuse.planners.base import Call
-from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.planners.base import Planner
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.settings import Settings
 from robotdiffuse.types import PlanResult
 
 RESOLUTION = 0.02
@@ -35,22 +37,28 @@ class Attempt(NamedTuple):
     path: Float[ndarray, "frames dof"]
 
 
-class GuidedPrior(ABC):
+@dataclass(frozen=True)
+class PriorSettings(Settings):
+    weights: str | None = None
+    """Folder of a trained trajectory_prior; None: the one that comes with the package for the robot."""
+    samples: int = 16
+    """Trajectories per batch."""
+
+
+Own = TypeVar("Own", bound=PriorSettings)
+
+
+class GuidedPrior(Planner[Own]):
     """A planner that samples batches from the prior under guidance.
 
     The free samples of a batch go to the judge, the shortest first; where none passes, the next batch is
     drawn from new noise, until time runs out. There is no search, and no sample is shortened or repaired.
     """
 
-    name: ClassVar[str]
-
-    def __init__(self, weights: str | None, samples: int) -> None:
-        """weights: folder of a trained prior, or None; samples: trajectories per batch.
-
-        Raises InputError if the folder holds no weights.
-        """
-        check_weights("trajectory_prior", weights)
-        self.weights, self.samples = weights, samples
+    def __init__(self, settings: Own | None = None) -> None:
+        """Raises InputError if the folder that the settings name holds no weights."""
+        super().__init__(settings)
+        check_weights("trajectory_prior", self.settings.weights)
 
     @abstractmethod
     def draw(
@@ -66,29 +74,23 @@ class GuidedPrior(ABC):
 
     def prior(self, robot: Robot) -> TrajectoryPrior:
         """The trained network. Raises InputError if there is none for the robot."""
-        prior = load_baseline("trajectory_prior", self.weights, robot)
+        prior = load_baseline("trajectory_prior", self.settings.weights, robot)
         assert isinstance(prior, TrajectoryPrior)
         return prior.for_inference()
 
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
-        """See `planners.base.Planner`. Raises InputError if there are no weights for the robot."""
-        prior = self.prior(problem.robot)
-        call = Call(self.name, problem, time_limit, seed)
-        rng = np.random.default_rng(seed)
-        ends = usable_ends(call, rng)
-        if isinstance(ends, PlanResult):
-            return ends
-        return self._batches(call, ends, prior, rng)
+    def prepare(self, robot: Robot) -> None:
+        """See `planners.base.Planner`."""
+        self.prior(robot)
 
-    def _batches(
-        self, call: Call, ends: Ends, prior: TrajectoryPrior, rng: np.random.Generator
-    ) -> PlanResult:
-        start, goals = shared_out(*ends.rows(), self.samples)
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planners.base.Planner`."""
+        prior, samples = self.prior(call.problem.robot), self.settings.samples
+        start, goals = shared_out(*ends.rows(), samples)
         space = search_space(ends.checker, RESOLUTION)
         closest: Attempt | None = None
         batches = 0
         while call.remaining > 0:
-            drawn = self.draw(prior, ends.checker, start, goals, rng, lambda: call.remaining <= 0)
+            drawn = self.draw(prior, ends.checker, start, goals, call.rng, lambda: call.remaining <= 0)
             if drawn is None:
                 break
             batches += 1
@@ -106,10 +108,10 @@ class GuidedPrior(ABC):
             result = call.finish(ends.complete(closest.path), self.name)
             if result is not None:
                 return result
-        return call.timeout(
-            f"none of {batches * self.samples} samples of the network is free of collision"
+        return call.unsolved(
+            f"none of {batches * samples} samples of the network is free of collision"
             if batches
-            else f"time ran out before the first {self.samples} samples were done; it takes a longer limit"
+            else f"time ran out before the first {samples} samples were done; it takes a longer limit"
         )
 
 

@@ -37,15 +37,11 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior, exponential_levels
-from robotdiffuse.planners.guided_prior import GuidedPrior, collision_gradient, limited
+from robotdiffuse.planners.guided_prior import GuidedPrior, PriorSettings, collision_gradient, limited
 
 
 @dataclass(frozen=True)
-class MPDSettings:
-    weights: str | None = None
-    """Folder of a trained trajectory_prior; None: the one that comes with the package for the robot."""
-    samples: int = 16
-    """Trajectories per batch."""
+class MPDSettings(PriorSettings, name="mpd"):
     sampling_steps: int = 25
     """Denoising steps, at levels as far apart as those of MPD's exponential schedule."""
     quiet_steps: int = 5
@@ -87,14 +83,11 @@ class MPDSettings:
             raise InputError(f"mpd.push is {self.push}; it must be positive")
 
 
-class MPD(GuidedPrior):
+class MPD(GuidedPrior[MPDSettings]):
     """The prior's samples under MPD's guidance; see the head of this file."""
 
     name = "mpd"
-
-    def __init__(self, settings: MPDSettings | None = None) -> None:
-        self.settings = settings or MPDSettings()
-        super().__init__(self.settings.weights, self.settings.samples)
+    settings_class = MPDSettings
 
     def draw(
         self,

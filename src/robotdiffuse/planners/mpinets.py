@@ -29,11 +29,12 @@ from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, RollOuts
-from robotdiffuse.planners.base import Call
-from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.planners.base import Planner
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.settings import Settings
 from robotdiffuse.types import PlanResult
 
 STILL = 1e-4
@@ -41,7 +42,7 @@ STILL = 1e-4
 
 
 @dataclass(frozen=True)
-class MPiNetsSettings:
+class MPiNetsSettings(Settings, name="mpinets"):
     weights: str | None = None
     """Folder of a trained network; None: the one that comes with the package for the robot."""
     steps: int = 150
@@ -67,14 +68,15 @@ class MPiNetsSettings:
             raise InputError(f"mpinets.resolution is {self.resolution}; it must be positive")
 
 
-class MPiNets:
+class MPiNets(Planner[MPiNetsSettings]):
     """The policy's roll-outs as a planner; see the head of this file."""
 
     name = "mpinets"
+    settings_class = MPiNetsSettings
 
     def __init__(self, settings: MPiNetsSettings | None = None) -> None:
         """Raises InputError if the folder that the settings name holds no weights."""
-        self.settings = settings or MPiNetsSettings()
+        super().__init__(settings)
         check_weights("mpinets", self.settings.weights)
 
     def network(self, robot: Robot) -> MPiNetsNetwork:
@@ -83,14 +85,13 @@ class MPiNets:
         assert isinstance(network, MPiNetsNetwork)
         return network
 
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
-        """See `planners.base.Planner`. Raises InputError if there are no weights for the robot."""
-        network = self.network(problem.robot)
-        call = Call(self.name, problem, time_limit, seed)
-        rng = np.random.default_rng(seed)
-        ends = usable_ends(call, rng)
-        if isinstance(ends, PlanResult):
-            return ends
+    def prepare(self, robot: Robot) -> None:
+        """See `planners.base.Planner`."""
+        self.network(robot)
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planners.base.Planner`."""
+        network, rng = self.network(call.problem.robot), call.rng
         best: _Motion | None = None
         tried = 0
         while best is None or call.remaining > 0:
@@ -108,7 +109,7 @@ class MPiNets:
         if result is not None:
             return result
         what = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
-        return call.timeout(f"{tried} roll-outs of the policy, the best of which {what}")
+        return call.unsolved(f"{tried} roll-outs of the policy, the best of which {what}")
 
     def _roll_outs(
         self,

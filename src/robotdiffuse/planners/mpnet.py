@@ -36,11 +36,13 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.networks.mpnet import MPNetNetwork
 from robotdiffuse.paths.shortcut import shortcut
-from robotdiffuse.planners.base import Call
-from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.planners.base import Planner
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.settings import Settings
 from robotdiffuse.types import PlanResult
 
 SEARCH_ITERATIONS = 500
@@ -49,7 +51,7 @@ SEARCH_CAPACITY = 20_000
 
 
 @dataclass(frozen=True)
-class MPNetPlannerSettings:
+class MPNetPlannerSettings(Settings, name="mpnet"):
     weights: str | None = None
     """Folder of trained networks; None: those that come with the package for the robot."""
     attempts: int = 16
@@ -80,28 +82,32 @@ class MPNetPlannerSettings:
                 raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must not be negative")
 
 
-class MPNet:
+class MPNet(Planner[MPNetPlannerSettings]):
     """Motion Planning Networks as a planner."""
 
     name = "mpnet"
+    settings_class = MPNetPlannerSettings
 
     def __init__(self, settings: MPNetPlannerSettings | None = None) -> None:
         """Raises InputError if the folder that the settings name holds no weights."""
-        self.settings = settings or MPNetPlannerSettings()
+        super().__init__(settings)
         check_weights("mpnet", self.settings.weights)
 
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
-        """See `planners.base.Planner`. Raises InputError where there are no weights for the robot."""
-        call = Call(self.name, problem, time_limit, seed)
-        network = load_baseline("mpnet", self.settings.weights, problem.robot)
+    def network(self, robot: Robot) -> MPNetNetwork:
+        """The networks for a robot. Raises InputError, naming the command that trains them, without them."""
+        network = load_baseline("mpnet", self.settings.weights, robot)
         assert isinstance(network, MPNetNetwork)
-        rng = np.random.default_rng(seed)
-        ends = usable_ends(call, rng)
-        if isinstance(ends, PlanResult):
-            return ends
-        settings, best, rounds = self.settings, Attempt.none(), 0
+        return network
+
+    def prepare(self, robot: Robot) -> None:
+        """See `planners.base.Planner`."""
+        self.network(robot)
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planners.base.Planner`."""
+        network, settings, best, rounds = self.network(call.problem.robot), self.settings, Attempt.none(), 0
         while rounds == 0 or call.remaining > 0:
-            one = NeuralPlanning(call, ends, network, settings, rng)
+            one = NeuralPlanning(call, ends, network, settings, call.rng)
             found = one.best()
             rounds += 1
             if found.broken == 0:
@@ -115,7 +121,7 @@ class MPNet:
             result = call.finish(ends.complete(best.path), self.name)
             if result is not None:
                 return result
-        return call.timeout(
+        return call.unsolved(
             f"no path of the network was free in {call.elapsed:.2f} s and {rounds} rounds of "
             f"{settings.attempts} attempts; a longer time limit or hybrid replanning may find one"
         )

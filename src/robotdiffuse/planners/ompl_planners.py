@@ -32,10 +32,11 @@ from robotdiffuse.collision.kernels import lanes
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motion import finer, search_space
 from robotdiffuse.errors import InputError
-from robotdiffuse.planners.base import Call
-from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.planners.base import Planner, ever_finer
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.settings import NotNegative, Positive, Settings
 from robotdiffuse.types import Path, PlanResult
 from robotdiffuse.verify import VerifySettings, verifier
 
@@ -59,31 +60,23 @@ SAME = 1e-6
 
 
 @dataclass(frozen=True)
-class OmplSettings:
-    resolution: float = 0.05
+class OmplSettings(Settings, name="ompl"):
+    resolution: Positive = 0.05
     """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
     covers the rest, and after a path that it refuses the search begins anew at half the distance."""
-    clearance: float = 0.002
+    clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m], as for rrt_connect."""
-    range: float | None = None
+    range: Positive | None = None
     """Longest extension of a tree [rad, joint-space L2]; None: OMPL's own, 0.2 of the space's diameter. PRM
     and BIT* have none."""
     simplify: bool = True
     """Whether OMPL's PathSimplifier shortens the path of a first-solution planner."""
 
-    def __post_init__(self) -> None:
-        if not 0 < self.resolution < np.inf:
-            raise InputError(f"ompl.resolution is {self.resolution}; it must be positive")
-        if not 0 <= self.clearance < np.inf:
-            raise InputError(f"ompl.clearance is {self.clearance}; it must not be negative")
-        if self.range is not None and not 0 < self.range < np.inf:
-            raise InputError(f"ompl.range is {self.range}; it must be positive, or None for OMPL's own")
 
-
-class OmplPlanner:
+class OmplPlanner(Planner[OmplSettings]):
     """What the planners of OMPL share; a planner is its class in ompl.geometric and a line in PLANNERS."""
 
-    name: ClassVar[str]
+    settings_class = OmplSettings
     algorithm: ClassVar[type[ob.Planner]]
     anytime: ClassVar[bool]
     """Whether it goes on after its first path."""
@@ -92,35 +85,28 @@ class OmplPlanner:
 
     def __init__(self, settings: OmplSettings | None = None) -> None:
         """Raises InputError for a range where the planner has none."""
-        self.settings = settings or OmplSettings()
+        super().__init__(settings)
         if self.settings.range is not None and not hasattr(self.algorithm, "setRange"):
             raise InputError(
                 f"ompl.range is {self.settings.range}; {self.name} has no range, so it must be None"
             )
 
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
-        call = Call(self.name, problem, time_limit, seed)
-        ends = usable_ends(call, np.random.default_rng(seed))
-        if isinstance(ends, PlanResult):
-            return ends
         with _quiet():
             return self._best(call, ends) if self.anytime else self._first(call, ends)
 
     def _first(self, call: Call, ends: Ends) -> PlanResult:
-        settings, attempt = self.settings, 0
-        while attempt == 0 or call.remaining > 0:
+        for settings, attempt in ever_finer(call, self.settings):
             search = _Search(call, ends, self, settings, attempt)
             if not search.run():
-                return call.timeout(search.gave_up)
+                return call.unsolved(search.gave_up)
             if settings.simplify:
                 search.simplify()
             result = call.finish(ends.complete(search.path()), self.name)
             if result is not None:
                 return result
-            settings = replace(settings, resolution=finer(settings.resolution))
-            attempt += 1
-        return call.timeout()
+        return call.unsolved()
 
     def _best(self, call: Call, ends: Ends) -> PlanResult:
         """The shortest path that the judge let pass until time runs out or none can be shorter."""
@@ -146,8 +132,8 @@ class OmplPlanner:
             if call.remaining <= 0:
                 break
         if best is None:
-            return call.timeout(search.gave_up)
-        return call.finish(best, self.name) or call.timeout("the judge refused the motion along the path")
+            return call.unsolved(search.gave_up)
+        return call.finish(best, self.name) or call.unsolved("the judge refused the motion along the path")
 
 
 class OmplRRT(OmplPlanner):

@@ -21,17 +21,16 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.paths.shortcut import shortcut
-from robotdiffuse.planners.base import Call
+from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, encode
-from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.rrt_connect.planner import RRTConnect, RRTConnectSettings
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, PlanResult
 
 
 @dataclass(frozen=True)
-class RobotDiffuseSettings(SamplingSettings):
+class RobotDiffuseSettings(SamplingSettings, name="robotdiffuse"):
     planner: ClassVar[str] = "robotdiffuse"
     sampling_steps: int | None = 2
     """Calls of the denoiser per batch. With guidance, more bring no more solved problems, see
@@ -72,16 +71,16 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
     name = "robotdiffuse"
     settings_class = RobotDiffuseSettings
 
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+    def prepare(self, robot: Robot) -> None:
         """See `planners.base.Planner`."""
-        model = self.model(problem.robot)
-        call = Call(self.name, problem, time_limit, seed)
+        self.model(robot)
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planners.base.Planner`."""
+        robot = call.problem.robot
+        model = self.model(robot)
         if model is None:
-            call.notes.append(f"no weights come with the package for {problem.robot.name}; planned by search")
-        rng = np.random.default_rng(seed)
-        ends = usable_ends(call, rng)
-        if isinstance(ends, PlanResult):
-            return ends
+            call.notes.append(f"no weights come with the package for {robot.name}; planned by search")
         search = RRTConnect(self.settings.search)
         result = self._straight(call, ends)
         if result is None and model is not None:
@@ -89,10 +88,10 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             if quick is not None:
                 call.improved(quick.length)
             if call.remaining > 0 or quick is None:
-                result = self._learned(call, ends, model, rng, quick)
+                result = self._learned(call, ends, model, quick)
             if result is None and quick is not None:
                 result = call.finish(quick.positions, search.name)
-        return result or search.search(call, ends)
+        return result or search.solve(call, ends)
 
     def _straight(self, call: Call, ends: Ends) -> PlanResult | None:
         """The straight line to the nearest goal that it reaches: no path could be shorter."""
@@ -106,11 +105,9 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
                     return result
         return None
 
-    def _learned(
-        self, call: Call, ends: Ends, model: MotionModel, rng: np.random.Generator, quick: Path | None
-    ) -> PlanResult | None:
+    def _learned(self, call: Call, ends: Ends, model: MotionModel, quick: Path | None) -> PlanResult | None:
         """The shortest of the network's motions and the quick path; None if none passes in time."""
-        start, goals = ends.rows()
+        (start, goals), rng = ends.rows(), call.rng
         code = encode(model, ends.checker, self.settings.points, rng)
         sampled = self.sample(model, ends.checker, code, start, goals, rng)
         result = self._best(call, ends, sampled, quick) if sampled.free.any() else None

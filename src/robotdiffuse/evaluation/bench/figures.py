@@ -101,7 +101,7 @@ class Outcome:
             return LATER
         if record.status in FAILURES:
             return record.status
-        if record.status != Status.TIMEOUT.value:
+        if record.status not in (Status.TIMEOUT.value, Status.NO_PATH.value):
             return "ends refused"
         if record.refused:
             return REFUSED.get(record.refused, "other refusal")

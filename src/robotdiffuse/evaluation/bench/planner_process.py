@@ -23,7 +23,7 @@ import numpy as np
 
 from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.metrics import Measure
-from robotdiffuse.planners import check_planner, load_planner
+from robotdiffuse.planners import PLANNERS, load_planner
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.problems.files import Robots, problem_from_record
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -54,7 +54,7 @@ class Contestant(NamedTuple):
     def of(cls, text: str) -> "Contestant":
         """From NAME or NAME@FOLDER. Raises InputError for an unknown name."""
         name, at, folder = text.partition("@")
-        check_planner(name)
+        PLANNERS.entry(name)
         return cls(name, str(FilePath(folder).resolve()) if at else None)
 
     @property

@@ -19,29 +19,30 @@ sqrt(dof) times as long as the straight line that it stands for.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from itertools import product
 from math import ceil, sqrt
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.motion import FINEST, finer, levers, search_space
+from robotdiffuse.collision.motion import FINEST, levers, search_space
 from robotdiffuse.errors import InputError
-from robotdiffuse.planners.base import Call
-from robotdiffuse.planners.ends import usable_ends
+from robotdiffuse.planners.base import Planner, ever_finer
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.lattice import graph as lattice_graph
 from robotdiffuse.planners.lattice import kernel
 from robotdiffuse.planners.lattice import table as table
 from robotdiffuse.planners.lattice.graph import UNITS, Lattice
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.types import PlanResult
+from robotdiffuse.settings import Bound, Count, NotNegative, Positive, Settings
+from robotdiffuse.types import PlanResult, Status
 
 SLICE = 200
 """Expansions between two looks at the clock."""
@@ -54,62 +55,36 @@ INSIDE = 1e-9
 
 
 @dataclass(frozen=True)
-class LatticeSettings:
-    spacing: float = 0.4
+class LatticeSettings(Settings):
+    spacing: Positive = 0.4
     """Step of the lattice [rad], [m] for prismatic joints."""
-    joints_per_move: int = 1
+    joints_per_move: Count = 1
     """Most joints that an edge moves, each by one step."""
-    max_nodes: int = 2_000_000
+    max_nodes: Annotated[int, Bound(least=1.0, below=2.0**31 - 1)] = 2_000_000
     """Most nodes that are kept; some 60 to 80 bytes each, and more with `joints_per_move`."""
-    resolution: float = 0.05
+    resolution: Positive = 0.05
     """No point of the arm moves further than this between two checks of an edge [m]; a path that the judge
     refuses is searched again at half the distance."""
-    clearance: float = 0.002
+    clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
-
-    def __post_init__(self) -> None:
-        for name in ("spacing", "resolution"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise InputError(f"{self._name}.{name} is {getattr(self, name)}; it must be positive")
-        for name in ("joints_per_move", "max_nodes"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{self._name}.{name} is {getattr(self, name)}; it must be at least 1")
-        if self.max_nodes >= 2**31 - 1:
-            raise InputError(f"{self._name}.max_nodes is {self.max_nodes}; it must be below 2^31 - 1")
-        if not 0 <= self.clearance < float("inf"):
-            raise InputError(f"{self._name}.clearance is {self.clearance}; it must not be negative")
-
-    @property
-    def _name(self) -> str:
-        return "lattice"
 
 
 @dataclass(frozen=True)
-class AStarSettings(LatticeSettings):
-    joints_per_move: int = 2
+class AStarSettings(LatticeSettings, name="a_star"):
+    joints_per_move: Count = 2
     """See LatticeSettings. More make paths shorter (2.1, 1.6, 1.35 and 1.2 times the straight line with 1, 2,
     3 and 7 on ROP problems) and the search slower: an expansion checks up to 14, 98, 378 and 2,186 edges."""
-    inflation: float = 1.5
+    inflation: Annotated[float, Bound(least=1.0, most=1000.0)] = 1.5
     """Factor on the heuristic (weighted A*): paths are at most this much longer than the shortest of the
     lattice; 1 finds the shortest, with seven joints often not in time."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not 1 <= self.inflation <= 1000:
-            raise InputError(f"a_star.inflation is {self.inflation}; it must be from 1 to 1000")
-
-    @property
-    def _name(self) -> str:
-        return "a_star"
-
 
 @dataclass(frozen=True)
-class DStarLiteSettings(LatticeSettings):
+class DStarLiteSettings(LatticeSettings, name="d_star_lite"):
     """No inflation: repairs are right only with a consistent heuristic."""
 
-    @property
-    def _name(self) -> str:
-        return "d_star_lite"
+
+Own = TypeVar("Own", bound=LatticeSettings)
 
 
 class Outcome(Enum):
@@ -147,8 +122,8 @@ def _make_graph(
     counts = below + above + 1
     if (total := np.prod(counts.astype(float))) >= MOST_KEYS:
         raise InputError(
-            f"{settings._name}.spacing is {spacing:g}; on {robot.name} that makes {total:.0e} nodes, which "
-            f"must be below {MOST_KEYS:.0e}: a spacing of "
+            f"{settings.settings_name}.spacing is {spacing:g}; on {robot.name} that makes {total:.0e} nodes, "
+            f"which must be below {MOST_KEYS:.0e}: a spacing of "
             f"{spacing * (total / MOST_KEYS) ** (1 / robot.dof) * 1.1:.2g} does it"
         )
     strides = np.concatenate([[1], np.cumprod(counts[:-1])]).astype(np.int64)
@@ -365,62 +340,48 @@ class DStarLiteSearch(_Search):
         )
 
 
-class AStar:
-    """Weighted A* on a lattice; the same path for every seed, but for the configurations of a goal pose."""
+class _LatticePlanner(Planner[Own]):
+    """The same path for every seed, but for the configurations of a goal pose."""
 
-    name = "a_star"
+    search: Callable[..., AStarSearch | DStarLiteSearch]
 
-    def __init__(self, settings: AStarSettings | None = None) -> None:
-        self.settings = settings or AStarSettings()
-
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
-        return _plan(Call(self.name, problem, time_limit, seed), self.settings, AStarSearch)
+        padding = ends.kept_clearance(self.settings.clearance)
+        for settings, _ in ever_finer(call, self.settings):
+            search = self.search(ends.checker, *ends.rows(), settings, padding)
+            outcome = search.run(lambda: call.remaining <= 0)
+            path = search.path() if outcome is Outcome.FOUND else None
+            if path is None:
+                status = Status.TIMEOUT if outcome is Outcome.GOING else Status.NO_PATH
+                return call.fail(status, _reason(outcome, settings, search))
+            done = f"solved by {call.planner}: {search.expansions} expansions"
+            result = call.finish(ends.complete(path), call.planner, reason=done)
+            if result is not None:
+                return result
+            if settings.resolution <= FINEST:
+                break
+        return call.unsolved("the judge refused every path that was found; a larger clearance may help")
 
 
-class DStarLite:
-    """D* Lite on a lattice, for one problem; `DStarLiteSearch` is what can be repaired. The same path for
-    every seed, but for the configurations of a goal pose."""
+class AStar(_LatticePlanner[AStarSettings]):
+    """Weighted A* on a lattice."""
 
-    name = "d_star_lite"
-
-    def __init__(self, settings: DStarLiteSettings | None = None) -> None:
-        self.settings = settings or DStarLiteSettings()
-
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
-        """See `planners.base.Planner`."""
-        return _plan(Call(self.name, problem, time_limit, seed), self.settings, DStarLiteSearch)
+    name, settings_class, search = "a_star", AStarSettings, AStarSearch
 
 
-def _plan(
-    call: Call, settings: LatticeSettings, begin: Callable[..., AStarSearch | DStarLiteSearch]
-) -> PlanResult:
-    """Search until a path passes the judge, there is none, or time or memory run out."""
-    ends = usable_ends(call, np.random.default_rng(call.seed))
-    if isinstance(ends, PlanResult):
-        return ends
-    padding = ends.kept_clearance(settings.clearance)
-    while True:
-        search = begin(ends.checker, *ends.rows(), settings, padding)
-        outcome = search.run(lambda: call.remaining <= 0)
-        path = search.path() if outcome is Outcome.FOUND else None
-        if path is None:
-            return call.timeout(_reason(outcome, settings, search))
-        done = f"solved by {call.planner}: {search.expansions} expansions"
-        result = call.finish(ends.complete(path), call.planner, reason=done)
-        if result is not None:
-            return result
-        if settings.resolution <= FINEST or call.remaining <= 0:
-            return call.timeout("the judge refused every path that was found; a larger clearance may help")
-        settings = replace(settings, resolution=finer(settings.resolution))
+class DStarLite(_LatticePlanner[DStarLiteSettings]):
+    """D* Lite on a lattice, for one problem; `DStarLiteSearch` is what can be repaired."""
+
+    name, settings_class, search = "d_star_lite", DStarLiteSettings, DStarLiteSearch
 
 
 def _reason(outcome: Outcome, settings: LatticeSettings, search: AStarSearch | DStarLiteSearch) -> str:
-    spacing = f"{settings._name}.spacing (now {settings.spacing:g} rad)"
+    spacing = f"{settings.settings_name}.spacing (now {settings.spacing:g} rad)"
     if outcome is Outcome.FULL:
         return (
             f"memory is full: {search.nodes} nodes after {search.expansions} expansions; take a coarser "
-            f"{spacing} or a larger {settings._name}.max_nodes"
+            f"{spacing} or a larger {settings.settings_name}.max_nodes"
         )
     if outcome is Outcome.EXHAUSTED:
         return f"there is no path on the lattice; a finer {spacing} may have one"

@@ -1,6 +1,6 @@
 """RRT-Connect with shortcutting: the fast classical planner, and the one that answers when learning fails."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -8,13 +8,13 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import path_length
-from robotdiffuse.collision.motion import finer, search_space
-from robotdiffuse.errors import InputError
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.paths.shortcut import shortcut
-from robotdiffuse.planners.base import Call
-from robotdiffuse.planners.ends import Ends, usable_ends
+from robotdiffuse.planners.base import Planner, ever_finer
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.settings import Count, Natural, NotNegative, Positive, Settings
 from robotdiffuse.types import Path, PlanResult
 from robotdiffuse.verify import VerifySettings, verifier
 
@@ -23,45 +23,29 @@ ITERATIONS = 2_000
 
 
 @dataclass(frozen=True)
-class RRTConnectSettings:
-    reach: float = 1.0
+class RRTConnectSettings(Settings, name="rrt_connect"):
+    reach: Positive = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
-    resolution: float = 0.05
+    resolution: Positive = 0.05
     """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
     covers the rest, and a path that it refuses is searched again at half the distance."""
-    clearance: float = 0.002
+    clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
-    searches: int = 2
+    searches: Count = 2
     """Paths found, the shortest of which is shortened: a search costs less than the shortcuts it saves."""
-    shortcuts: int = 25
+    shortcuts: Natural = 25
     """Attempts to shorten a path."""
-    optimize_time: float = 0.0
+    optimize_time: NotNegative = 0.0
     """Time spent on restarts and more shortcuts after the first path [s]; the shortest path is kept."""
-    capacity: int = 20_000
+    capacity: Count = 20_000
     """Most nodes of a tree; a full pair of trees is started anew."""
 
-    def __post_init__(self) -> None:
-        for name in ("reach", "resolution", "capacity", "searches"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must be positive")
-        for name in ("clearance", "shortcuts", "optimize_time"):
-            if getattr(self, name) < 0:
-                raise InputError(f"rrt_connect.{name} is {getattr(self, name)}; it must not be negative")
 
-
-class RRTConnect:
+class RRTConnect(Planner[RRTConnectSettings]):
     """Two trees grown towards each other (Kuffner and LaValle, 2000), then shortcuts."""
 
     name = "rrt_connect"
-
-    def __init__(self, settings: RRTConnectSettings | None = None) -> None:
-        self.settings = settings or RRTConnectSettings()
-
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
-        """See `planners.base.Planner`."""
-        call = Call(self.name, problem, time_limit, seed)
-        ends = usable_ends(call, np.random.default_rng(seed))
-        return ends if isinstance(ends, PlanResult) else self.search(call, ends)
+    settings_class = RRTConnectSettings
 
     def first(self, call: Call, ends: Ends) -> Path | None:
         """A path that passes the judge, its motion not yet timed.
@@ -74,20 +58,16 @@ class RRTConnect:
         path = Path(call.problem.robot.joint_names, ends.complete(found))
         return path if verifier(call.problem, VerifySettings()).path(path).valid else None
 
-    def search(self, call: Call, ends: Ends) -> PlanResult:
-        """Search until a path passes the judge or time runs out; for planners that have begun a call."""
-        settings = self.settings
-        attempt = 0
-        while attempt == 0 or call.remaining > 0:
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planners.base.Planner`."""
+        for settings, attempt in ever_finer(call, self.settings):
             path = _Search(call, ends, settings, attempt).best()
             if path is None:
                 break
             result = call.finish(ends.complete(path), self.name)
             if result is not None:
                 return result
-            settings = replace(settings, resolution=finer(settings.resolution))
-            attempt += 1
-        return call.timeout()
+        return call.unsolved()
 
 
 class _Search:

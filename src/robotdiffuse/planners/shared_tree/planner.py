@@ -11,8 +11,9 @@ What is in the paper's section on data sets, and where it is here:
   optimality needs (S. Karaman and E. Frazzoli, IJRR 2011; `kernel.add_node`). The authors rewire within a
   fixed radius of 1.2 and have choose-parent commented out. Neighbours come from a k-d tree.
 - *Node security defence*: nodes and edges keep a safety distance to obstacles; near a start or goal that is
-  itself closer it is relaxed in steps (`rrt_connect_kernel.padding_near`), and where no path is found the
-  whole distance is lowered stepwise. The authors enlarge the obstacles by 5 cm. What was kept is recorded.
+  itself closer it is relaxed in steps (`collision.kernels.motions.padding_near`), and where no path is
+  found the whole distance is lowered stepwise. The authors enlarge the obstacles by
+  5 cm. What was kept is recorded.
 - *Cost*: joint-space length. The authors' is that of the end effector plus a little for orientation, which
   makes detours of the joints cheap.
 
@@ -22,7 +23,8 @@ path; so the hyperspheroids shrink early. Both only add branches, so the tree st
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -31,14 +33,14 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
-from robotdiffuse.collision.motion import finer, search_space
-from robotdiffuse.errors import InputError
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.paths.shortcut import shortcut
-from robotdiffuse.planners.base import Call
-from robotdiffuse.planners.ends import usable_ends
+from robotdiffuse.planners.base import Planner, ever_finer
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.rrt_connect import kernel as connect
 from robotdiffuse.planners.shared_tree import kernel
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.settings import Bound, Count, Natural, NotNegative, Positive, Settings
 from robotdiffuse.types import PlanResult
 
 END_MARGIN = 0.0005
@@ -46,49 +48,34 @@ END_MARGIN = 0.0005
 
 
 @dataclass(frozen=True)
-class SharedTreeSettings:
-    safety_distance: float = 0.05
+class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
+    safety_distance: NotNegative = 0.05
     """Distance to obstacles that nodes and edges keep [m]; the default is what the authors' scenes imply."""
-    steps: int = 5
+    steps: Natural = 5
     """Steps in which the safety distance is lowered to zero where no path is found; one more is what the
     start has, and one what the goal farthest from obstacles has."""
-    step_rounds: int = 4
+    step_rounds: Count = 4
     """Rounds without a path before it is lowered."""
-    reach: float = 1.0
+    reach: Positive = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
-    resolution: float = 0.05
+    resolution: Positive = 0.05
     """No point of the arm moves further than this between two checks of a motion [m]."""
-    goal_bias: float = 0.1
+    goal_bias: Annotated[float, Bound(least=0.0, below=1.0)] = 0.1
     """Share of the samples at a goal that is not reached yet."""
-    growth: int = 150
+    growth: Count = 150
     """Iterations of RRT* in a round."""
-    connect_iterations: int = 1_000
+    connect_iterations: Count = 1_000
     """Most iterations of RRT-Connect in a round."""
-    shortcuts: int = 20
+    shortcuts: Natural = 20
     """Attempts to shorten a path."""
-    rounds: int = 100_000
+    rounds: Count = 100_000
     """Most rounds."""
-    improvement: float = 0.005
+    improvement: NotNegative = 0.005
     """The search ends when the best cost fell by less than this share in `patience` rounds; 0: never."""
-    patience: int = 20
+    patience: Count = 20
     """See `improvement`."""
-    capacity: int = 2_000
+    capacity: Count = 2_000
     """Nodes that a tree has room for at first; it is doubled when full."""
-
-    def __post_init__(self) -> None:
-        for name in ("reach", "resolution", "growth", "connect_iterations", "rounds", "patience", "capacity",
-                     "step_rounds"):  # fmt: skip
-            if not getattr(self, name) > 0:
-                raise InputError(f"shared_tree_rrt_star.{name} is {getattr(self, name)}; it must be positive")
-        for name in ("safety_distance", "steps", "shortcuts", "improvement"):
-            if getattr(self, name) < 0:
-                raise InputError(
-                    f"shared_tree_rrt_star.{name} is {getattr(self, name)}; it must not be negative"
-                )
-        if not 0 <= self.goal_bias < 1:
-            raise InputError(
-                f"shared_tree_rrt_star.goal_bias is {self.goal_bias}; it must be at least 0 and below 1"
-            )
 
 
 class SharedTreeSearch:
@@ -229,23 +216,17 @@ class SharedTreeSearch:
         return True
 
 
-class SharedTreeRRTStar:
+class SharedTreeRRTStar(Planner[SharedTreeSettings]):
     """Shared-Tree Informed RRT* as a planner: anytime, until it hardly improves or time runs out."""
 
     name = "shared_tree_rrt_star"
+    settings_class = SharedTreeSettings
 
-    def __init__(self, settings: SharedTreeSettings | None = None) -> None:
-        self.settings = settings or SharedTreeSettings()
-
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
-        call = Call(self.name, problem, time_limit, seed)
-        ends = usable_ends(call, np.random.default_rng(seed))
-        if isinstance(ends, PlanResult):
-            return ends
-        settings, attempt = self.settings, 0
-        while attempt == 0 or call.remaining > 0:
-            search = SharedTreeSearch(ends.checker, *ends.rows(), settings, random_state(seed, attempt))
+        for settings, attempt in ever_finer(call, self.settings):
+            state = random_state(call.seed, attempt)
+            search = SharedTreeSearch(ends.checker, *ends.rows(), settings, state)
 
             def out_of_time(search: SharedTreeSearch = search) -> bool:
                 if search.cost < np.inf:
@@ -259,9 +240,7 @@ class SharedTreeRRTStar:
             result = call.finish(ends.complete(path), self.name, reason=_reason(search))
             if result is not None:
                 return result
-            settings = replace(settings, resolution=finer(settings.resolution))
-            attempt += 1
-        return call.timeout()
+        return call.unsolved()
 
 
 def _reason(search: SharedTreeSearch) -> str:
