@@ -100,7 +100,10 @@ def test_assignments() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("reach=1", "search has no setting 'reach'; known: step, clearance, .*inner.cells, greedy"),
+        (
+            "reach=1",
+            "search has no setting 'reach'; it has step=1.0, .*range=none, .*inner.cells=3, greedy=false",
+        ),
         ("step", "'step' is not NAME=VALUE"),
         ("step=big", "search.step is 'big'; it must be of type float"),
         ("step=-1", "search.step is -1.0; it must be positive"),

@@ -27,6 +27,8 @@ from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.registry import Registry
 
 Given = TypeVar("Given", bound="Settings")
+LONG = 40
+"""Longest value that is shown in lists of settings."""
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,18 @@ class Setting(NamedTuple):
     """What values it takes."""
     description: str
 
+    @property
+    def value(self) -> str:
+        """The default as `Settings.changed` takes it, "..." where that is long."""
+        plain = self.default is None or isinstance(self.default, bool)
+        text = str(self.default).lower() if plain else str(self.default)
+        return text if len(text) <= LONG else "..."
+
+    @property
+    def assignment(self) -> str:
+        """NAME=VALUE."""
+        return f"{self.name}={self.value}"
+
 
 class Settings:
     """Base of settings classes; a subclass that overrides __post_init__ calls this one's."""
@@ -148,20 +162,18 @@ class Settings:
     def changed(self: Given, assignments: Iterable[str]) -> Given:
         """These settings with some replaced: "step=0.5", "guidance.margin=0.02"; values as in YAML.
 
-        Raises InputError for what is no NAME=VALUE, a name that is not there (all are listed) and a value of
-        the wrong type or out of bounds.
+        Raises InputError for what is no NAME=VALUE, a name that is not there (all are listed, with what they
+        are) and a value of the wrong type or out of bounds.
         """
         where = self.settings_name or type(self).__name__
         changes: dict[str, Any] = {}
         for text in assignments:
             name, equals, value = text.partition("=")
-            known = [setting.name for setting in self.describe()]
+            known = {setting.name: setting.assignment for setting in self.describe()}
             if not equals or not name:
-                raise InputError(
-                    f"{text!r} is not NAME=VALUE; {where} has {', '.join(known) or 'no settings'}"
-                )
+                raise InputError(f"{text!r} is not NAME=VALUE; {where} has {', '.join(known.values())}")
             if name not in known:
-                raise InputError(f"{where} has no setting {name!r}; known: {', '.join(known)}")
+                raise InputError(f"{where} has no setting {name!r}; it has {', '.join(known.values())}")
             try:
                 parsed = yaml.safe_load(value)
             except yaml.YAMLError:

@@ -22,7 +22,8 @@ from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
 from robotdiffuse.paths.export import load_result
-from robotdiffuse.planners import PLANNERS
+from robotdiffuse.planners import PLANNERS, planner_settings
+from robotdiffuse.types import PlanResult, Status
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted(ROOT.glob("examples/*.yaml")) + sorted(ROOT.glob("src/robotdiffuse/examples/*.yaml"))
@@ -303,6 +304,43 @@ def test_planners_lists_them_all_without_loading_them() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert all(name in done.stdout for name in PLANNERS)
+
+
+def test_settings_of_a_planner_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("planners", "rrt_connect") == 0
+    printed = capsys.readouterr().out
+    assert "reach" in printed and "1.0" in printed and "Longest extension of a tree" in printed
+    assert run("planners", "teleport") == 2
+    assert "unknown planner 'teleport'" in capsys.readouterr().err
+
+
+def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given: list[object] = []
+
+    def solve(_problem: object, planner: str, *rest: object) -> PlanResult:
+        given.extend(rest)
+        return PlanResult(Status.NO_PATH, "none", planner, "panda", 0.1, 0)
+
+    monkeypatch.setattr("robotdiffuse.cli.plan.solve", solve)
+    sets = ("--set", "search.reach=0.5", "--set", "samples=4")
+    assert run("plan", write(tmp_path), *sets) == 1
+    settings = planner_settings("robotdiffuse", ["samples=4", "search.reach=0.5"])
+    assert settings in given and settings != planner_settings("robotdiffuse", [])
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("reech=0.5", "has no setting 'reech'; it has reach=1.0, resolution=0.05, "),
+        ("reach=0", "rrt_connect.reach is 0.0; it must be positive"),
+        ("reach", "'reach' is not NAME=VALUE; rrt_connect has reach=1.0, "),
+    ],
+)
+def test_wrong_settings_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], value: str, message: str
+) -> None:
+    assert run("plan", write(tmp_path), "--planner", "rrt_connect", "--set", value) == 2
+    assert message in capsys.readouterr().err
 
 
 def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:

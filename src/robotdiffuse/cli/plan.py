@@ -11,6 +11,7 @@ from robotdiffuse.cli.draw import ENDINGS, draw, show
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
+    from robotdiffuse.settings import Settings
     from robotdiffuse.types import PlanResult
 
 DEMO = "shelf.yaml"
@@ -36,7 +37,15 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--weights",
         metavar="FOLDER",
-        help="of `train planner`, for the planner robotdiffuse (default: bundled)",
+        help="of `train`, for a learned planner (default: bundled)",
+    )
+    parser.add_argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a setting of the planner, see `robotdiffuse planners NAME`; repeatable",
     )
     parser.add_argument(
         "--time-limit", type=positive, default=1.0, metavar="S", help="wall time for planning (default: 1 s)"
@@ -64,16 +73,17 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
 
 def run_plan(arguments: argparse.Namespace) -> int:
     from robotdiffuse.paths.export import check_output, save_result
-    from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
+    from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, planner_settings
     from robotdiffuse.problems.files import load_problem, problem_record
 
     name = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(name)
+    settings = planner_settings(name, arguments.settings) if arguments.settings else None
     outputs = [check_output(file, (".json", ".csv", *ENDINGS)) for file in arguments.out]
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
     problem = load_problem(arguments.problem, arguments.index)
-    result = solve(problem, name, arguments.time_limit, arguments.seed, arguments.weights)
+    result = solve(problem, name, arguments.time_limit, arguments.seed, settings, arguments.weights)
     print_result(result)
     for file in outputs:
         if file.suffix.lower() == ".json":
@@ -109,9 +119,14 @@ def run_demo(arguments: argparse.Namespace) -> int:
 
 
 def solve(
-    problem: "Problem", planner: str, time_limit: float, seed: int, weights: str | None = None
+    problem: "Problem",
+    planner: str,
+    time_limit: float,
+    seed: int,
+    settings: "Settings | None" = None,
+    weights: str | None = None,
 ) -> "PlanResult":
-    """Load the planner, with weights of its own if it is a learned one, and plan, behind a spinner.
+    """Load the planner, with settings or weights of its own, and plan, behind a spinner.
 
     A first call, whose result is dropped, loads the compiled code, or compiles it on a new machine, which
     would otherwise use up the time limit.
@@ -122,7 +137,7 @@ def solve(
 
     console = Console(stderr=True)
     with console.status("loading compiled code (a new machine compiles it first, for about a minute)"):
-        loaded = load_planner(planner, weights=weights)
+        loaded = load_planner(planner, settings, weights)
         loaded.plan(problem, time_limit=WARM_UP, seed=seed)
     with console.status(f"planning with {planner}"):
         return loaded.plan(problem, time_limit=time_limit, seed=seed)
