@@ -33,9 +33,10 @@ from robotdiffuse.collision.kernels.motions import Space, motion_free
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.collision.signed_distance import SignedDistance
 from robotdiffuse.planners.rrt_connect.planner import RRTConnectSettings
-from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, sample_scene
+from robotdiffuse.problems.families.family import base_spheres
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.files import load_motion_bench_maker
-from robotdiffuse.problems.rop_problems import base_spheres
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
@@ -59,7 +60,7 @@ Place = tuple[Robot, Scene]
 def rop_places(robot: Robot, dense: bool, count: int) -> list[Place]:
     settings, keep_out = (ROP_DENSE if dense else ROP), base_spheres(robot)
     seeds = [np.random.default_rng([SEED, dense, i]) for i in range(count)]
-    return [(robot, sample_scene(settings, rng, keep_out)) for rng in seeds]
+    return [(robot, settings.scene(rng, keep_out)) for rng in seeds]
 
 
 def cloud_places(robot: Robot, count: int) -> list[Place]:

@@ -20,7 +20,7 @@ from robotdiffuse.generation.shard_maker import solve
 from robotdiffuse.robots import load_robot
 
 STAGES = {
-    "drawing scene, start and goals (inverse kinematics)": ("problems.py", "draw_problem"),
+    "drawing scene, start and goals (inverse kinematics)": ("shard_maker.py", "draw"),
     "search": ("shared_tree.py", "run"),
     "judge": ("verify.py", "path"),
 }

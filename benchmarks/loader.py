@@ -19,7 +19,8 @@ from report import header, print_table
 
 from robotdiffuse.data.dataset import RopDataset
 from robotdiffuse.data.shards import SPLITS, Manifest, write_manifest, write_shard
-from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, sample_scene
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
@@ -57,7 +58,7 @@ def write_store(folder: str, robot: Robot, trajectories: int) -> None:
         n = min(SHARD, trajectories - index * SHARD)
         ends = rng.uniform(robot.lower, robot.upper, (2, n, robot.dof)).astype(np.float32)
         dense = rng.random(n) < DENSE_SHARE
-        scenes = [sample_scene(ROP_DENSE if d else ROP, rng) for d in dense]
+        scenes = [(ROP_DENSE if d else ROP).scene(rng) for d in dense]
         packed = [pack_scene(Scene(scene.shapes[1:]), SLOTS) for scene in scenes]
         goals = np.repeat(ends[1][:, None], GOALS, axis=1)
         arrays = {

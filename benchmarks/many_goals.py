@@ -4,9 +4,9 @@
         [--weights FOLDER]
 
 Prints the report that is kept in benchmarks/results/many_goals.txt. Scenes of held-out problems; from the
-problem's start to so many goals, drawn as ROP draws them, that RRT-Connect reaches with a few thousand nodes
-and the straight line does not. Every method gives at most one motion to each goal, and no other where the
-judge, which is not timed, refuses it.
+problem's start to so many goals, drawn with the tip in the family's region, that RRT-Connect reaches with a
+few thousand nodes and the straight line does not. Every method gives at most one motion to each goal, and no
+other where the judge, which is not timed, refuses it.
 
 - network: 4 samples to each goal in one call, refined where none of the 4 is free, the shortest free one.
 - bumps: its control, the line and 3 random bumps to each goal, refined.
@@ -35,10 +35,9 @@ from robotdiffuse.evaluation.trials import NETWORK_ALONE
 from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, encode, unlearned_starts
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.problems.families.rop import RopSettings
+from robotdiffuse.problems.families import FAMILIES, Family, load_family
+from robotdiffuse.problems.families.family import uniform_configurations
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.problems.rop_problems import free_configuration
 from robotdiffuse.types import Path
 from robotdiffuse.verify import VerifySettings, verifier
 
@@ -64,16 +63,16 @@ Paths = list[ndarray | None]
 """One for each goal."""
 
 
-def prepare(problem: Problem, rules: RopSettings, count: int, resolution: float, seed: int) -> Scene | None:
+def prepare(problem: Problem, family: Family, count: int, resolution: float, seed: int) -> Scene | None:
     """With goals; None if not enough of those that were drawn are worth it."""
     checker, rng = CollisionChecker(PANDA, problem.scene), np.random.default_rng([SEED, 6, seed])
     space, state = search_space(checker, resolution), random_state(SEED, seed)
     start, goals = problem.start.astype(np.float32), []
     for _ in range(8 * count):
-        goal = free_configuration(PANDA, rules, checker, rng)
-        if goal is None:
+        found = uniform_configurations(PANDA, family.region, checker, 1, rng)
+        if not len(found):
             break
-        goal = goal.astype(np.float32)
+        goal = found[0].astype(np.float32)
         if motions_free(space, np.stack([start, goal])).all():
             continue
         if len(search(space, start, goal, state)):
@@ -173,22 +172,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Many motions for one scene.")
     parser.add_argument("--problems", type=int, default=10, help="scenes (10)")
     parser.add_argument("--goals", type=int, default=64, help="of each scene (64)")
-    families = [name for name, rules in FAMILIES.items() if isinstance(rules, RopSettings)]
-    parser.add_argument("--family", default="rop_dense", choices=families, help="of scenes (rop_dense)")
+    parser.add_argument("--family", default="rop_dense", choices=list(FAMILIES), help="of scenes (rop_dense)")
     parser.add_argument("--cases", type=File, help="folder that keeps what is known of the problems")
     parser.add_argument("--weights", help="folder of a trained model; default: the bundled one")
     arguments = parser.parse_args()
     print(header("numpy", "numba", "torch"))
     print(f"weights: {arguments.weights or 'the bundled ones'}")
     planner = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
-    rules = FAMILIES[arguments.family]
-    assert isinstance(rules, RopSettings)
+    family = load_family(arguments.family)
     cases = draw_cases(arguments.family, arguments.problems, arguments.cases).hard
     resolution = planner.settings.resolution
     scenes = [
         scene
         for i, case in enumerate(progress(cases, "goals"))
-        if (scene := prepare(case.problem, rules, arguments.goals, resolution, i)) is not None
+        if (scene := prepare(case.problem, family, arguments.goals, resolution, i)) is not None
     ]
     if not scenes:
         print("no scene leaves so many goals; ask for fewer")

@@ -16,9 +16,9 @@ import numpy as np
 from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.bench.problem_sets import line_solves
-from robotdiffuse.evaluation.trials import SEED, goal_of, problem_number
+from robotdiffuse.evaluation.problem_sets import judge
 from robotdiffuse.planners.lattice.planner import DStarLiteSearch, DStarLiteSettings, Outcome
+from robotdiffuse.problems.held_out import SEED, goal_of, held_out_problem, line_length
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
 
@@ -60,8 +60,8 @@ def main() -> None:
     print(header("numba", "numpy"))
     solvable = []
     for index in count():
-        problem = problem_number(index)
-        if not line_solves(problem) and ran(search(problem))[0] is Outcome.FOUND:
+        problem = held_out_problem("rop", index)
+        if line_length(problem, judge) is None and ran(search(problem))[0] is Outcome.FOUND:
             solvable.append(problem)
         if len(solvable) == arguments.problems:
             break

@@ -25,10 +25,10 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.rrt_connect import kernel
 from robotdiffuse.planners.rrt_connect.planner import Ends, RRTConnect, RRTConnectSettings
-from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, RopSettings
+from robotdiffuse.problems.families.rop import ROP, Rop
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
 
 SEED = 20261122
@@ -107,13 +107,11 @@ def figures(data: dict[str, list]) -> list[str]:
 
 def rop(count: int) -> None:
     robot, rows = load_robot("panda"), []
-    ten = RopSettings(
-        obstacles=(10, 10), sphere_radius=ROP_DENSE.sphere_radius, cube_side=ROP_DENSE.cube_side
-    )
+    ten = Rop(obstacles=(10, 10), sphere_radius=ROP_DENSE.sphere_radius, cube_side=ROP_DENSE.cube_side)
     for title, settings in (("ROP, 2 obstacles", ROP), ("ROP, 10 obstacles", ten)):
         one, ten_seconds, times = [], [], []
         for i in track(range(count), title, transient=True):
-            problem = sample_problem(robot, settings, np.random.default_rng([SEED, i]))
+            problem = settings.draw(robot, np.random.default_rng([SEED, i])).problem(robot)
             result = RRTConnect().plan(problem, 1.0, seed=0)
             one.append(result.solved)
             times.append(result.planning_time)

@@ -26,12 +26,11 @@ from robotdiffuse.collision.kernels import lanes
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motion import search_space
-from robotdiffuse.generation.problems import draw_problem
 from robotdiffuse.generation.settings import GenerationSettings
+from robotdiffuse.generation.shard_maker import draw as draw_problem
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal
-from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
 
 SEED = 20261121
@@ -51,7 +50,7 @@ def one_goal(count: int) -> list[Problem]:
     found: list[Problem] = []
     index = 0
     while len(found) < count:
-        problem = sample_problem(PANDA, ROP, np.random.default_rng([SEED, index]))
+        problem = ROP.draw(PANDA, np.random.default_rng([SEED, index])).problem(PANDA)
         index += 1
         assert isinstance(problem.goal, JointGoal)
         checker = CollisionChecker(PANDA, problem.scene)
@@ -71,7 +70,7 @@ def many_goals(count: int) -> list[Problem]:
     found: list[Problem] = []
     index = 0
     while len(found) < count:
-        drawn = draw_problem(settings, PANDA, np.random.default_rng([SEED, 1, index]))
+        drawn = draw_problem(settings, PANDA, np.random.default_rng([SEED, 1, index]))[1]
         index += 1
         checker = CollisionChecker(PANDA, drawn.scene)
         nearest = np.linalg.norm(drawn.goals - drawn.start, axis=1).argmin()

@@ -1,10 +1,12 @@
-"""Files that are written whole or not at all, and folders that one process fills at a time."""
+"""Files written whole or not at all, or line by line; folders that one process fills at a time."""
 
 import fcntl
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from robotdiffuse.errors import InputError
 
@@ -26,6 +28,43 @@ def write_atomically(file: Path, content: str | bytes, make_folder: bool = False
             raise
     except OSError as error:
         raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
+
+
+class JsonLines:
+    """JSON objects, one a line; each is on the disk when `append` returns. Without a file, in memory."""
+
+    def __init__(self, file: Path | None) -> None:
+        """What is there already, but for a last line that was cut off. Raises InputError, naming file and
+        line, for any other line that is no JSON object."""
+        self.rows: list[dict[str, Any]] = []
+        self._file = file
+        if file is None or not file.is_file():
+            return
+        content = file.read_bytes()
+        whole = content[: content.rfind(b"\n") + 1]
+        for number, line in enumerate(whole.splitlines(), start=1):
+            try:
+                self.rows.append(dict(json.loads(line)))
+            except (ValueError, TypeError) as error:
+                raise InputError(f"{file}, line {number} is no JSON object: {error}") from None
+        if whole != content:
+            write_atomically(file, whole)
+
+    def replace(self, rows: list[dict[str, Any]]) -> None:
+        """Write these in place of what is there, whole or not at all."""
+        self.rows = rows
+        if self._file is not None:
+            write_atomically(self._file, "".join(json.dumps(row) + "\n" for row in rows), make_folder=True)
+
+    def append(self, row: dict[str, Any]) -> None:
+        self.rows.append(row)
+        if self._file is None:
+            return
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        with self._file.open("a") as stream:
+            stream.write(json.dumps(row) + "\n")
+            stream.flush()
+            os.fsync(stream.fileno())
 
 
 @contextmanager

@@ -19,7 +19,8 @@ from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.planner import moving_links
 from robotdiffuse.learning.training.validation import FLOOR
-from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, sample_scene
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import pack_scene
@@ -59,7 +60,7 @@ def model_config(robot: Robot, **changes) -> MotionModelConfig:
 def test_training_is_told_what_planning_is() -> None:
     """In scenes of different size at once; clearances are those that are told without gradients."""
     rng = np.random.default_rng(1)
-    scenes = [Scene(sample_scene(family, rng).shapes[1:]) for family in (ROP, ROP_DENSE, ROP_DENSE)]
+    scenes = [Scene(family.scene(rng).shapes[1:]) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     packed = [pack_scene(scene, 12) for scene in [*scenes, Scene([])]]
     kinds, params = (np.stack(part) for part in zip(*packed, strict=True))
     q, config = configurations(len(packed), 60), model_config(PANDA, sees_gradients=True)

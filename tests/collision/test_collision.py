@@ -20,8 +20,9 @@ from robotdiffuse.collision.kernels.lanes import block_hits, free_many
 from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.collision.points import THINNING, build_grid, cover, thin
 from robotdiffuse.errors import InputError
-from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, sample_scene
-from robotdiffuse.problems.rop_problems import base_spheres
+from robotdiffuse.problems.families.family import base_spheres
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -227,7 +228,7 @@ def test_any_number_of_configurations(count: int) -> None:
 @pytest.mark.parametrize("seed", range(8))
 def test_free_by_spheres_is_free_by_mesh(seed: int) -> None:
     robot, rng = with_spheres("panda"), np.random.default_rng(seed)
-    scene = sample_scene(ROP if seed < 2 else ROP_DENSE, rng, base_spheres(robot))
+    scene = (ROP if seed < 2 else ROP_DENSE).scene(rng, base_spheres(robot))
     shapes = [random_shape(kind, rng) for kind in ("cylinder", "capsule", "box", "cloud")]
     scene = Scene([*scene.shapes, *shapes[: seed % 5]])
     q = rng.uniform(robot.lower, robot.upper, (600, robot.dof))

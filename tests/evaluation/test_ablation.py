@@ -11,15 +11,13 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import ablation
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.statistics import bootstrap_interval
-from robotdiffuse.evaluation.trials import Tried, goal_of, held_out_problems
+from robotdiffuse.evaluation.trials import Tried
 from robotdiffuse.learning.denoisers import DENOISERS, Transformer
 from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.planner import _model_config
 from robotdiffuse.robots import load_robot
-from robotdiffuse.types import Path as Motion
-from robotdiffuse.verify import Verifier, VerifySettings
 
 PANDA = load_robot("panda")
 
@@ -76,16 +74,6 @@ def test_bootstrap_covers_the_mean() -> None:
         low, high = bootstrap_interval(rng.normal(1.0, 2.0, 80), seed=i)
         covered += low < 1.0 < high
     assert 50 <= covered <= 60
-
-
-def test_held_out_problems_are_not_trivial_and_kept(tmp_path: Path) -> None:
-    file = tmp_path / "out" / "problems.json"
-    first, more, anew = (held_out_problems(n, f) for n, f in ((2, file), (3, file), (3, tmp_path / "b.json")))
-    assert [len(problems) for problems in (first, more, anew)] == [2, 3, 3]
-    for problem, other in zip(more, anew, strict=True):
-        assert np.array_equal(problem.start, other.start)
-        line = Motion(problem.robot.joint_names, np.stack([problem.start, goal_of(problem)]))
-        assert not Verifier(problem, VerifySettings()).path(line).valid
 
 
 def test_a_trial_is_kept_for_what_it_was_of(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from robotdiffuse.cli import main
-from robotdiffuse.evaluation.bench.problem_sets import gather_cases
 from robotdiffuse.evaluation.bench.records import Record, RecordFile
+from robotdiffuse.evaluation.problem_sets import gather_cases
 from robotdiffuse.planners.rrt_connect.planner import RRTConnect
 from robotdiffuse.problems.problem import JointGoal
 
@@ -18,7 +18,7 @@ pytest.importorskip("pybullet", reason="the extra `sim` (pybullet) is not instal
 def folder(tmp_path: Path) -> Path:
     """One problem that the line does not solve: a path, and the line."""
     case = gather_cases(["rop_nontrivial"], 1, tmp_path, lambda _: None)[0]
-    problem = case.load()
+    problem = case.problem
     path = RRTConnect().plan(problem, 10.0).path
     assert path is not None and isinstance(problem.goal, JointGoal)
     about = Record("good", *case.key, case.family, case.trivial, 0, 1.0, "solved", "", 0.01)
@@ -47,6 +47,6 @@ def test_motions_are_looked_at_again(folder: Path, capsys: pytest.CaptureFixture
 def test_folder_without_results_or_problems(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "confirm", str(folder / "nothing")]) == 2
     assert "holds no results" in capsys.readouterr().err
-    (folder / "problems" / "rop_nontrivial.json").unlink()
+    (folder / "problems" / "rop.jsonl").unlink()
     assert main(["bench", "confirm", str(folder), "--count", "1"]) == 2
     assert "of rop_nontrivial, which has results" in capsys.readouterr().err

@@ -12,9 +12,10 @@ from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench import figures, page, plots, report
 from robotdiffuse.evaluation.bench.figures import GAVE_UP, LATER, RAN_OUT, counting, outcome
-from robotdiffuse.evaluation.bench.problem_sets import Case, family_problem, problem_record
 from robotdiffuse.evaluation.bench.records import Record, record_from_json
 from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
+from robotdiffuse.evaluation.problem_sets import case_file
+from robotdiffuse.problems.held_out import Case, held_out_problem
 from robotdiffuse.types import Path as Motion
 
 RUN = {
@@ -98,10 +99,8 @@ def write(folder: Path, records: list[Record], counts: dict[float, int | None] |
 
 
 def keep_problems(folder: Path, names: list[str]) -> None:
-    problem = problem_record(family_problem("rop", 0))
-    lines = ",".join(json.dumps(Case("rop", name, "rop", False, problem).__dict__) for name in names)
-    (folder / "problems").mkdir()
-    (folder / "problems" / "rop.json").write_text(f'{{"drawn": {len(names)}, "cases": [{lines}]}}')
+    problem = held_out_problem("rop", 0)
+    case_file(folder / "problems", "rop").fill([Case(n, "rop", problem, n == "rop/3") for n in names])
 
 
 @pytest.fixture
@@ -258,7 +257,7 @@ def test_a_metric_is_declared_in_one_place(
     pytest.importorskip("matplotlib")
     waypoints = Metric("waypoint_count", "kilo", "less", ".4f", lambda m: len(m.path.positions), 1e-3)
     monkeypatch.setitem(METRICS, waypoints.name, waypoints)
-    problem = family_problem("rop", 0)
+    problem = held_out_problem("rop", 0)
     line = np.stack([problem.start, problem.start + 0.1, problem.start])
     measured = Measure(problem.robot)(Motion(problem.robot.joint_names, line))
     record = solved("robotdiffuse", "rop/9", 1.0, [(0.1, 0.5)], measures=measured)
@@ -307,11 +306,7 @@ def test_the_command_writes_everything(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("matplotlib")
-    problem = problem_record(family_problem("rop", 0))
-    cases = [Case("rop", f"rop/{i}", "rop", i == 3, problem) for i in range(2)]
-    lines = ",".join(json.dumps(case.__dict__) for case in cases)
-    (small / "problems").mkdir()
-    (small / "problems" / "rop.json").write_text(f'{{"drawn": 2, "cases": [{lines}]}}')
+    keep_problems(small, ["rop/0", "rop/1"])
     out = tmp_path / "out"
     assert main(["bench", "report", str(small), "--out", str(out), "--limits", "1,10", "--no-replays"]) == 0
     said = capsys.readouterr().out
@@ -331,11 +326,7 @@ def test_the_command_writes_everything(
 
 
 def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
-    problem = problem_record(family_problem("rop", 0))
-    cases = [Case("rop", f"rop/{i}", "rop", i == 3, problem) for i in range(4)]
-    lines = ",".join(json.dumps(case.__dict__) for case in cases)
-    (small / "problems").mkdir()
-    (small / "problems" / "rop.json").write_text(f'{{"drawn": 4, "cases": [{lines}]}}')
+    keep_problems(small, [f"rop/{i}" for i in range(4)])
     bench = figures.read_bench(small)
     shown = page.worth_showing(bench, figures.sections(bench, [1.0]))
     titles = [motion.title for motion in shown]

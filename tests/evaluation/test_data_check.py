@@ -13,7 +13,6 @@ from robotdiffuse.data.shards import read_shard, shard_path, write_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.data.check import KINDS, check_data
 from robotdiffuse.evaluation.data.rows import motion_of, pick_rows, problem_of, scene_of
-from robotdiffuse.problems.families.rop import RopSettings, floor_box
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -180,13 +179,14 @@ def test_rows_are_problems_again(tmp_path):
     motion = motion_of(ARM, shard, 0)
     assert isinstance(motion, Motion) and np.array_equal(motion.positions, near["trajectories"])
 
-    floored = replace(manifest, families={"rop": {"floor_size": 3.0, "x": [0.0, 1.0]}})
+    floored = replace(
+        manifest, families={"rop": {"floor_size": 3.0, "floor_thickness": 0.1, "x": [0.0, 1.0]}}
+    )
     first, *others = scene_of(floored, shard, 0).shapes
-    floor = floor_box(RopSettings(floor_size=3.0))
-    assert floor is not None and isinstance(first, Box) and np.array_equal(first.size, floor.size)
+    assert isinstance(first, Box) and first.size.tolist() == [3.0, 3.0, 0.1]
     assert len(others) == 2
-    with pytest.raises(InputError, match=r"families\.rop.*height"):
-        scene_of(replace(manifest, families={"rop": {"height": 1.0}}), shard, 0)
+    with pytest.raises(InputError, match="family 'rap'"):
+        scene_of(replace(manifest, families={"rap": {}}), shard, 0)
     with pytest.raises(InputError, match="family is 0; the manifest has 0"):
         scene_of(replace(manifest, families={}), shard, 0)
 

@@ -19,11 +19,10 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.data.shards import check_shard, read_manifest, read_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.data.rows import path_of, problem_of
-from robotdiffuse.generation import GenerationSettings, factory, generate, problems
-from robotdiffuse.generation.problems import draw_problem
-from robotdiffuse.generation.shard_maker import NUMBERS, make_shard, resample
-from robotdiffuse.problems.families import FAMILIES, floor_of
-from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.generation import GenerationSettings, factory, generate
+from robotdiffuse.generation.shard_maker import NUMBERS, draw, make_shard, resample
+from robotdiffuse.problems.families import family, rop
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.packed import pack_scene
@@ -98,9 +97,9 @@ def test_shards_are_whole_and_what_the_manifest_says(folder: Path) -> None:
 def checked_problem(row: dict[str, Any]) -> tuple[Problem, CollisionChecker]:
     """The problem of a row's own number, drawn again: it is the one that the row says."""
     rng = np.random.default_rng([SETTINGS.seed, int(row["seed"])])
-    drawn = draw_problem(SETTINGS, PANDA, rng)
-    assert row["family"] == drawn.family
-    floor = floor_of(list(SETTINGS.families.values())[drawn.family])
+    number, drawn = draw(SETTINGS, PANDA, rng)
+    assert row["family"] == number
+    floor = list(SETTINGS.families.values())[number].floor
     kinds, params = pack_scene(Scene(drawn.scene.shapes[floor is not None :]), SETTINGS.slots)
     np.testing.assert_array_equal(row["obstacle_kinds"], kinds)
     np.testing.assert_array_equal(row["obstacle_params"], params)
@@ -109,9 +108,7 @@ def checked_problem(row: dict[str, Any]) -> tuple[Problem, CollisionChecker]:
     np.testing.assert_array_equal(row["goals"][:k], drawn.goals)
     assert np.isnan(row["goals"][k:]).all() and np.isnan(row["goal_costs"][k:]).all()
     assert not np.isnan(row["goal_costs"][:k]).any()
-    goal = JointGoal(drawn.goals.astype(float))
-    problem = Problem(PANDA, drawn.scene, drawn.start.astype(float), goal)
-    return problem, CollisionChecker(PANDA, drawn.scene)
+    return drawn.problem(PANDA), CollisionChecker(PANDA, drawn.scene)
 
 
 @pytest.mark.parametrize("i", range(12))
@@ -228,11 +225,10 @@ def test_unknown_kinds_are_refused_with_those_known(name: str, known: str) -> No
 
 
 def test_scenes_out_of_reach_are_refused() -> None:
-    far = replace(FAMILIES["rop"], tip_x=(5.0, 5.1))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(FAMILIES, "rop", far)
-        patch.setattr(problems, "SCENES", 2)
-        with pytest.raises(InputError, match="no free start and goal in 2 scenes of rop for panda"):
+        patch.setattr(rop, "ROP", replace(rop.ROP, tip_x=(5.0, 5.1)))
+        patch.setattr(family, "SCENES", 2)
+        with pytest.raises(InputError, match="no free start and goal in 2 scenes of Rop for panda"):
             make_shard(replace(SETTINGS, mix={"rop": 1.0}), 0)
 
 

@@ -29,10 +29,10 @@ from numpy import ndarray
 from safetensors.numpy import load_file
 
 from robotdiffuse.data.shards import read_shard
-from robotdiffuse.evaluation.bench.problem_sets import family_problem
 from robotdiffuse.planners import load_planner
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import problem_record
+from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import Problem
 
 GOLDEN = Path(__file__).with_name("golden.json")
@@ -100,7 +100,7 @@ def problem_numbers(problem: Problem) -> ndarray:
 
 def problems() -> Iterator[tuple[str, Entry]]:
     for family in FAMILIES:
-        rows = [problem_numbers(family_problem(family, i)) for i in range(PROBLEMS)]
+        rows = [problem_numbers(held_out_problem(family, i)) for i in range(PROBLEMS)]
         yield family, entry(np.concatenate(rows))
 
 
@@ -138,7 +138,7 @@ def weights() -> Iterator[tuple[str, Entry]]:
 
 
 def plans() -> Iterator[tuple[str, Entry]]:
-    asked = [(family, index, family_problem(family, index)) for family, index in PLANS]
+    asked = [(family, index, held_out_problem(family, index)) for family, index in PLANS]
     for name in PLANNERS:
         planner = load_planner(name)
         for family, index, problem in asked:

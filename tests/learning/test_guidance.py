@@ -10,9 +10,8 @@ from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
-from robotdiffuse.problems.families.rop import ROP_DENSE
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal
-from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Sphere
@@ -90,7 +89,7 @@ def test_limits_are_kept() -> None:
 def test_random_motions_of_the_panda_get_better() -> None:
     robot, before, after, solved = load_robot("panda"), 0.0, 0.0, 0
     for seed in range(20):
-        problem = sample_problem(robot, ROP_DENSE, np.random.default_rng(seed))
+        problem = ROP_DENSE.draw(robot, np.random.default_rng(seed)).problem(robot)
         assert isinstance(problem.goal, JointGoal)
         checker = CollisionChecker(robot, problem.scene)
         line = straight(problem.start, problem.goal.positions[0])[None]

@@ -7,7 +7,8 @@ import torch
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.training.losses import ArmDistance, LossSettings, SurfacePoints, hinge
-from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, floor_box, sample_scene
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics, link_pose
 from robotdiffuse.scenes.packed import pack_scene
@@ -27,7 +28,7 @@ def configurations(n: int, frames: int, seed: int = 0) -> torch.Tensor:
 def test_distances_are_those_of_the_kernel(floor: bool) -> None:
     """In scenes of different size at once, with turned boxes among them."""
     rng = np.random.default_rng(1)
-    scenes = [Scene(sample_scene(family, rng).shapes[1:]) for family in (ROP, ROP_DENSE, ROP_DENSE)]
+    scenes = [Scene(family.scene(rng).shapes[1:]) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     turned = rng.normal(size=4)
     scenes += [Scene([]), Scene([Box([0.4, 0.1, 0.5], [0.1, 0.3, 0.6], turned / np.linalg.norm(turned))])]
     packed = [pack_scene(scene, 12) for scene in scenes]
@@ -35,9 +36,7 @@ def test_distances_are_those_of_the_kernel(floor: bool) -> None:
     q = configurations(len(scenes), 20)
     distance = ArmDistance(DOUBLE, floor)(q, kinds, params).numpy()
     for i, scene in enumerate(scenes):
-        box = floor_box(ROP)
-        assert box is not None
-        full = Scene([*scene.shapes, *([box] if floor else [])])
+        full = Scene([*scene.shapes, *([ROP.floor] if floor else [])])
         expected = CollisionChecker(PANDA, full).link_clearances(q[i].numpy()).min(axis=1)
         # the floor's box is as wide as the arm reaches; deep in it the plane and the box differ
         checked = (expected > -0.05) & (expected < 0.8)
@@ -48,7 +47,7 @@ def test_distances_are_those_of_the_kernel(floor: bool) -> None:
 
 def test_the_hinge_and_its_gradient() -> None:
     rng = np.random.default_rng(2)
-    kinds, params = pack_scene(Scene(sample_scene(ROP, rng).shapes[1:]), 2)
+    kinds, params = pack_scene(Scene(ROP.scene(rng).shapes[1:]), 2)
     arm, q = ArmDistance(DOUBLE), configurations(1, 6, 3).requires_grad_()
 
     def loss(at: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,7 @@ import pytest
 from helpers.example_robots import example_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.training.turns import turned, turns_about_vertical
-from robotdiffuse.problems.families.rop import ROP_DENSE, sample_scene
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.packed import pack_scene, unpack_scene
 from robotdiffuse.scenes.scene import Scene
@@ -14,8 +14,8 @@ from robotdiffuse.scenes.scene import Scene
 
 def test_turned_motions_have_the_same_clearances():
     robot, rng = load_robot("panda"), np.random.default_rng(3)
-    scenes = [sample_scene(ROP_DENSE, rng) for _ in range(6)]
-    packed = [pack_scene(Scene(scene.shapes[1:]), ROP_DENSE.slots) for scene in scenes]
+    scenes = [ROP_DENSE.scene(rng) for _ in range(6)]
+    packed = [pack_scene(Scene(scene.shapes[1:]), 13) for scene in scenes]
     params = np.stack([params for _, params in packed])
     start, goal = rng.uniform(robot.lower, robot.upper, (2, 6, robot.dof))
     q = np.linspace(start, goal, 20, axis=1).astype(np.float32)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.trials import problem_number
 from robotdiffuse.planners import PLANNERS, SEARCH, load_planner
+from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
@@ -26,7 +26,7 @@ def name(request: pytest.FixtureRequest) -> str:
 
 @pytest.mark.parametrize("number", [0, 4])
 def test_solved_means_verified(name: str, number: int) -> None:
-    problem = problem_number(number)
+    problem = held_out_problem("rop", number)
     result = load_planner(name).plan(problem, time_limit=1.0, seed=number)
     assert result.planner == name and result.reason
     assert (result.path is not None) == (result.trajectory is not None) == result.solved

@@ -19,7 +19,6 @@ from robotdiffuse.planners.robotdiffuse import (
 from robotdiffuse.planners.rrt_connect.planner import RRTConnect
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.sampling import sample_surface
@@ -50,7 +49,7 @@ def test_the_network_solves_and_the_judge_agrees(planner):
 
 @pytest.mark.parametrize("index", range(8))
 def test_solved_means_verified(planner, index):
-    problem = sample_problem(PANDA, ROP, np.random.default_rng([12, index]))
+    problem = ROP.draw(PANDA, np.random.default_rng([12, index])).problem(PANDA)
     result = planner.plan(problem, time_limit=10.0, seed=index)
     if result.solved:
         assert result.path is not None and verify(problem, result.path).valid

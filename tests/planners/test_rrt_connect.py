@@ -13,9 +13,9 @@ from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.ends import retreat
 from robotdiffuse.planners.rrt_connect import kernel
 from robotdiffuse.planners.rrt_connect.planner import RRTConnect, RRTConnectSettings
-from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
@@ -40,7 +40,7 @@ RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 @pytest.mark.parametrize("family", [ROP, ROP_DENSE], ids=["rop", "rop_dense"])
 @pytest.mark.parametrize("index", range(6))
 def test_solved_means_verified(family, index):
-    problem = sample_problem(PANDA, family, np.random.default_rng([11, index]))
+    problem = family.draw(PANDA, np.random.default_rng([11, index])).problem(PANDA)
     result = RRTConnect().plan(problem, time_limit=5.0)
     assert result.status in (Status.SOLVED, Status.TIMEOUT)
     if result.solved:

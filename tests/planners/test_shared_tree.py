@@ -17,9 +17,9 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.planners import load_planner
 from robotdiffuse.planners.shared_tree import kernel
 from robotdiffuse.planners.shared_tree.planner import SharedTreeRRTStar, SharedTreeSearch, SharedTreeSettings
-from robotdiffuse.problems.families.rop import ROP, ROP_DENSE
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.problems.rop_problems import sample_problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
@@ -227,7 +227,7 @@ def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
 @pytest.mark.parametrize("family", [ROP, ROP_DENSE], ids=["rop", "rop_dense"])
 @pytest.mark.parametrize("index", range(4))
 def test_solved_means_verified(family, index) -> None:
-    problem = sample_problem(PANDA, family, np.random.default_rng([21, index]))
+    problem = family.draw(PANDA, np.random.default_rng([21, index])).problem(PANDA)
     result = SharedTreeRRTStar().plan(problem, time_limit=5.0)
     assert result.status in (Status.SOLVED, Status.NO_PATH)
     if result.solved:

@@ -8,20 +8,19 @@ import pytest
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.families import furniture
+from robotdiffuse.problems.families.crate import CRATE
+from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.furniture import (
-    CRATE,
     FLOOR,
-    FURNITURE,
     MARGIN,
-    SHELF,
     SHOULDER,
-    TABLE,
     Furnished,
+    Furniture,
     Region,
-    sample_furniture,
     sample_target,
 )
-from robotdiffuse.problems.rop_problems import base_spheres
+from robotdiffuse.problems.families.shelf import SHELF
+from robotdiffuse.problems.families.table import TABLE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
@@ -29,12 +28,13 @@ from robotdiffuse.scenes.packed import pack_scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
 BASE = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
+FURNITURE: dict[str, Furniture] = {"shelf": SHELF, "crate": CRATE, "table": TABLE}
 every_family = pytest.mark.parametrize("name", FURNITURE)
 
 
 def drawn(name: str, count: int, seed: int = 0) -> list[Furnished]:
     rng = np.random.default_rng(seed)
-    return [sample_furniture(FURNITURE[name], rng, BASE) for _ in range(count)]
+    return [FURNITURE[name].furnish(rng, BASE) for _ in range(count)]
 
 
 def named(furnished: Furnished, name: str) -> list[Shape]:
@@ -53,7 +53,7 @@ def gaps(shape: Shape, points: np.ndarray) -> np.ndarray:
 
 @every_family
 def test_scenes_pack_and_stand_on_the_ground(name: str) -> None:
-    slots = FURNITURE[name].slots
+    slots = FURNITURE[name].most_obstacles
     assert slots <= 24
     for furnished in drawn(name, 30):
         floor, *shapes = furnished.scene.shapes
@@ -159,10 +159,10 @@ def test_targets_have_the_fingers_in_the_region() -> None:
 @pytest.mark.parametrize(
     ("settings", "change", "message"),
     [
-        (SHELF, {"boards": (1, 3)}, "boards is from 1; it must be at least 2"),
+        (SHELF, {"boards": (1, 3)}, "boards is 1; it must be at least 2"),
         (SHELF, {"depth": (0.3, 0.2)}, "depth is from 0.3 to 0.2"),
         (SHELF, {"back_share": 1.5}, "back_share is 1.5"),
-        (CRATE, {"thickness": (0.0, 0.02)}, "thickness is from 0.0; it must be positive"),
+        (CRATE, {"thickness": (0.0, 0.02)}, "thickness is 0.0; it must be positive"),
         (CRATE, {"reach": -1.0}, "reach is -1.0"),
         (TABLE, {"wall_share": 0.8}, "wall_share is 0.8 and pillar_share 0.3"),
     ],
@@ -176,7 +176,7 @@ def test_wrong_settings(settings: object, change: dict[str, object], message: st
 def test_impossible_settings(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(furniture, "MAX_TRIES", 5)
     with pytest.raises(InputError, match="in 5 draws; change distance or reach"):
-        sample_furniture(replace(FURNITURE[name], reach=0.01), np.random.default_rng(6), BASE)
+        replace(FURNITURE[name], reach=0.01).furnish(np.random.default_rng(6), BASE)
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +192,7 @@ def test_problems_for_a_panda_are_possible_and_hard(panda: Robot, name: str) -> 
     quick = InverseKinematicsSettings(max_rounds=2, patience=1)
     scenes, possible, hard = 20, 0, 0
     for _ in range(scenes):
-        furnished = sample_furniture(FURNITURE[name], rng, base_spheres(panda))
+        furnished = FURNITURE[name].furnish(rng, base_spheres(panda))
         checker = CollisionChecker(panda, furnished.scene)
         ends: list[np.ndarray] = []
         for i in rng.permutation(len(furnished.regions)):

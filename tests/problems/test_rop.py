@@ -1,4 +1,4 @@
-"""ROP scenes: what they are drawn from, packing, points for training; random problems."""
+"""ROP scenes: what they are drawn from, packing, points for training."""
 
 from dataclasses import replace
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.problems.families.rop import ROP, ROP_DENSE, RopSettings, sample_scene
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.problems.families.rop import ROP, Rop
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.scenes.packed import pack_scene, unpack_scene
 from robotdiffuse.scenes.sampling import VisibleRegion, sample_surface, sample_surfaces_batch
 from robotdiffuse.scenes.scene import Scene
@@ -18,7 +18,7 @@ FLOOR = 1
 
 def test_papers_scenes() -> None:
     rng = np.random.default_rng(0)
-    shapes = [shape for _ in range(300) for shape in sample_scene(ROP, rng).shapes]
+    shapes = [shape for _ in range(300) for shape in ROP.scene(rng).shapes]
     floors, obstacles = shapes[::3], [shape for shape in shapes if shape.name != "floor"]
     assert len(obstacles) == 600
     for floor in floors:
@@ -36,27 +36,25 @@ def test_papers_scenes() -> None:
 
 def test_dense_scenes() -> None:
     rng = np.random.default_rng(1)
-    scenes = [sample_scene(ROP_DENSE, rng) for _ in range(200)]
+    scenes = [ROP_DENSE.scene(rng) for _ in range(200)]
     counts = {len(scene.shapes) - FLOOR for scene in scenes}
     assert counts == set(range(3, 13))
-    assert ROP_DENSE.slots == 13
+    assert ROP_DENSE.most_obstacles == 12
     radii = [shape.radius for scene in scenes for shape in scene.shapes if isinstance(shape, Sphere)]
     assert 0.08 <= min(radii) < 0.1 and 0.18 < max(radii) <= 0.2
 
 
 def test_every_setting_counts() -> None:
-    settings = RopSettings(
-        obstacles=(4, 4), kinds=("box",), cube_side=(0.3, 0.4), x=(2.0, 3.0), yaw=True, floor=False
-    )
-    shapes = sample_scene(settings, np.random.default_rng(2)).shapes
-    assert len(shapes) == 4 == settings.slots
+    settings = Rop(obstacles=(4, 4), kinds=("box",), cube_side=(0.3, 0.4), x=(2.0, 3.0), yaw=True)
+    shapes = settings.scene(np.random.default_rng(2)).shapes[FLOOR:]
+    assert len(shapes) == 4 == settings.most_obstacles
     for shape in shapes:
         assert isinstance(shape, Box) and 2 <= shape.center[0] <= 3 and 0.3 <= shape.size[0] <= 0.4
         assert 0 < abs(shape.wxyz[3]) <= np.sin(np.pi / 8) and shape.wxyz[1] == shape.wxyz[2] == 0
 
 
 def test_same_seed_same_scene() -> None:
-    packs = [pack_scene(sample_scene(ROP_DENSE, np.random.default_rng(3)), 13) for _ in range(2)]
+    packs = [pack_scene(ROP_DENSE.scene(np.random.default_rng(3)), 13) for _ in range(2)]
     assert (packs[0][0] == packs[1][0]).all() and (packs[0][1] == packs[1][1]).all()
 
 
@@ -65,13 +63,13 @@ def test_obstacles_stay_clear_of_the_base() -> None:
     keep_out = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
     settings = replace(ROP, x=(-0.5, 0.5), y=(-0.5, 0.5), yaw=True)
     for _ in range(100):
-        for shape in sample_scene(settings, rng, keep_out).shapes[FLOOR:]:
+        for shape in settings.scene(rng, keep_out).shapes[FLOOR:]:
             points = sample_surface(Scene([shape]), 200, rng, VisibleRegion(floor=-5.0, reach=9.0))
             gaps = np.linalg.norm(points[:, None] - keep_out[:, :3], axis=2) - keep_out[:, 3]
             assert gaps.min() > 0
             assert isinstance(shape, Sphere | Box) and np.linalg.norm(shape.center - keep_out[0, :3]) > 0.15
     with pytest.raises(InputError, match="widen"):
-        sample_scene(replace(ROP, x=(0.0, 0.0), y=(0.0, 0.0), z=(0.1, 0.1)), rng, keep_out)
+        replace(ROP, x=(0.0, 0.0), y=(0.0, 0.0), z=(0.1, 0.1)).scene(rng, keep_out)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +80,6 @@ def test_obstacles_stay_clear_of_the_base() -> None:
         ({"obstacles": (3, 2)}, "obstacles is from 3 to 2"),
         ({"kinds": ()}, "must allow a scene"),
         ({"sphere_radius": (0.0, 0.1)}, "must be positive"),
-        ({"floor_size": 0.0}, "floor_size is 0.0"),
     ],
 )
 def test_wrong_settings(change: dict[str, object], message: str) -> None:
@@ -91,7 +88,7 @@ def test_wrong_settings(change: dict[str, object], message: str) -> None:
 
 
 def test_packing() -> None:
-    scene = sample_scene(replace(ROP_DENSE, yaw=True), np.random.default_rng(5))
+    scene = replace(ROP_DENSE, yaw=True).scene(np.random.default_rng(5))
     kinds, params = pack_scene(scene, 15)
     assert kinds.shape == (15,) and params.shape == (15, 10)
     back = unpack_scene(kinds, params)
@@ -109,7 +106,7 @@ def test_packing() -> None:
 def test_batch_has_the_distribution_of_single_scenes() -> None:
     """Shares of points by shape and by half of space, against sample_surface on the same scenes."""
     rng = np.random.default_rng(6)
-    scenes = [sample_scene(replace(ROP_DENSE, yaw=True), rng) for _ in range(12)]
+    scenes = [replace(ROP_DENSE, yaw=True).scene(rng) for _ in range(12)]
     kinds, params = map(np.stack, zip(*(pack_scene(scene, 13) for scene in scenes), strict=True))
     batch = sample_surfaces_batch(kinds, params, 4096, rng)
     region = VisibleRegion()
@@ -146,45 +143,3 @@ def test_batch_of_nothing_visible_is_zero() -> None:
         32,
         3,
     )
-
-
-@pytest.fixture(scope="module")
-def panda() -> Robot:
-    from robotdiffuse.robots import load_robot
-
-    return load_robot("panda")
-
-
-@pytest.mark.parametrize("settings", [ROP, ROP_DENSE], ids=["paper", "dense"])
-def test_problems(panda: Robot, settings: RopSettings) -> None:
-    from robotdiffuse.collision import CollisionChecker
-    from robotdiffuse.problems.problem import JointGoal
-    from robotdiffuse.problems.rop_problems import sample_problem
-    from robotdiffuse.robots.kinematics import link_pose
-
-    rng = np.random.default_rng(8)
-    for _ in range(5):
-        problem = sample_problem(panda, settings, rng)
-        assert isinstance(problem.goal, JointGoal)
-        ends = np.stack([problem.start, problem.goal.positions[0]])
-        assert CollisionChecker(panda, problem.scene).free(ends).all()
-        assert (ends[0] != ends[1]).any()
-        for q in ends:
-            x, y, z = link_pose(panda, q, panda.tip)[:3, 3]
-            assert abs(x) <= 0.6 and abs(y) <= 0.6 and 0.2 <= z <= 0.8
-
-
-def test_same_seed_same_problem(panda: Robot) -> None:
-    from robotdiffuse.problems.rop_problems import sample_problem
-
-    a, b = (sample_problem(panda, ROP, np.random.default_rng(9)) for _ in range(2))
-    assert (a.start == b.start).all()
-    assert (pack_scene(a.scene, 3)[1] == pack_scene(b.scene, 3)[1]).all()
-
-
-def test_impossible_problems(panda: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
-    from robotdiffuse.problems import rop_problems
-
-    monkeypatch.setattr(rop_problems, "SCENES", 2)
-    with pytest.raises(InputError, match="no free start and goal in 2 scenes"):
-        rop_problems.sample_problem(panda, replace(ROP, tip_z=(5.0, 6.0)), np.random.default_rng(10))

@@ -149,19 +149,17 @@ def run_report(arguments: argparse.Namespace) -> int:
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
     """The name of the file; None if there is nothing to replay."""
     from robotdiffuse.evaluation.bench.page import worth_showing
-    from robotdiffuse.problems.files import Robots
     from robotdiffuse.types import Path as Waypoints
     from robotdiffuse.viewer.gallery import Exhibit, write_gallery
 
-    robots: Robots = {}
-    shown = [(motion, motion.case.load(robots)) for motion in worth_showing(bench, parts)]
+    shown = worth_showing(bench, parts)
     if not shown:
         return None
-    robot = shown[0][1].robot
+    robot = shown[0].case.problem.robot
     exhibits = [
         Exhibit(motion.title, motion.caption, problem.scene, Waypoints(robot.joint_names, motion.positions))
-        for motion, problem in shown
-        if problem.robot.name == robot.name
+        for motion in shown
+        if (problem := motion.case.problem).robot.name == robot.name
     ]
     write_gallery(robot, exhibits, file, "Motions")
     return file.name

@@ -3,7 +3,6 @@
 The arrays of a scene have the same types whatever the scene holds, so that no obstacle causes a compilation.
 """
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy import ndarray
 from robotdiffuse.collision.near_pairs import no_tables, tabulate
 from robotdiffuse.collision.points import EMPTY, build_grid, cover, thin
 from robotdiffuse.robots.reach import motion_radii
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated, pose
 
@@ -69,7 +68,7 @@ def robot_groups(robot: Robot) -> tuple[str, ...]:
     return tuple(sorted(links, key=lambda link: robot.link_frame(link) > 0))
 
 
-@lru_cache(maxsize=16)
+@once_per_robot
 def compile_robot(robot: Robot) -> RobotArrays:
     """The arrays of a robot with its joints locked as they are."""
     groups = robot_groups(robot)
@@ -101,7 +100,7 @@ def compile_robot(robot: Robot) -> RobotArrays:
     return arrays._replace(pairs=found, near=near)
 
 
-@lru_cache(maxsize=16)
+@once_per_robot
 def reach(robot: Robot) -> float:
     """An upper bound of the distance of any sphere's surface from the base's origin [m]."""
     lengths = np.linalg.norm(robot.frame_offsets[:, :3, 3], axis=1)

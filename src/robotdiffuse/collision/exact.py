@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
 from robotdiffuse.transforms import transform
@@ -109,7 +109,7 @@ def _surface(vertices: ndarray, faces: ndarray) -> coal.BVHModelOBBRSS:
     return model
 
 
-@lru_cache(maxsize=16)
+@once_per_robot
 def _pieces(robot: Robot) -> dict[str, tuple[_Piece, ...]]:
     """Convex parts of every link that has geometry."""
     pieces: dict[str, tuple[_Piece, ...]] = {}

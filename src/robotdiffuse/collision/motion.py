@@ -19,7 +19,7 @@ from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.exact import Check, ExactCollision
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.robots.reach import motion_radii
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 
 FINEST = 0.002
@@ -266,6 +266,7 @@ def _check_levers(robot: Robot, checks: tuple[Check, ...]) -> Float[ndarray, "do
     return levers
 
 
+@once_per_robot
 def _covered(robot: Robot) -> Robot:
     """The robot, with one sphere about the meshes of each link that has meshes but no spheres."""
     added = {}

@@ -21,14 +21,13 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.data.shards import read_manifest
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.evaluation.metrics import Kinematics
+from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.tables import Column, Table
 from robotdiffuse.evaluation.trials import (
     NETWORK_ALONE,
-    SEED,
     Tried,
     from_network,
-    held_out_problems,
     judged,
     without_network,
 )
@@ -40,6 +39,7 @@ from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.planners.robotdiffuse import RobotDiffuseSettings
+from robotdiffuse.problems.held_out import SEED
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 
@@ -148,7 +148,8 @@ def _run(
             _check_budget(FilePath(settings.out) / config / "model.json", "samples", settings.samples)
             report(f"trained {config}")
         _check_same_data(settings, configs)
-        problems = held_out_problems(settings.problems, FilePath(settings.out) / "problems.json")
+        cases = hard_cases("rop", settings.problems, FilePath(settings.out) / "problems", report)
+        problems = [case.problem for case in cases]
         trials = [
             (settings, config, guided, problems) for config in (*configs, None) for guided in (False, True)
         ]

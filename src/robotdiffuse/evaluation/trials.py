@@ -1,4 +1,4 @@
-"""Held-out ROP problems, and what a network's samples are worth on them; both kept in files."""
+"""What a network's samples are worth on held-out problems, kept in files."""
 
 import json
 from collections.abc import Callable
@@ -15,19 +15,11 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode, unlearned_starts
-from robotdiffuse.planners.rrt_connect.planner import RRTConnect
-from robotdiffuse.problems.families.rop import ROP
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.problems.rop_problems import sample_problem
+from robotdiffuse.problems.held_out import goal_of
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.types import Path
 from robotdiffuse.verify import Verifier, VerifySettings
-
-SEED = 20261121
-"""Of the held-out problems; data are drawn from other seed sequences."""
-SEARCH_TIME = 10.0
-"""Problems that this much search does not solve are left out [s]."""
-
 
 NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4)
 """How networks are sampled where they are looked at alone: without guidance, the planner's steps are few."""
@@ -62,31 +54,6 @@ class Tried:
         if found.pop("key") != key:
             return None
         return cls(**{name: np.array(values, np.float64) for name, values in found.items()})
-
-
-def problem_number(index: int) -> Problem:
-    """Each number is a problem, trivial and unsolvable ones among them."""
-    return sample_problem(load_robot("panda"), ROP, np.random.default_rng([SEED, index]))
-
-
-def held_out_problems(count: int, file: FilePath) -> list[Problem]:
-    """Problems that the straight line does not solve and search does; the file keeps their numbers."""
-    known = json.loads(file.read_text()) if file.is_file() else {"drawn": 0, "numbers": []}
-    while len(known["numbers"]) < count:
-        problem = problem_number(known["drawn"])
-        line = Path(problem.robot.joint_names, np.stack([problem.start, goal_of(problem)]))
-        trivial = Verifier(problem, VerifySettings()).path(line).valid
-        if not trivial and RRTConnect().plan(problem, SEARCH_TIME, seed=1).solved:
-            known["numbers"].append(known["drawn"])
-        known["drawn"] += 1
-        write_atomically(file, json.dumps(known), make_folder=True)
-    return [problem_number(number) for number in known["numbers"][:count]]
-
-
-def goal_of(problem: Problem) -> Float[ndarray, "dof"]:
-    """The goal configuration."""
-    assert isinstance(problem.goal, JointGoal)
-    return problem.goal.positions[0]
 
 
 def judged(

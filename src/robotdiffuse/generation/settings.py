@@ -4,11 +4,10 @@ from dataclasses import dataclass, field
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSettings
-from robotdiffuse.problems.families import FAMILIES, most_obstacles
-from robotdiffuse.problems.families.furniture import FurnitureSettings
-from robotdiffuse.problems.families.rop import RopSettings
+from robotdiffuse.problems.families import FAMILIES, Family, load_family
+from robotdiffuse.problems.families.family import POSE, POSITION
 
-TARGETS = ("position", "pose")
+TARGETS = (POSITION, POSE)
 TIMINGS = ("arc", "time")
 
 
@@ -26,7 +25,7 @@ class GenerationSettings:
     the number of their family in this order."""
     trivial_share: float = 1.0
     """Share that is kept of the problems that the straight line solves; 1 is the paper's distribution."""
-    target: str = "position"
+    target: str = POSITION
     """What is given of the tip's goal: its position alone, as in the paper, or the whole pose. Among
     furniture it is always the pose, with the fingers in a compartment, say."""
     goals: int = 10
@@ -65,14 +64,14 @@ class GenerationSettings:
             raise InputError(f"goals is {self.goals}; it must be at most 127")
 
     @property
-    def families(self) -> dict[str, RopSettings | FurnitureSettings]:
+    def families(self) -> dict[str, Family]:
         """Those of the mix, in its order."""
-        return {name: FAMILIES[name] for name in self.mix}
+        return {name: load_family(name) for name in self.mix}
 
     @property
     def slots(self) -> int:
         """Most obstacles of a scene, the floor left out."""
-        return max(most_obstacles(family) for family in self.families.values())
+        return max(family.most_obstacles for family in self.families.values())
 
     @property
     def shards(self) -> int:

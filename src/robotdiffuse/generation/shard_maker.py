@@ -9,12 +9,10 @@ from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
-from robotdiffuse.generation.problems import TargetProblem, draw_problem
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch
-from robotdiffuse.problems.families import floor_of
-from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.families import Drawn
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import pack_scene
@@ -64,7 +62,7 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
 def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     """The row of a problem by its number, or why there is none: thinned, unsolved or refused."""
     rng = np.random.default_rng([settings.seed, number])
-    drawn = draw_problem(settings, robot, rng)
+    family, drawn = draw(settings, robot, rng)
     checker = CollisionChecker(robot, drawn.scene)
     lines_free = [_line_is_free(settings, checker, drawn.start, goal) for goal in drawn.goals]
     thinned = rng.random() >= settings.trivial_share
@@ -80,8 +78,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     goal, line_free = drawn.goals[search.best_goal], lines_free[search.best_goal]
     if thinned and line_free:
         return "thinned"
-    goals = JointGoal(drawn.goals.astype(np.float64))
-    judge = Verifier(Problem(robot, drawn.scene, drawn.start.astype(np.float64), goals), VerifySettings())
+    judge = Verifier(drawn.problem(robot), VerifySettings())
     motion = _frames(settings, robot, path, judge)
     if motion is None:
         return "refused"
@@ -89,7 +86,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     q[0], q[-1] = drawn.start, goal
     if not judge.path(Path(robot.joint_names, q.astype(np.float64))).valid:
         return "refused"
-    row = _row(settings, drawn, search, q)
+    row = _row(settings, family, drawn, search, q)
     clearances = checker.link_clearances(q).min(axis=1)
     row["clearance"], row["end_clearance"] = clearances.min(), clearances[[0, -1]]
     row["line_free"] = np.bool_(line_free)
@@ -99,13 +96,25 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     return row
 
 
+def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -> tuple[int, Drawn]:
+    """A random problem, and the number of its family in the mix; the same state of `rng` gives the same."""
+    shares = np.array(list(settings.mix.values()))
+    number = int(rng.choice(len(shares), p=shares / shares.sum()))
+    family = list(settings.families.values())[number]
+    return number, family.draw(robot, rng, settings.goals, settings.target)
+
+
 def _row(
-    settings: GenerationSettings, drawn: TargetProblem, search: SharedTreeSearch, q: Float32[ndarray, "n dof"]
+    settings: GenerationSettings,
+    family: int,
+    drawn: Drawn,
+    search: SharedTreeSearch,
+    q: Float32[ndarray, "n dof"],
 ) -> Row:
     k, dof = drawn.goals.shape
     goals, goal_costs = np.full((settings.goals, dof), np.nan), np.full(settings.goals, np.nan)
     goals[:k], goal_costs[:k] = drawn.goals, search.goal_costs
-    floor = floor_of(list(settings.families.values())[drawn.family])
+    floor = list(settings.families.values())[family].floor
     kinds, params = pack_scene(Scene(drawn.scene.shapes[floor is not None :]), settings.slots)
     wxyz = quaternion_from_rotation(drawn.T_base_tip[:3, :3])
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
@@ -118,7 +127,7 @@ def _row(
         "target_pose": np.concatenate([wxyz, drawn.T_base_tip[:3, 3]]).astype(np.float32),
         "obstacle_kinds": kinds,
         "obstacle_params": params,
-        "family": np.int8(drawn.family),
+        "family": np.int8(family),
         "cost": np.float32(search.cost),
         "safety_distance": np.float32(search.safety_distance),
         "detour": np.float32(search.cost / max(straight, 1e-9)),

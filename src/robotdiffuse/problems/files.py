@@ -21,9 +21,6 @@ from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quat
 FIELDS = ("robot", "scene", "start", "goal")
 GOALS = ("joints", "joint_set", "pose")
 
-Robots = dict[tuple[str, tuple[tuple[str, float], ...]], Robot]
-"""Robots already read, by name or file and locked values: what is cached in one serves all its problems."""
-
 
 @dataclass(frozen=True, eq=False)
 class ProblemEntry:
@@ -56,11 +53,11 @@ def load_problem(file: str | Path, index: int = 0) -> Problem:
         if not 0 <= index < len(lines):
             raise InputError(f"index is {index}; {file} holds {len(lines)} problems, counted from 0")
         number, line = lines[index]
-        return _problem(f"{file}, line {number}", _json(f"{file}, line {number}", line), file.parent, {})
+        return _problem(f"{file}, line {number}", _json(f"{file}, line {number}", line), file.parent)
     if index != 0:
         raise InputError(f"index is {index}; {file} holds one problem, and only .jsonl files hold more")
     data = _json(str(file), text) if file.suffix.lower() == ".json" else read_yaml(file)
-    return _problem(str(file), data, file.parent, {})
+    return _problem(str(file), data, file.parent)
 
 
 def load_problems(file: str | Path) -> list[ProblemEntry]:
@@ -74,11 +71,10 @@ def load_problems(file: str | Path) -> list[ProblemEntry]:
         return load_motion_bench_maker(file)
     if file.suffix.lower() != ".jsonl":
         return [ProblemEntry(file.stem, load_problem(file))]
-    robots: Robots = {}
     entries = []
     for number, line in _lines(read_text(file)):
         where = f"{file}, line {number}"
-        problem = _problem(where, _json(where, line), file.parent, robots)
+        problem = _problem(where, _json(where, line), file.parent)
         entries.append(ProblemEntry(f"{file.stem}:{number}", problem))
     return entries
 
@@ -120,12 +116,9 @@ def problem_record(
     }
 
 
-def problem_from_record(record: object, robots: Robots | None = None) -> Problem:
-    """The problem of `problem_record`; InputError as in `load_problem`.
-
-    `robots`: those that were read before; what is read now is added.
-    """
-    return _problem("problem", record, Path(), {} if robots is None else robots)
+def problem_from_record(record: object) -> Problem:
+    """The problem of `problem_record`; InputError as in `load_problem`."""
+    return _problem("problem", record, Path())
 
 
 def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -> None:
@@ -175,12 +168,11 @@ def load_motion_bench_maker(folder: str | Path, robot: Robot | None = None) -> l
         raise InputError(
             f"{folder} has no files scene*.yaml; it must be a folder as MotionBenchMaker writes it"
         )
-    robots: Robots = {}
     entries = []
     for scene_file in scenes:
         name = f"{folder.resolve().name}/{scene_file.stem.removeprefix('scene')}"
         try:
-            problem = _moveit_problem(scene_file, robot, robots)
+            problem = _moveit_problem(scene_file, robot)
         except InputError as error:
             entries.append(ProblemEntry(name, None, str(error)))
         else:
@@ -188,28 +180,27 @@ def load_motion_bench_maker(folder: str | Path, robot: Robot | None = None) -> l
     return entries
 
 
-def _moveit_problem(scene_file: Path, robot: Robot | None, robots: Robots) -> Problem:
+def _moveit_problem(scene_file: Path, robot: Robot | None) -> Problem:
     request_file = scene_file.with_name(scene_file.name.replace("scene", "request", 1))
     where = scene_file
     try:
         data = read_yaml(scene_file)
         if robot is None:
             robot_name = data.get("robot_model_name") if isinstance(data, dict) else None
-            robot = _robot(robot_name, {}, scene_file.parent, robots)
+            robot = _robot(robot_name, {}, scene_file.parent)
         frames = moveit_frames(data, robot)
         scene = moveit_scene(data, frames, scene_file.parent)
         where = request_file
-        return _requested(robot, scene, moveit_request(read_yaml(request_file), frames), robots)
+        return _requested(robot, scene, moveit_request(read_yaml(request_file), frames))
     except InputError as error:
         prefix = "" if str(error).startswith(str(where)) else f"{where}: "
         raise InputError(f"{prefix}{error}") from None
 
 
-def _requested(robot: Robot, scene: Scene, request: MoveItRequest, robots: Robots) -> Problem:
+def _requested(robot: Robot, scene: Scene, request: MoveItRequest) -> Problem:
     held = {j.name for j in robot.joints if j.kind in MOVING_KINDS} - {*robot.joint_names}
     locked = {name: value for name, value in request.start.items() if name in held}
-    key = (robot.name, tuple(sorted(locked.items())))
-    robot = robots.setdefault(key, robot.with_locked(locked))
+    robot = robot.with_locked(locked)
 
     def values(where: str, positions: dict[str, float]) -> list[float]:
         missing = [name for name in robot.joint_names if name not in positions]
@@ -232,13 +223,13 @@ def _json(where: str, text: str) -> object:
         raise InputError(f"{where} is not valid JSON: {error.msg} at {at}") from None
 
 
-def _problem(where: str, data: object, folder: Path, robots: Robots) -> Problem:
+def _problem(where: str, data: object, folder: Path) -> Problem:
     try:
         requested = isinstance(data, dict) and "request" in data
         values = check_fields(
             "problem", data, ("robot", "scene", "request") if requested else FIELDS, ("locked",)
         )
-        robot = _robot(values["robot"], values.get("locked", {}), folder, robots)
+        robot = _robot(values["robot"], values.get("locked", {}), folder)
         frames, notes = moveit_frames({}, robot), ()
         if isinstance(values["scene"], str):
             file = folder / values["scene"]
@@ -249,13 +240,13 @@ def _problem(where: str, data: object, folder: Path, robots: Robots) -> Problem:
             scene, notes = read_scene(values["scene"], folder)
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames)
-            return _requested(robot, scene, request, robots)
+            return _requested(robot, scene, request)
         return Problem(robot, scene, values["start"], _goal(values["goal"]), notes)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
 
-def _robot(name: object, locked: object, folder: Path, robots: Robots) -> Robot:
+def _robot(name: object, locked: object, folder: Path) -> Robot:
     if not isinstance(name, str) or not name:
         raise InputError(
             f"robot is {shown(name)}; it must be a bundled name ({', '.join(ROBOTS)}) or a URDF file"
@@ -270,10 +261,7 @@ def _robot(name: object, locked: object, folder: Path, robots: Robots) -> Robot:
         if not isinstance(joint, str) or array is None or array.ndim != 0:
             raise InputError(f"locked: {shown(joint)} is {shown(value)}; it must be a number")
         values[joint] = float(array)
-    key = (name, tuple(sorted(values.items())))
-    if key not in robots:
-        robots[key] = load_robot(name, locked=values)
-    return robots[key]
+    return load_robot(name, locked=values)
 
 
 def _goal(data: object) -> JointGoal | PoseGoal:

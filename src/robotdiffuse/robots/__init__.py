@@ -5,7 +5,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.robots.bundle import ROBOT_FILE, read_bundle, read_source
+from robotdiffuse.robots.bundle import MESH_FILE, ROBOT_FILE, read_bundle, read_source
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 
 __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
@@ -20,13 +20,14 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
 
     A URDF is looked up by its content among the robots that were added; a new or changed one is fitted with
     spheres first, which takes about a minute, and kept. `locked` holds joints at values (see
-    Robot.with_locked). Raises InputError for an unknown name or bad input.
+    Robot.with_locked). The same robot is the same object, as long as its files stay as they are. Raises
+    InputError for an unknown name or bad input.
     """
     text = str(name)
     if (Path(name) / ROBOT_FILE).is_file():
-        robot = replace(read_bundle(name), source=str(Path(name).resolve()))
+        robot = _read(Path(name), str(Path(name).resolve()))
     elif isinstance(name, Path) or text.endswith((".urdf", ".xml")) or "/" in text or "\\" in text:
-        robot = replace(_from_urdf(Path(name)), source=str(Path(name).resolve()))
+        robot = _from_urdf(Path(name))
     else:
         robot = _by_name(text)
     return robot.with_locked(locked or {})
@@ -34,16 +35,36 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
 
 def _by_name(name: str) -> Robot:
     if name in ROBOTS:
-        return _bundled(name)
+        return _read(DATA / name, None)
     added = _added()
     if name not in added:
         raise unknown_name("robot", name, [*ROBOTS, *added])
-    return replace(read_bundle(added[name]), source=name)
+    return _read(added[name], name)
+
+
+def _read(folder: Path, source: str | None) -> Robot:
+    """The robot in a folder; the one of the last time if its files are the same."""
+    return _read_state(folder.resolve(), source, _state(folder / ROBOT_FILE), _state(folder / MESH_FILE))
+
+
+def _state(file: Path) -> tuple[int, int, int] | None:
+    """What changes when a file is written; None if there is none."""
+    try:
+        found = file.stat()
+    except OSError:
+        return None
+    return found.st_mtime_ns, found.st_size, found.st_ino
 
 
 @lru_cache
-def _bundled(name: str) -> Robot:
-    return read_bundle(DATA / name)
+def _read_state(folder: Path, source: str | None, *_states: tuple[int, int, int] | None) -> Robot:
+    return replace(read_bundle(folder), source=source)
+
+
+@lru_cache
+def _digest(folder: Path, _state: tuple[int, int, int] | None) -> str | None:
+    """Of the URDF that the robot in a folder was made from."""
+    return read_source(folder).get("sha256")
 
 
 def _added() -> dict[str, Path]:
@@ -56,14 +77,14 @@ def _from_urdf(urdf: Path) -> Robot:
     from robotdiffuse.robots.add import add_robot, user_robots
     from robotdiffuse.robots.urdf import content_hash, read_urdf
 
-    digest = content_hash(urdf)
+    digest, source = content_hash(urdf), str(urdf.resolve())
     for folder in _added().values():
         try:
-            if read_source(folder).get("sha256") == digest:
-                return read_bundle(folder)
+            if _digest(folder, _state(folder / ROBOT_FILE)) == digest:
+                return _read(folder, source)
         except InputError:
             continue  # a damaged folder of another robot is no reason to fail
     name = read_urdf(urdf).name
     report = add_robot(urdf, out=user_robots() / f"{name}-{digest[:8]}")
     note = f"spheres were fitted to {urdf.name} ({report.sphere_count}) and kept in {report.folder}"
-    return replace(report.robot, notes=(*report.robot.notes, note))
+    return replace(report.robot, notes=(*report.robot.notes, note), source=source)

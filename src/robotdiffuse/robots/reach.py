@@ -1,12 +1,10 @@
 """How far a link can be from a joint's axis: the lever arms of the verification certificate."""
 
-from functools import lru_cache
-
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, once_per_robot
 
 COLUMNS = 180
 """Directions around the axis; the bounds exceed the true maxima by about 0.1 % per joint in between."""
@@ -18,7 +16,7 @@ ROWS = COLUMNS // 2 + 1
 ARC_SAGITTA = 1 - np.cos(STEP / 2)
 
 
-@lru_cache(maxsize=16)
+@once_per_robot
 def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     """Bounds on the motion of links per unit of joint motion; one row per link with spheres.
 

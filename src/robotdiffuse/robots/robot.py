@@ -1,7 +1,9 @@
 """Robot: a serial arm as plain data, in the form that kinematics and collision checking share."""
 
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, lru_cache, wraps
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,6 +13,10 @@ from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
+VARIANTS = 256
+"""Robots with joints locked at values that are kept, the last ones used: about 0.1 MB each."""
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,6 +197,37 @@ class Robot:
                 raise unknown_name("joint in locked", name, movable)
             if not np.isfinite(value):
                 raise InputError(f"locked: {name} is {value}; it must be a finite number")
-        if all(self.locked.get(name) == value for name, value in locked.items()):
-            return self
-        return replace(self, locked=self.locked | {k: float(v) for k, v in locked.items()})
+        held = self.locked | {name: float(value) for name, value in locked.items()}
+        return _variant(self.unlocked, tuple(sorted(held.items()))) if held != self.locked else self
+
+    @property
+    def unlocked(self) -> "Robot":
+        """The robot that `with_locked` made this one of; itself if it was not made so."""
+        return self.__dict__.get("_unlocked", self)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: the robot, and nothing that was compiled for it."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+@lru_cache(maxsize=VARIANTS)
+def _variant(robot: Robot, locked: tuple[tuple[str, float], ...]) -> Robot:
+    """One object for equal values, so that what is compiled for it is compiled once."""
+    if dict(locked) == robot.locked:
+        return robot
+    variant = replace(robot, locked=dict(locked))
+    variant.__dict__["_unlocked"] = robot
+    return variant
+
+
+def once_per_robot(build: Callable[[Robot], T]) -> Callable[[Robot], T]:
+    """A function of a robot alone that works once for each: results live as long as their robot."""
+    name = f"{build.__module__}.{build.__qualname__}"
+
+    @wraps(build)
+    def known(robot: Robot) -> T:
+        if name not in robot.__dict__:
+            robot.__dict__[name] = build(robot)
+        return robot.__dict__[name]
+
+    return known

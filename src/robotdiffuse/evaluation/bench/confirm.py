@@ -6,9 +6,9 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.bench.problem_sets import Case, read_cases
 from robotdiffuse.evaluation.bench.records import Record, read_records
-from robotdiffuse.problems.files import Robots
+from robotdiffuse.evaluation.problem_sets import read_cases
+from robotdiffuse.problems.held_out import Case
 from robotdiffuse.simulation.oracle import OracleContact, PyBulletOracle
 from robotdiffuse.types import Path
 
@@ -53,11 +53,10 @@ def confirm(
         raise InputError(f"{out}/problems lacks {lost[0][1]} of {lost[0][0]}, which has results")
     cases = {case.key: case for of in kept.values() for case in of[:count]}
     by_case = {key: by_case[key] for key in cases if key in by_case}
-    robots: Robots = {}
     checked = {record.planner: 0 for record in records}
     refuted: dict[str, list[Refuted]] = {planner: [] for planner in checked}
     for done, (key, found) in enumerate(by_case.items(), start=1):
-        for record, contact in _looked_at(cases[key], found, robots):
+        for record, contact in _looked_at(cases[key], found):
             checked[record.planner] += 1
             if contact is not None:
                 refuted[record.planner].append(Refuted(record, contact))
@@ -65,11 +64,9 @@ def confirm(
     return {planner: Confirmation(count, tuple(refuted[planner])) for planner, count in checked.items()}
 
 
-def _looked_at(
-    case: Case, records: list[Record], robots: Robots
-) -> list[tuple[Record, OracleContact | None]]:
+def _looked_at(case: Case, records: list[Record]) -> list[tuple[Record, OracleContact | None]]:
     """Each motion of a problem, and what PyBullet finds wrong with it."""
-    problem = case.load(robots)
+    problem = case.problem
     with PyBulletOracle(problem.robot, problem.scene) as oracle:
         names = problem.robot.joint_names
         return [(record, oracle.check_path(Path(names, record.waypoints), STEP)) for record in records]

@@ -16,14 +16,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.bench.problem_sets import read_cases
 from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED, Record, read_records
 from robotdiffuse.evaluation.comscore import Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric
+from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
 from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.problems.families.rop import RopSettings
 from robotdiffuse.types import Status
 
 LIMITS = (0.1, 1.0, 10.0, 60.0)
@@ -31,7 +30,8 @@ LIMITS = (0.1, 1.0, 10.0, 60.0)
 LATE_SHARE, LATE = 0.1, 0.05
 """A returned motion may be this share of the limit, or this time [s], late: planners stop in time, and then
 the judge takes its own."""
-ROP = tuple(name for name, family in FAMILIES.items() if isinstance(family, RopSettings))
+ROP = ("rop", "rop_dense")
+"""Sets that stand beside the paper's figures."""
 NONTRIVIAL = ", non-trivial"
 RAN_OUT, GAVE_UP, LATER = "time ran out", "gave up before", "found one later"
 FAILURES = {
@@ -241,7 +241,7 @@ def _read_runs(file: FilePath) -> tuple[dict[str, Any], ...]:
 
 
 def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Section]:
-    """All problem sets; those of random obstacles with trivial problems also without them.
+    """All problem sets; those of random problems, some of them trivial, also without these.
 
     `limits`: the time limits [s] to report; None: those of the records, and LIMITS below them.
     Raises InputError if no planner was run as long as any of these.
@@ -255,7 +255,7 @@ def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Sectio
         places = {name: i for i, name in enumerate(dict.fromkeys([*cases, *names]))}
         chosen = _limits(records) if limits is None else sorted(limits)
         parts = {problem_set: set(names)}
-        if any(r.trivial for r in records) and {r.family for r in records} <= set(ROP):
+        if any(r.trivial for r in records) and {r.family for r in records} <= set(FAMILIES):
             parts[problem_set + NONTRIVIAL] = {r.name for r in records if r.solved and not r.trivial}
         for name, problems in parts.items():
             part = {

@@ -22,13 +22,14 @@ from robotdiffuse.evaluation.bench.figures import (
     counting,
     outcome,
 )
-from robotdiffuse.evaluation.bench.problem_sets import Case, read_cases
 from robotdiffuse.evaluation.bench.records import Record
 from robotdiffuse.evaluation.look import STYLE
+from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.tables import Table
 from robotdiffuse.evaluation.tables import html as html_table
 from robotdiffuse.files import write_atomically
 from robotdiffuse.paths.export import check_output
+from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
 
 OWN_STYLE = """
@@ -280,7 +281,9 @@ def worth_showing(bench: Bench, parts: Sequence[Section]) -> list[Shown]:
     hardest = sorted((t for t in tries if t.solved), key=lambda t: (len(t.solved) < 2, -t.detour))[:HARDEST]
     shown = [motion for t in hardest for motion in _solved(t, bench.reference)]
     failed = [
-        t for t in tries if t.failed and t not in hardest and (t.solved or "joints" in t.case.problem["goal"])
+        t
+        for t in tries
+        if t.failed and t not in hardest and (t.solved or isinstance(t.case.problem.goal, JointGoal))
     ]
     failed.sort(key=lambda t: (bench.reference not in t.failed, len(t.solved)))
     return shown + [_failed(t, bench.reference) for t in failed[: MOST_REPLAYS - len(shown)]]
@@ -331,7 +334,7 @@ def _failed(tries: _Tries, reference: str) -> Shown:
     if solved:
         others = f"; here: {solved[0].planner}" + (f", {len(solved)} solve it" if len(solved) > 1 else "")
         return Shown(title, failures[loser] + others, tries.case, solved[0].waypoints)
-    problem = tries.case.load()
+    problem = tries.case.problem
     assert isinstance(problem.goal, JointGoal)
     caption = "solved by none; here: the straight line, no solution"
     line = np.stack([problem.start, problem.goal.positions[0]])

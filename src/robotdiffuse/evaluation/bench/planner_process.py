@@ -25,7 +25,7 @@ from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.metrics import Measure
 from robotdiffuse.planners import PLANNERS, load_planner
 from robotdiffuse.planners.base import Planner
-from robotdiffuse.problems.files import Robots, problem_from_record
+from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -161,12 +161,11 @@ def serve(planner: Planner, tasks: TextIO, answers: TextIO) -> None:
 
     lines: queue.Queue[str] = queue.Queue()
     threading.Thread(target=_read, args=(tasks, lines), daemon=True).start()
-    robots: Robots = {}
     measures: dict[Robot, Measure] = {}
     answer("")
     while True:
         task = json.loads(lines.get())
-        problem = problem_from_record(task["problem"], robots)
+        problem = problem_from_record(task["problem"])
         if problem.robot not in measures:
             measures[problem.robot] = Measure(problem.robot)
             _warm_up(planner, problem, measures[problem.robot])

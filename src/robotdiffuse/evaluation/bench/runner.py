@@ -13,11 +13,12 @@ from pathlib import Path as FilePath
 from robotdiffuse import __version__
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench.planner_process import Contestant
-from robotdiffuse.evaluation.bench.problem_sets import Case, gather_cases, problem_set_name
 from robotdiffuse.evaluation.bench.records import Record, RecordFile
 from robotdiffuse.evaluation.bench.workers import Task, on_ray, on_this_machine
+from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
 from robotdiffuse.files import alone_in
 from robotdiffuse.planners import PLANNERS
+from robotdiffuse.problems.held_out import Case
 
 PACKAGES = ("numpy", "numba", "torch", "ompl")
 """Whose versions are kept with the results, beside our own."""

@@ -9,9 +9,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from robotdiffuse.evaluation.bench.planner_process import Contestant, PlannerProcess
-from robotdiffuse.evaluation.bench.problem_sets import Case
 from robotdiffuse.evaluation.bench.records import Record, record_from_json
 from robotdiffuse.generation.workers import ray_cluster
+from robotdiffuse.problems.files import problem_record
+from robotdiffuse.problems.held_out import Case
 
 Made = Generator[Record, None, None]
 CHUNK = 20
@@ -53,7 +54,7 @@ def on_this_machine(tasks: dict[Contestant, list[Task]], workers: int, logs: Fil
         for task in tasks[planner]:
             if stop.is_set():
                 return
-            answer = process.plan(task.case.problem, task.seed, task.time_limit)
+            answer = process.plan(problem_record(task.case.problem), task.seed, task.time_limit)
             with news:
                 if not stop.is_set():  # else it is the stop that ended the call
                     ready.append(record_of(planner, task, answer))
@@ -104,7 +105,9 @@ def _portion(planner: Contestant, tasks: list[Task]) -> tuple[list[Record], str]
         log = FilePath(folder) / "log"
         process = PlannerProcess(planner, log)
         try:
-            answers = [process.plan(task.case.problem, task.seed, task.time_limit) for task in tasks]
+            answers = [
+                process.plan(problem_record(task.case.problem), task.seed, task.time_limit) for task in tasks
+            ]
         finally:
             process.close()
         records = [record_of(planner, *pair) for pair in zip(tasks, answers, strict=True)]

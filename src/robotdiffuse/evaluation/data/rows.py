@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path as FilePath
-from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -10,8 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.data.shards import Manifest, Shard, read_shard, shard_indices
 from robotdiffuse.errors import InputError
-from robotdiffuse.problems.families.furniture import FLOOR, FURNITURE
-from robotdiffuse.problems.families.rop import RopSettings, floor_box
+from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import unpack_scene
@@ -25,26 +23,21 @@ def family_names(manifest: Manifest) -> tuple[str, ...]:
     return tuple(manifest.families)
 
 
-def family_settings(manifest: Manifest, family: int) -> RopSettings:
-    """What the scenes of a family were drawn from. Raises InputError if the manifest has no such family."""
+def family_floor(manifest: Manifest, family: int) -> Box | None:
+    """The floor of a family's scenes; None if they have none.
+
+    ROP's floors had settings of their own once. Raises InputError for a family that is not known.
+    """
     names = family_names(manifest)
     if not 0 <= family < len(names):
         raise InputError(f"family is {family}; the manifest has {len(names)}: {', '.join(names)}")
-    fields: dict[str, Any] = {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in manifest.families[names[family]].items()
-    }
-    try:
-        return RopSettings(**fields)
-    except TypeError as error:
-        raise InputError(f"families.{names[family]} in the manifest: {error}") from None
-
-
-def family_floor(manifest: Manifest, family: int) -> Box | None:
-    """The floor of a family's scenes; None if they have none. Raises InputError as `family_settings`."""
-    if 0 <= family < len(manifest.families) and family_names(manifest)[family] in FURNITURE:
-        return FLOOR
-    return floor_box(family_settings(manifest, family))
+    name, settings = names[family], manifest.families[names[family]]
+    if not settings.get("floor", True):
+        return None
+    if "floor_size" in settings:
+        size, thickness = settings["floor_size"], settings["floor_thickness"]
+        return Box((0.0, 0.0, -thickness / 2), (size, size, thickness), name="floor")
+    return load_family(name).floor
 
 
 def scene_of(manifest: Manifest, shard: Shard, row: int) -> Scene:

@@ -1,0 +1,151 @@
+"""Problems by name: held-out ones of the families, and those of files and folders; judged once and kept."""
+
+import itertools
+import time
+from dataclasses import replace
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import path_length
+from robotdiffuse.collision.motion import search_space
+from robotdiffuse.errors import InputError
+from robotdiffuse.paths.shortcut import shortcut
+from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.files import load_problems
+from robotdiffuse.problems.held_out import SEED, Case, CaseFile, Report, goal_of, line_length
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.types import Path
+from robotdiffuse.verify import VerifySettings, verifier
+
+NONTRIVIAL = "_nontrivial"
+"""Suffix of a family's name: only problems that the straight line does not solve and search does."""
+SEARCH_TIME = 10.0
+"""Problems that this much search does not solve count as unsolvable [s]."""
+RUNS = 16
+"""RRT-Connect runs after the one that decides; the shortest path of all is the reference length."""
+
+
+def judge(problem: Problem, path: Path) -> bool:
+    """Whether a path passes the judge."""
+    return verifier(problem, VerifySettings()).path(path).valid
+
+
+def search(problem: Problem) -> float | None:
+    """Length of the shortest of some RRT-Connect runs with shortcutting [rad]; None: not solved in time."""
+    found = RRTConnect().plan(problem, SEARCH_TIME, seed=1)
+    if found.path_length is None:
+        return None
+    space = search_space(CollisionChecker(problem.robot, problem.scene), 0.02)
+    start, goals = problem.start.astype(np.float32), goal_of(problem)[None].astype(np.float32)
+    lengths, state, until = [found.path_length], random_state(SEED), time.perf_counter() + SEARCH_TIME
+    while len(lengths) <= RUNS and time.perf_counter() < until:
+        trees = kernel.make_trees(start, goals, 20_000)
+        path = kernel.search(space, trees, np.float32(1.5), 1_000_000, state)
+        if len(path):
+            lengths.append(float(path_length(shortcut(space, path, 120, state))))
+    return min(lengths)
+
+
+def case_file(folder: FilePath | None, name: str) -> CaseFile:
+    """What a folder keeps of a family's problems, or of another set's; nothing without a folder."""
+    return CaseFile(None if folder is None else folder / f"{name}.jsonl")
+
+
+def hard_cases(
+    family: str, count: int, folder: FilePath | None = None, report: Report = lambda text: None
+) -> list[Case]:
+    """The first held-out problems of a family that are hard; the folder keeps what is known of them."""
+    return case_file(folder, family).held_out(family, count, judge, search, report)
+
+
+def problem_set_name(text: str) -> str:
+    """The name of a set as it stands in results. Raises InputError for what is no family, file or folder."""
+    family = text.removesuffix(NONTRIVIAL)
+    if family in FAMILIES:
+        return text
+    place = FilePath(text)
+    if not place.exists():
+        raise InputError(
+            f"problems {text!r} are neither a file or folder nor a family; known families: "
+            f"{', '.join(FAMILIES)}, each also with {NONTRIVIAL}"
+        )
+    return place.resolve().stem
+
+
+def gather_cases(names: list[str], count: int | None, out: FilePath, report: Report) -> list[Case]:
+    """The first `count` problems of each set (None: all of a file or folder, 100 of a family).
+
+    They are kept in `out`/problems, one file for each family, file or folder, and read from there the next
+    time; a larger count adds to them. `report` is told how far it is. Raises InputError for unknown names and
+    empty sets.
+    """
+    sets = [problem_set_name(text) for text in names]
+    twice = {name for name in sets if sets.count(name) > 1}
+    if twice:
+        raise InputError(f"problems name {', '.join(sorted(twice))} twice; rename a file or folder")
+    return [case for text in names for case in _set(text, count, out / "problems", report)]
+
+
+def read_cases(out: FilePath, problem_set: str) -> list[Case]:
+    """All problems of a set that a folder keeps. Raises InputError if their file is damaged."""
+    family = problem_set.removesuffix(NONTRIVIAL)
+    name = family if family in FAMILIES else problem_set
+    return _of_set(case_file(out / "problems", name).cases(hard=name != problem_set), problem_set)
+
+
+def _set(text: str, count: int | None, folder: FilePath, report: Report) -> list[Case]:
+    name, family = problem_set_name(text), text.removesuffix(NONTRIVIAL)
+    if family in FAMILIES:
+        finder = search if text.endswith(NONTRIVIAL) else None
+        wanted = 100 if count is None else count
+        return _of_set(case_file(folder, family).held_out(family, wanted, judge, finder, report), name)
+    kept = case_file(folder, name)
+    if not len(kept):
+        kept.fill(_from_place(FilePath(text), name, report))
+    return _of_set(kept.cases()[:count], name)
+
+
+def _of_set(cases: list[Case], problem_set: str) -> list[Case]:
+    return [replace(case, problem_set=problem_set) for case in cases]
+
+
+def _from_place(place: FilePath, name: str, report: Report) -> list[Case]:
+    """Those of a file, of a MotionBenchMaker folder, or of the files and such folders in a folder."""
+    cases = []
+    for part in _parts(place):
+        family = part.resolve().stem
+        for entry in load_problems(part):
+            if entry.problem is None:
+                report(f"left out: {entry.error}")
+                continue
+            line = line_length(entry.problem, judge)
+            cases.append(Case(entry.name, family, entry.problem, line is not None, line))
+        report(f"problems: {len(cases)} of {name}")
+    if not cases:
+        raise InputError(f"{place} holds no usable problem")
+    return _interleaved(cases)
+
+
+def _parts(place: FilePath) -> list[FilePath]:
+    if place.is_file() or any(place.glob("scene*.yaml")):
+        return [place]
+    endings = (".jsonl", ".json", ".yaml", ".yml")
+    return [
+        part
+        for part in sorted(place.iterdir())
+        if (part.is_dir() and any(part.glob("scene*.yaml"))) or part.suffix.lower() in endings
+    ]
+
+
+def _interleaved(cases: list[Case]) -> list[Case]:
+    """One of each family in turn, so that the first so many are of all."""
+    families: dict[str, list[Case]] = {}
+    for case in cases:
+        families.setdefault(case.family, []).append(case)
+    rows = itertools.zip_longest(*families.values())
+    return [case for row in rows for case in row if case is not None]

@@ -1,0 +1,99 @@
+"""Open-topped boxes on the ground or on blocks, and things around them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+
+from robotdiffuse.problems.families.family import PositiveRange
+from robotdiffuse.problems.families.furniture import (
+    DOWN,
+    PLACE_TRIES,
+    Built,
+    Furniture,
+    Region,
+    Square,
+    Standing,
+    Thing,
+    count,
+    is_free,
+)
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.settings import Count, Natural, Share
+
+
+@dataclass(frozen=True)
+class Crate(Furniture):
+    """Open-topped boxes on the ground or on blocks, and things around them. Regions are the insides of the
+    crates and free spots on the ground; the hand points down. Lengths in [m]."""
+
+    object_height: PositiveRange = (0.1, 0.5)
+    crates: tuple[Count, Count] = (1, 2)
+    distance: PositiveRange = (0.4, 0.65)
+    """From the base to the middle of a crate, of a thing or of a spot."""
+    length: PositiveRange = (0.25, 0.45)
+    """Inside, along and across."""
+    height: PositiveRange = (0.12, 0.3)
+    """Of the walls, inside."""
+    thickness: PositiveRange = (0.01, 0.03)
+    """Of walls and bottom of a crate."""
+    raised_share: Share = 0.4
+    """Share of the crates that stand on a block."""
+    block_height: PositiveRange = (0.05, 0.3)
+    spots: tuple[Natural, Natural] = (1, 2)
+    """Number of free spots on the ground."""
+    spot_size: PositiveRange = (0.12, 0.2)
+
+    @property
+    def most_obstacles(self) -> int:
+        return 6 * self.crates[1] + self.objects[1]
+
+    def build(self, rng: Generator) -> Built | None:
+        shapes: list[Box | Sphere] = []
+        regions: list[Region] = []
+        taken: list[Square] = []
+        for _ in range(count(self.crates, rng)):
+            x, y = rng.uniform(*self.length, 2) / 2
+            h, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
+            frame = _free_place(self, float(np.hypot(x + t, y + t)), taken, rng)
+            if frame is None:
+                return None
+            low = 0.0
+            if rng.random() < self.raised_share:
+                low = rng.uniform(*self.block_height)
+                shapes.append(frame.box((-x - t, -y - t, 0.0), (x + t, y + t, low), "block"))
+            bottom, top = low + t, low + t + h
+            shapes.append(frame.box((-x - t, -y - t, low), (x + t, y + t, bottom), "bottom"))
+            for side in (-1, 1):
+                a, b = sorted((side * x, side * (x + t)))
+                shapes.append(frame.box((a, -y - t, bottom), (b, y + t, top), "wall"))
+                a, b = sorted((side * y, side * (y + t)))
+                shapes.append(frame.box((-x, a, bottom), (x, b, top), "wall"))
+            regions.append(frame.region((-x, -y, bottom), (x, y, top), DOWN))
+        for _ in range(count(self.spots, rng)):
+            half = rng.uniform(*self.spot_size) / 2
+            frame = _free_place(self, float(np.sqrt(2) * half), taken, rng)
+            if frame is None:
+                return None
+            regions.append(frame.region((-half, -half, 0.0), (half, half, 2 * half), DOWN))
+        for _ in range(count(self.objects, rng)):
+            thing = Thing(self, rng)
+            frame = _free_place(self, thing.half, taken, rng)
+            if frame is None:
+                return None
+            shapes.append(thing.placed(frame, 0.0, 0.0, 0.0))
+        return shapes, regions
+
+
+def _free_place(crate: Crate, half: float, taken: list[Square], rng: Generator) -> Standing | None:
+    """A free place on the ground for something of this half width; it is taken from now on."""
+    for _ in range(PLACE_TRIES):
+        frame = Standing(crate, crate.distance, rng)
+        square = (float(frame.xy[0]), float(frame.xy[1]), half, half)
+        if is_free(square, taken):
+            taken.append(square)
+            return frame
+    return None
+
+
+CRATE = Crate()

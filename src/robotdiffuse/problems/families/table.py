@@ -1,0 +1,124 @@
+"""A table with things on it, sometimes divided by a wall or with a pillar."""
+
+from dataclasses import dataclass
+
+from numpy.random import Generator
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.problems.families.family import PositiveRange
+from robotdiffuse.problems.families.furniture import (
+    AHEAD,
+    DOWN,
+    PLACE_TRIES,
+    Built,
+    Furniture,
+    Region,
+    Square,
+    Standing,
+    Thing,
+    count,
+    is_free,
+)
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.settings import Natural, Share
+
+BENEATH = 0.3
+"""Tables at least this high have a region beneath [m]."""
+
+
+@dataclass(frozen=True)
+class Table(Furniture):
+    """A table with things on it, sometimes divided by a wall or with a pillar. Regions are free spots between
+    the things, where the hand points down, and the space beneath a table on legs. Lengths in [m]."""
+
+    objects: tuple[Natural, Natural] = (3, 10)
+    object_height: PositiveRange = (0.08, 0.35)
+    distance: PositiveRange = (0.25, 0.4)
+    """From the base to the middle of the near edge."""
+    height: PositiveRange = (0.1, 0.5)
+    """Of the upper side."""
+    length: PositiveRange = (0.45, 0.7)
+    """Away from the arm."""
+    width: PositiveRange = (0.8, 1.4)
+    thickness: PositiveRange = (0.02, 0.04)
+    """Of the top, and of a dividing wall."""
+    legs_share: Share = 0.5
+    """Share of the tables on four legs; the others are solid."""
+    leg_width: PositiveRange = (0.04, 0.07)
+    wall_share: Share = 0.5
+    """Share of the tables with a wall that runs away from the arm, in the middle part."""
+    pillar_share: Share = 0.3
+    """Share of the tables with a pillar."""
+    divider_height: PositiveRange = (0.25, 0.6)
+    """Of walls and pillars."""
+    pillar_width: PositiveRange = (0.06, 0.12)
+    spots: tuple[Natural, Natural] = (2, 4)
+    spot_size: PositiveRange = (0.12, 0.2)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.wall_share + self.pillar_share > 1:
+            raise InputError(
+                f"wall_share is {self.wall_share} and pillar_share {self.pillar_share}; "
+                "together they must be at most 1"
+            )
+
+    @property
+    def most_obstacles(self) -> int:
+        return 6 + self.objects[1]
+
+    def build(self, rng: Generator) -> Built | None:
+        frame = Standing(self, self.distance, rng)
+        length, side = rng.uniform(*self.length), rng.uniform(*self.width) / 2
+        height, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
+        legs = rng.random() < self.legs_share
+        under = height - t
+        bottom = under if legs else 0.0
+        shapes: list[Box | Sphere] = [frame.box((0.0, -side, bottom), (length, side, height), "table")]
+        regions: list[Region] = []
+        if legs:
+            w = rng.uniform(*self.leg_width)
+            for x, y in ((0.0, -side), (0.0, side - w), (length - w, -side), (length - w, side - w)):
+                shapes.append(frame.box((x, y, 0.0), (x + w, y + w, under), "leg"))
+            if under > BENEATH:
+                inner = side - w
+                regions.append(frame.region((0.0, -inner, 0.0), (length / 2, inner, under), AHEAD))
+        taken: list[Square] = []
+
+        def place(half: float) -> tuple[float, float] | None:
+            for _ in range(PLACE_TRIES if half < min(length / 2, side) else 0):
+                x, y = float(rng.uniform(half, length - half)), float(rng.uniform(half - side, side - half))
+                if is_free((x, y, half, half), taken):
+                    taken.append((x, y, half, half))
+                    return x, y
+            return None
+
+        kind, top = rng.random(), height + rng.uniform(*self.divider_height)
+        if kind < self.wall_share:
+            start, y = rng.uniform(0.0, length / 3), rng.uniform(-side / 3, side / 3)
+            shapes.append(frame.box((start, y - t / 2, height), (length, y + t / 2, top), "wall"))
+            taken.append(((start + length) / 2, y, (length - start) / 2, t / 2))
+        elif kind < self.wall_share + self.pillar_share:
+            w = rng.uniform(*self.pillar_width) / 2
+            spot = place(w)
+            if spot is None:
+                return None
+            x, y = spot
+            shapes.append(frame.box((x - w, y - w, height), (x + w, y + w, top), "pillar"))
+        for _ in range(count(self.spots, rng)):
+            half = rng.uniform(*self.spot_size) / 2
+            spot = place(half)
+            if spot is None:
+                return None
+            (x, y), z = spot, height + 2 * half
+            regions.append(frame.region((x - half, y - half, height), (x + half, y + half, z), DOWN))
+        for _ in range(count(self.objects, rng)):
+            thing = Thing(self, rng)
+            spot = place(thing.half)
+            if spot is None:
+                return None
+            shapes.append(thing.placed(frame, *spot, height))
+        return shapes, regions
+
+
+TABLE = Table()

@@ -1,0 +1,105 @@
+"""Held-out problems: one rule for what they are worth, kept and gone on with."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.problems.held_out import (
+    Case,
+    CaseFile,
+    held_out_problem,
+    line_length,
+)
+from robotdiffuse.problems.problem import PoseGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.types import Path as Motion
+
+
+class Referee:
+    """Passes the line of every third problem; its search fails on every fifth."""
+
+    def __init__(self) -> None:
+        self.judged: list[Problem] = []
+        self.searched: list[Problem] = []
+        self.numbers = {held_out_problem("rop", i).start.tobytes(): i for i in range(12)}
+
+    def judge(self, problem: Problem, path: Motion) -> bool:
+        self.judged.append(problem)
+        assert len(path.positions) == 2
+        return self.numbers[problem.start.tobytes()] % 3 == 0
+
+    def search(self, problem: Problem) -> float | None:
+        self.searched.append(problem)
+        number = self.numbers[problem.start.tobytes()]
+        return None if number % 5 == 0 else float(number)
+
+
+def names(cases: list[Case]) -> list[str]:
+    return [case.name for case in cases]
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_one_rule(tmp_path: Path, kept: bool) -> None:
+    referee, cases = Referee(), CaseFile(tmp_path / "a" / "rop.jsonl" if kept else None)
+    hard = cases.held_out("rop", 4, referee.judge, referee.search)
+    assert names(hard) == ["rop/1", "rop/2", "rop/4", "rop/7"]
+    assert [case.reference for case in hard] == [1.0, 2.0, 4.0, 7.0]
+    assert all(case.hard and not case.trivial and case.family == "rop" for case in hard)
+    every = cases.held_out("rop", 8, referee.judge)
+    assert [case.trivial for case in every] == [i % 3 == 0 for i in range(8)]
+    assert [case.hard for case in every] == [i in (1, 2, 4, 7) for i in range(8)]
+    assert every[5].reference is None and every[6].reference == pytest.approx(
+        line_length(every[6].problem, referee.judge)
+    )
+    for i, case in enumerate(every):
+        assert np.array_equal(case.problem.start, held_out_problem("rop", i).start)
+
+
+def test_goes_on_with_what_is_known(tmp_path: Path) -> None:
+    file, first, second = tmp_path / "rop.jsonl", Referee(), Referee()
+    CaseFile(file).held_out("rop", 5, first.judge)
+    assert len(first.judged) == 5 and not first.searched
+    hard = CaseFile(file).held_out("rop", 4, second.judge, second.search)
+    assert names(hard) == ["rop/1", "rop/2", "rop/4", "rop/7"]
+    assert len(second.judged) == 3, "numbers 5, 6 and 7"
+    assert len(second.searched) == 5, "numbers 1, 2, 4, 5 and 7"
+    third = Referee()
+    assert names(CaseFile(file).held_out("rop", 4, third.judge, third.search)) == names(hard)
+    assert not third.judged and not third.searched
+    assert names(CaseFile(file).cases(hard=True)) == names(hard)
+
+
+def test_line_that_was_cut_off_is_made_again(tmp_path: Path) -> None:
+    file, referee = tmp_path / "rop.jsonl", Referee()
+    whole = CaseFile(file).held_out("rop", 3, referee.judge)
+    text = file.read_text()
+    file.write_text(text[:-20])
+    again = CaseFile(file).held_out("rop", 3, referee.judge)
+    assert names(again) == names(whole) and file.read_text() == text
+    assert len(referee.judged) == 4
+
+
+def test_damaged_lines_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "rop.jsonl"
+    for line, message in (("[1, 2]", "line 1 is no JSON object"), ('{"drawn": 3}', "line 1 has drawn")):
+        file.write_text(line + "\n")
+        with pytest.raises(InputError, match=message):
+            CaseFile(file)
+
+
+def test_two_of_one_name_are_refused() -> None:
+    case = Case("a", "mine", held_out_problem("rop", 0), False)
+    with pytest.raises(InputError, match="two problems are called a"):
+        CaseFile(None).fill([case, case])
+
+
+def test_pose_goals_have_no_line() -> None:
+    robot = load_robot("panda")
+    start = held_out_problem("rop", 0).start
+    pose = np.eye(4)
+    pose[:3, 3] = 0.3, 0.0, 0.5
+    problem = Problem(robot, Scene([]), start, PoseGoal("panda_hand", pose))
+    assert line_length(problem, lambda problem, path: True) is None
