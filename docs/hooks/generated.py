@@ -3,6 +3,7 @@
 import argparse
 import re
 from collections.abc import Callable, Iterator
+from importlib import import_module
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
@@ -11,6 +12,11 @@ from mkdocs.structure.pages import Page
 
 READING_ORDER = ("planners", "problems", "robots", "scenes", "types", "verify", "paths", "data", "errors")
 """Of the rooms that public names are from."""
+TABLES = {
+    "Planners": "planners:PLANNERS",
+    "Families of random problems": "problems.families:FAMILIES",
+}
+"""On the page of parts by name."""
 MARK = re.compile(r"^<!-- generated: (.+) -->$", re.MULTILINE)
 
 
@@ -81,17 +87,55 @@ def public_names() -> str:
     return "\n\n".join(f"## {room.capitalize()}\n\n" + "\n\n".join(rooms[room]) for room in order)
 
 
-def planners() -> str:
+def tables() -> str:
+    """Every table of things by name, with their settings."""
+    return "\n\n".join(f"## {title}\n\n{_table(location)}" for title, location in TABLES.items())
+
+
+def _table(location: str) -> str:
+    module, _, name = location.partition(":")
+    table = getattr(import_module(f"robotdiffuse.{module}"), name)
+    kinds = any(entry.kind for entry in table.values())
+    rows = [f"| name |{' kind |' if kinds else ''} what it is |", f"|---|{'---|' if kinds else ''}---|"]
+    for key, entry in table.items():
+        rows.append(f"| `{key}` |{f' {entry.kind} |' if kinds else ''} {_cell(entry.description)} |")
+    return "\n".join(rows)
+
+
+def metrics() -> str:
+    from robotdiffuse.evaluation.metrics import METRICS
+
+    rows = [f"| `{name}` | {metric.unit} | {metric.better} |" for name, metric in METRICS.items()]
+    return "\n".join(["| name | unit | better |", "|---|---|---|", *rows])
+
+
+def planner_settings() -> str:
+    """The settings of every planner, as `--set NAME=VALUE` takes them."""
     from robotdiffuse.planners import PLANNERS
 
-    rows = "".join(f"| `{name}` | {_cell(entry.description)} |\n" for name, entry in PLANNERS.items())
-    return f"| name | what it is |\n|---|---|\n{rows}"
+    parts: dict[type, list[str]] = {}
+    for name in PLANNERS:
+        kind = PLANNERS.settings(name)
+        if kind is not None:
+            parts.setdefault(kind, []).append(name)
+    return "\n\n".join(_settings(kind, names) for kind, names in parts.items())
+
+
+def _settings(kind: type, names: list[str]) -> str:
+    rows = [
+        f"| `{setting.name}` | {_cell(str(setting.default))} | {_cell(setting.description)} |"
+        for setting in kind().describe()
+    ]
+    heading = ", ".join(f"`{name}`" for name in names)
+    return "\n".join([f"### {heading}\n", "| setting | default | meaning |", "|---|---|---|", *rows])
 
 
 PARTS: dict[str, Callable[[], str]] = {
     "commands": commands,
-    "planners": planners,
+    "metrics": metrics,
+    "planner settings": planner_settings,
     "public names": public_names,
+    "tables": tables,
 }
 
 

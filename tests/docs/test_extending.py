@@ -1,0 +1,77 @@
+"""Each example of docs/extending.md is written as a module, registered by its line, and used."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from helpers.code_blocks import ROOT, Notebook, code_blocks
+from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.evaluation.metrics import METRICS
+from robotdiffuse.planners import PLANNERS
+from robotdiffuse.problems.families import FAMILIES, Family, load_family
+from robotdiffuse.problems.files import problem_record
+from robotdiffuse.scenes.files import SHAPES
+from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.simulation import PyBulletOracle
+from robotdiffuse.viewer.html import write_replay
+
+TABLES: tuple[dict[str, Any], ...] = (PLANNERS, FAMILIES, METRICS, SHAPES)
+
+
+@pytest.fixture(scope="module")
+def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
+    """What the page's Python made, while its lines are in the tables."""
+    folder, tables = tmp_path_factory.mktemp("extending"), [dict(table) for table in TABLES]
+    notebook = Notebook(folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.syspath_prepend(folder)
+        try:
+            for block in code_blocks(ROOT / "docs" / "extending.md"):
+                notebook.try_block(block)
+            yield notebook.names
+        finally:
+            for table, before in zip(TABLES, tables, strict=True):
+                table.clear()
+                table.update(before)
+            for file in folder.glob("*.py"):
+                sys.modules.pop(file.stem, None)
+
+
+def test_a_planner_solves_and_is_judged(names: dict[str, Any]) -> None:
+    bent = names["bent"]
+    assert bent.solved and bent.planner == "one_bend" and len(bent.path.positions) == 3
+    assert rd.verify(names["problem"], bent.path).valid
+    assert rd.load_planner("one_bend").plan(names["problem"], seed=1).solved
+
+
+def test_a_family_draws_problems(names: dict[str, Any]) -> None:
+    family = load_family("posts")
+    assert isinstance(family, Family)
+    assert len(names["drawn"].scene.shapes) <= 1 + family.most_obstacles
+    first, again = (family.draw(names["problem"].robot, np.random.default_rng(3)) for _ in range(2))
+    assert np.array_equal(first.start, again.start)
+
+
+def test_a_metric_is_measured(names: dict[str, Any]) -> None:
+    assert names["values"]["steps"] == 2
+
+
+def test_a_shape_is_everywhere(names: dict[str, Any], tmp_path: Path) -> None:
+    problem, result = names["around_cone"], names["result"]
+    [cone] = problem.scene.shapes
+    assert result.solved and problem_record(problem)["scene"][0]["cone"]["height"] == cone.height  # type: ignore[index]
+    line = np.linspace(problem.start, problem.goal.positions[0], 50)
+    assert ExactCollision(problem.robot, problem.scene).collides(line).any(), "the cone is in the way"
+    with PyBulletOracle(problem.robot, problem.scene) as oracle:
+        assert any(oracle.collides(q) for q in line)
+        assert oracle.check_path(result.path) is None
+    cloud = sample_surface(problem.scene, 500, np.random.default_rng(0)) - cone.center
+    radius = np.linalg.norm(cloud[:, :2], axis=1)
+    assert (radius <= (1 - cloud[:, 2] / cone.height) * cone.radius * 1.01 + 1e-9).all()
+    write_replay(problem.robot, problem.scene, result.trajectory, tmp_path / "cone.html")
