@@ -50,6 +50,12 @@ def test_a_planner_solves_and_is_judged(names: dict[str, Any]) -> None:
     assert rd.load_planner("one_bend").plan(names["problem"], seed=1).solved
 
 
+def test_a_learned_planner_solves_by_its_network(names: dict[str, Any]) -> None:
+    sampled = names["sampled"]
+    assert sampled.solved and sampled.stage == "network" and sampled.planner == "shortened_sample"
+    assert rd.verify(names["problem"], sampled.path).valid
+
+
 def test_a_family_draws_problems(names: dict[str, Any]) -> None:
     family = load_family("posts")
     assert isinstance(family, Family)
