@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from robotdiffuse.data.dataset import RopDataset as RopDataset
     from robotdiffuse.errors import InputError as InputError
-    from robotdiffuse.paths.export import load_result as load_result
     from robotdiffuse.planners import load_planner as load_planner
     from robotdiffuse.planners import plan as plan
     from robotdiffuse.problems.files import load_problem as load_problem
     from robotdiffuse.problems.problem import JointGoal as JointGoal
     from robotdiffuse.problems.problem import PoseGoal as PoseGoal
     from robotdiffuse.problems.problem import Problem as Problem
+    from robotdiffuse.results import PlanResult as PlanResult
+    from robotdiffuse.results import load_result as load_result
     from robotdiffuse.robots import load_robot as load_robot
     from robotdiffuse.scenes.scene import Scene as Scene
     from robotdiffuse.scenes.shapes import Box as Box
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
     from robotdiffuse.scenes.shapes import PointCloud as PointCloud
     from robotdiffuse.scenes.shapes import Sphere as Sphere
     from robotdiffuse.types import Path as Path
-    from robotdiffuse.types import PlanResult as PlanResult
     from robotdiffuse.types import Status as Status
     from robotdiffuse.types import Trajectory as Trajectory
     from robotdiffuse.verify import verify as verify
@@ -34,7 +34,7 @@ __version__ = "0.1.0"
 _HOME = {
     "InputError": "robotdiffuse.errors",
     "RopDataset": "robotdiffuse.data.dataset",
-    "load_result": "robotdiffuse.paths.export",
+    "load_result": "robotdiffuse.results",
     "load_planner": "robotdiffuse.planners",
     "plan": "robotdiffuse.planners",
     "JointGoal": "robotdiffuse.problems.problem",
@@ -50,7 +50,7 @@ _HOME = {
     "PointCloud": "robotdiffuse.scenes.shapes",
     "Sphere": "robotdiffuse.scenes.shapes",
     "Path": "robotdiffuse.types",
-    "PlanResult": "robotdiffuse.types",
+    "PlanResult": "robotdiffuse.results",
     "Status": "robotdiffuse.types",
     "Trajectory": "robotdiffuse.types",
     "verify": "robotdiffuse.verify",

@@ -30,6 +30,23 @@ def write_atomically(file: Path, content: str | bytes, make_folder: bool = False
         raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
 
 
+def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:
+    """The file as a path, after a check that it can be written.
+
+    Raises InputError for an ending that is not among `endings` and for a folder that is missing or read-only.
+    """
+    path = Path(file)
+    if path.suffix.lower() not in endings:
+        raise InputError(f"{path}: unknown ending {path.suffix!r}; known: {', '.join(endings)}")
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; name a file")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: the folder {path.parent} does not exist")
+    if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
+        raise InputError(f"{path} cannot be written: permission denied")
+    return path
+
+
 class JsonLines:
     """JSON objects, one a line; each is on the disk when `append` returns. Without a file, in memory."""
 

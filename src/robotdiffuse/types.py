@@ -1,11 +1,21 @@
-"""What a planner returns: Path, Trajectory, Status, PlanResult."""
+"""What motions are: Path and Trajectory; and Status, why a planner ended."""
 
-from dataclasses import dataclass, field
+import csv
+import io
+import json
+from dataclasses import dataclass
 from enum import Enum
+from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+
+from robotdiffuse.files import check_output, write_atomically
+
+ROWS = ("positions", "velocities", "accelerations")
+"""What a trajectory has for each time."""
 
 
 class Status(Enum):
@@ -54,53 +64,27 @@ class Trajectory:
         """[s]"""
         return float(self.times[-1])
 
-    def save(self, file: str) -> None:
-        """Write .json or .csv, by the ending; atomically."""
-        from robotdiffuse.paths.export import save_trajectory
+    def save(self, file: str | FilePath) -> None:
+        """Write .json or .csv, by the ending; the CSV header is time, then <joint>_position and so on.
 
-        save_trajectory(self, file)
+        Raises InputError for another ending or a file that cannot be written.
+        """
+        path = check_output(file, (".json", ".csv"))
+        if path.suffix.lower() == ".json":
+            write_atomically(path, json.dumps(self.record(), allow_nan=False) + "\n")
+        else:
+            write_atomically(path, self._csv())
 
+    def record(self) -> dict[str, Any]:
+        """For JSON."""
+        rows = {name: getattr(self, name).tolist() for name in ("times", *ROWS)}
+        return {"joint_names": list(self.joint_names)} | rows
 
-@dataclass(frozen=True, eq=False)
-class PlanResult:
-    """The answer of a planner. `path` is set if and only if `status` is SOLVED; then it passed `verify`."""
-
-    status: Status
-    reason: str
-    """A sentence that a person can act on; for SOLVED: what the solution came from."""
-    planner: str
-    robot: str
-    planning_time: float
-    """Wall time of plan() [s], with verification and without the timing of the trajectory."""
-    seed: int
-    stage: str = ""
-    """The part of the planner that produced the path, e.g. 'network', 'refinement', 'rrt_connect'."""
-    path: Path | None = None
-    trajectory: Trajectory | None = None
-    min_clearance: float | None = None
-    """A lower bound of all distances along the motion [m], the smaller of ..."""
-    scene_clearance: float | None = None
-    """... that of the distances to obstacles, and ..."""
-    self_clearance: float | None = None
-    """... that of those between links. Results of earlier versions lack the two."""
-    notes: tuple[str, ...] = field(default=())
-    """What was changed or ignored in the input, e.g. a start clamped to a limit."""
-    progress: tuple[tuple[float, float], ...] = ()
-    """When each shorter path was found [s since the call], and its joint-space length [rad]; the last pair is
-    the returned path's."""
-    refused: str = ""
-    """What was wrong with the last path that the judge refused, a `verify.Violation.kind`; "" if none was."""
-
-    @property
-    def solved(self) -> bool:
-        return self.status is Status.SOLVED
-
-    @property
-    def path_length(self) -> float | None:
-        return None if self.path is None else self.path.length
-
-    def save(self, file: str) -> None:
-        """Write the result as .json (all of it) or .csv (the trajectory alone); atomically."""
-        from robotdiffuse.paths.export import save_result
-
-        save_result(self, file)
+    def _csv(self) -> str:
+        stream = io.StringIO()
+        writer = csv.writer(stream, lineterminator="\n")
+        kinds = ("position", "velocity", "acceleration")
+        writer.writerow(["time", *(f"{name}_{kind}" for kind in kinds for name in self.joint_names)])
+        columns = (self.times[:, None], *(getattr(self, rows) for rows in ROWS))
+        writer.writerows([repr(value) for value in row] for row in np.concatenate(columns, axis=1).tolist())
+        return stream.getvalue()

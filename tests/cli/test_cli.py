@@ -21,9 +21,9 @@ from robotdiffuse.learning.denoisers import PAPER_SIZE
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
-from robotdiffuse.paths.export import load_result
 from robotdiffuse.planners import PLANNERS, planner_settings
-from robotdiffuse.types import PlanResult, Status
+from robotdiffuse.results import PlanResult, load_result
+from robotdiffuse.types import Status
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted(ROOT.glob("examples/*.yaml")) + sorted(ROOT.glob("src/robotdiffuse/examples/*.yaml"))

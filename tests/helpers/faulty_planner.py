@@ -10,7 +10,7 @@ from robotdiffuse.evaluation.bench import planner_process
 from robotdiffuse.planners import PLANNERS, Entry
 from robotdiffuse.planners.rrt_connect.planner import RRTConnect
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.types import PlanResult
+from robotdiffuse.results import PlanResult
 
 SOLVES, RAISES, DIES, HANGS, TALKS = range(5)
 

@@ -17,11 +17,12 @@ from robotdiffuse.collision.exact import explain_collision
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import ompl_planners as planners
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.types import PlanResult, Status
+from robotdiffuse.types import Status
 from robotdiffuse.verify import verify
 
 PANDA = load_robot("panda")

@@ -16,10 +16,10 @@ from helpers.box_arm import box_arm, box_mesh
 from helpers.example_robots import example_robot
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.export import save_result
 from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import ConvexMesh, Robot
@@ -39,7 +39,7 @@ from robotdiffuse.simulation import (
 )
 from robotdiffuse.simulation.model import mass_properties
 from robotdiffuse.simulation.replay import sample
-from robotdiffuse.types import Path, PlanResult, Status, Trajectory
+from robotdiffuse.types import Path, Status, Trajectory
 
 EYE = (1.5, -1.2, 1.4)
 CAMERA = DepthCamera(EYE, (0.0, 0.0, 0.4))
@@ -341,7 +341,7 @@ def result_file(folder: FilePath, scene: Scene) -> str:
     )
     problem = Problem(robot, scene, PANDA_START, JointGoal(goal[None]))
     file = folder / "result.json"
-    save_result(result, file, problem_record(problem))
+    result.save(file, problem_record(problem))
     return str(file)
 
 

@@ -10,13 +10,14 @@ import pytest
 from PIL import Image
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 from robotdiffuse.robots.visual import VisualMesh, load_visual, visual_meshes, write_visual
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 from robotdiffuse.transforms import transform
-from robotdiffuse.types import Path, PlanResult, Status, Trajectory
+from robotdiffuse.types import Path, Status, Trajectory
 from robotdiffuse.viewer import PictureSettings, write_picture, write_replay
 from robotdiffuse.viewer.look import creased, decimated, dense, robot_surfaces, tool_point, trace
 from robotdiffuse.viewer.picture import render

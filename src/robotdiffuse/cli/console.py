@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from robotdiffuse.types import PlanResult
+    from robotdiffuse.results import PlanResult
     from robotdiffuse.verify import Report
 
 

@@ -215,7 +215,7 @@ def print_check(check: "DataCheck") -> None:
 def run_view(arguments: argparse.Namespace) -> int:
     from robotdiffuse.cli.draw import show
     from robotdiffuse.data.shards import read_manifest
-    from robotdiffuse.paths.export import check_output
+    from robotdiffuse.files import check_output
     from robotdiffuse.robots import load_robot
     from robotdiffuse.viewer.gallery import write_gallery
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.types import PlanResult
+    from robotdiffuse.results import PlanResult
 
 ENDINGS = (".html", ".png")
 

@@ -11,8 +11,8 @@ from robotdiffuse.cli.draw import ENDINGS, draw, show
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
+    from robotdiffuse.results import PlanResult
     from robotdiffuse.settings import Settings
-    from robotdiffuse.types import PlanResult
 
 DEMO = "shelf.yaml"
 DEMO_TIME_LIMIT = 5.0
@@ -72,7 +72,7 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
 
 
 def run_plan(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.paths.export import check_output, save_result
+    from robotdiffuse.files import check_output
     from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, planner_settings
     from robotdiffuse.problems.files import load_problem, problem_record
 
@@ -87,11 +87,11 @@ def run_plan(arguments: argparse.Namespace) -> int:
     print_result(result)
     for file in outputs:
         if file.suffix.lower() == ".json":
-            save_result(result, file, problem_record(problem))
+            result.save(file, problem_record(problem))
         elif result.trajectory is None:
             continue
         elif file.suffix.lower() == ".csv":
-            save_result(result, file)
+            result.trajectory.save(file)
         else:
             draw(problem, result, file)
         print(f"wrote {file}")
@@ -101,7 +101,7 @@ def run_plan(arguments: argparse.Namespace) -> int:
 
 
 def run_demo(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.paths.export import check_output
+    from robotdiffuse.files import check_output
     from robotdiffuse.planners import DEFAULT_PLANNER
     from robotdiffuse.problems.files import load_problem
 

@@ -33,7 +33,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from robotdiffuse.paths.export import check_output
+    from robotdiffuse.files import check_output
 
     try:
         from robotdiffuse.simulation import replay, write_gif, write_png

@@ -10,7 +10,7 @@ from robotdiffuse.errors import InputError
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.types import PlanResult
+    from robotdiffuse.results import PlanResult
 
 
 def add_view(commands: argparse._SubParsersAction) -> None:
@@ -41,8 +41,8 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
 
 def read(file: str) -> "tuple[PlanResult, Problem]":
     """A solved result and its problem. Raises InputError where the file holds no motion or no problem."""
-    from robotdiffuse.paths.export import load_result
     from robotdiffuse.problems.files import problem_from_record
+    from robotdiffuse.results import load_result
 
     saved = load_result(file)
     if not saved.result.solved:
@@ -55,7 +55,7 @@ def read(file: str) -> "tuple[PlanResult, Problem]":
 
 
 def run_view(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.paths.export import check_output
+    from robotdiffuse.files import check_output
 
     files = arguments.out or [f"{Path(arguments.result).stem}.html"]
     outputs = [check_output(file, ENDINGS) for file in files]

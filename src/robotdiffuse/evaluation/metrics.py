@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.types import Path, PlanResult, Trajectory
+from robotdiffuse.types import Path, Trajectory
 from robotdiffuse.verify import Report
 
 STEP = 0.02

@@ -11,7 +11,7 @@ from robotdiffuse.settings import Settings
 if TYPE_CHECKING:
     from robotdiffuse.planners.base import Planner
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.types import PlanResult
+    from robotdiffuse.results import PlanResult
 
 
 SEARCH, LEARNED, HYBRID = "search", "learned", "hybrid"

@@ -9,9 +9,9 @@ from robotdiffuse.collision.motion import finer
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends, usable_ends
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Settings
-from robotdiffuse.types import PlanResult
 
 Own = TypeVar("Own", bound=Settings)
 

@@ -9,7 +9,8 @@ from numpy import ndarray
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.types import Path, PlanResult, Status, Trajectory
+from robotdiffuse.results import PlanResult
+from robotdiffuse.types import Path, Status, Trajectory
 from robotdiffuse.verify import Report, Verifier, VerifySettings, Violation, verifier
 
 

@@ -28,10 +28,11 @@ from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.settings import Settings
-from robotdiffuse.types import Path, PlanResult
+from robotdiffuse.types import Path
 from robotdiffuse.verify import VerifySettings, verifier
 
 SAMPLES_PER_GOAL = 4

@@ -8,8 +8,9 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import explain_collision
 from robotdiffuse.planners.call import Call
 from robotdiffuse.problems.problem import JointGoal, PoseGoal
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
-from robotdiffuse.types import PlanResult, Status
+from robotdiffuse.types import Status
 
 GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""

@@ -17,9 +17,9 @@ from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Settings
-from robotdiffuse.types import PlanResult
 
 RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of a sample [m]."""

@@ -32,10 +32,10 @@ from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, RollOuts
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.settings import Settings
-from robotdiffuse.types import PlanResult
 
 STILL = 1e-4
 """The policy stands still where no joint moves further in a step [rad]; it would for ever."""

@@ -40,10 +40,10 @@ from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.settings import Settings
-from robotdiffuse.types import PlanResult
 
 SEARCH_ITERATIONS = 500
 """Iterations of RRT-Connect between two looks at the clock, in hybrid replanning."""

@@ -35,9 +35,10 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.planners.base import Planner, ever_finer
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import NotNegative, Positive, Settings
-from robotdiffuse.types import Path, PlanResult
+from robotdiffuse.types import Path
 from robotdiffuse.verify import VerifySettings, verifier
 
 try:

@@ -25,8 +25,9 @@ from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, encode
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.rrt_connect.planner import RRTConnect, RRTConnectSettings
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.types import Path, PlanResult
+from robotdiffuse.types import Path
 
 
 @dataclass(frozen=True)

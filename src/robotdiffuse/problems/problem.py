@@ -4,9 +4,9 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, no_type_check
+from typing import TYPE_CHECKING, ClassVar, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -128,12 +128,8 @@ class Problem:
             notes: tuple[str, ...] = (),
         ) -> None: ...
 
-    @classmethod
-    def load(cls, file: str | Path) -> "Problem":
-        """The problem in a .yaml, .yml or .json file; InputError for anything wrong in it."""
-        from robotdiffuse.problems.files import load_problem
-
-        return load_problem(file)
+    load: ClassVar[Callable[..., "Problem"]]
+    """`problems.files.load_problem`, put here by the package: files know problems, not the reverse."""
 
 
 def _configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:

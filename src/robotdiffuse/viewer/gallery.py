@@ -12,8 +12,7 @@ from tempfile import TemporaryDirectory
 
 from PIL import Image
 
-from robotdiffuse.files import write_atomically
-from robotdiffuse.paths.export import check_output
+from robotdiffuse.files import check_output, write_atomically
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.types import Path, Trajectory

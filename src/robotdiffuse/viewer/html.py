@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.files import write_atomically
-from robotdiffuse.paths.export import check_output
+from robotdiffuse.files import check_output, write_atomically
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
-from robotdiffuse.types import Path, PlanResult, Trajectory
+from robotdiffuse.types import Path, Trajectory
 from robotdiffuse.viewer import look
 from robotdiffuse.viewer.camera import VERTICAL_FIELD, best_view
 from robotdiffuse.viewer.look import GOAL, START, Surface, join

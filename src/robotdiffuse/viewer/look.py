@@ -8,12 +8,13 @@ import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual import load_visual
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
-from robotdiffuse.types import Path, PlanResult, Trajectory
+from robotdiffuse.types import Path, Trajectory
 
 START, GOAL = (0x4F, 0x7F, 0xD9), (0x10, 0xA3, 0x7F)
 """sRGB colours of both ends of a motion; the trace runs from one to the other."""

@@ -10,11 +10,11 @@ from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.files import write_atomically
-from robotdiffuse.paths.export import check_output
+from robotdiffuse.files import check_output, write_atomically
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.types import Path, PlanResult, Trajectory
+from robotdiffuse.types import Path, Trajectory
 from robotdiffuse.viewer import look
 from robotdiffuse.viewer.camera import Camera, best_view
 from robotdiffuse.viewer.look import GOAL, START, Surface, join

@@ -27,8 +27,7 @@ from robotdiffuse.evaluation.look import STYLE
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.tables import Table
 from robotdiffuse.evaluation.tables import html as html_table
-from robotdiffuse.files import write_atomically
-from robotdiffuse.paths.export import check_output
+from robotdiffuse.files import check_output, write_atomically
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
 

@@ -27,11 +27,11 @@ from robotdiffuse.planners import PLANNERS, load_planner
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.types import PlanResult
 
 FAR_SIDE = sys.executable, "-m", "robotdiffuse.evaluation.bench.planner_process"
 WARM_UP_SECONDS = 1.0

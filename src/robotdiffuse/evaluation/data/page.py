@@ -13,8 +13,7 @@ from robotdiffuse.evaluation import look
 from robotdiffuse.evaluation.data import plots
 from robotdiffuse.evaluation.data.report import DataColumns, DataSummary, read_columns, summarize
 from robotdiffuse.evaluation.look import STYLE
-from robotdiffuse.files import write_atomically
-from robotdiffuse.paths.export import check_output
+from robotdiffuse.files import check_output, write_atomically
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot

@@ -39,10 +39,11 @@ from robotdiffuse.planners.lattice import graph as lattice_graph
 from robotdiffuse.planners.lattice import kernel
 from robotdiffuse.planners.lattice import table as table
 from robotdiffuse.planners.lattice.graph import UNITS, Lattice
+from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.settings import Bound, Count, NotNegative, Positive, Settings
-from robotdiffuse.types import PlanResult, Status
+from robotdiffuse.types import Status
 
 SLICE = 200
 """Expansions between two looks at the clock."""

@@ -14,8 +14,9 @@ from robotdiffuse.planners.base import Planner, ever_finer
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Count, Natural, NotNegative, Positive, Settings
-from robotdiffuse.types import Path, PlanResult
+from robotdiffuse.types import Path
 from robotdiffuse.verify import VerifySettings, verifier
 
 ITERATIONS = 2_000

@@ -40,8 +40,8 @@ from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.rrt_connect import kernel as connect
 from robotdiffuse.planners.shared_tree import kernel
+from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Bound, Count, Natural, NotNegative, Positive, Settings
-from robotdiffuse.types import PlanResult
 
 END_MARGIN = 0.0005
 """What an end that is closer than the safety distance keeps less than it has [m]."""

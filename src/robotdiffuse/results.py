@@ -1,23 +1,70 @@
-"""Results and trajectories as files."""
+"""What a planner answers, and its files: the only place that knows how results are written."""
 
-import csv
-import io
 import json
 import math
-import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.files import write_atomically
-from robotdiffuse.types import Path, PlanResult, Status, Trajectory
+from robotdiffuse.files import check_output, write_atomically
+from robotdiffuse.types import ROWS, Path, Status, Trajectory
 
-ROWS = ("positions", "velocities", "accelerations")
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
+
+
+@dataclass(frozen=True, eq=False)
+class PlanResult:
+    """The answer of a planner. `path` is set if and only if `status` is SOLVED; then it passed `verify`."""
+
+    status: Status
+    reason: str
+    """A sentence that a person can act on; for SOLVED: what the solution came from."""
+    planner: str
+    robot: str
+    planning_time: float
+    """Wall time of plan() [s], with verification and without the timing of the trajectory."""
+    seed: int
+    stage: str = ""
+    """The part of the planner that produced the path, e.g. 'network', 'refinement', 'rrt_connect'."""
+    path: Path | None = None
+    trajectory: Trajectory | None = None
+    min_clearance: float | None = None
+    """A lower bound of all distances along the motion [m], the smaller of ..."""
+    scene_clearance: float | None = None
+    """... that of the distances to obstacles, and ..."""
+    self_clearance: float | None = None
+    """... that of those between links. Results of earlier versions lack the two."""
+    notes: tuple[str, ...] = field(default=())
+    """What was changed or ignored in the input, e.g. a start clamped to a limit."""
+    progress: tuple[tuple[float, float], ...] = ()
+    """When each shorter path was found [s since the call], and its joint-space length [rad]; the last pair is
+    the returned path's."""
+    refused: str = ""
+    """What was wrong with the last path that the judge refused, a `verify.Violation.kind`; "" if none was."""
+
+    @property
+    def solved(self) -> bool:
+        return self.status is Status.SOLVED
+
+    @property
+    def path_length(self) -> float | None:
+        return None if self.path is None else self.path.length
+
+    def save(self, file: str | FilePath, problem: dict[str, Any] | None = None) -> None:
+        """Write .json (everything, and the problem as in a problem file) or .csv (the trajectory alone).
+
+        Raises InputError for another ending, a file that cannot be written, or .csv without a trajectory.
+        """
+        path = check_output(file, (".json", ".csv"))
+        if path.suffix.lower() == ".json":
+            write_atomically(path, json.dumps(_record(self, problem), allow_nan=False) + "\n")
+        elif self.trajectory is None:
+            raise InputError(f"{path}: there is no trajectory to write ({self.status.value}); use .json")
+        else:
+            self.trajectory.save(path)
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,46 +74,6 @@ class ResultFile:
     result: PlanResult
     problem: dict[str, Any] | None
     """The problem as in a problem file, if it was saved along."""
-
-
-def check_output(file: str | FilePath, endings: tuple[str, ...]) -> FilePath:
-    """The file as a path, after a check that it can be written.
-
-    Raises InputError for an ending that is not among `endings` and for a folder that is missing or read-only.
-    """
-    path = FilePath(file)
-    if path.suffix.lower() not in endings:
-        raise InputError(f"{path}: unknown ending {path.suffix!r}; known: {', '.join(endings)}")
-    if path.is_dir():
-        raise InputError(f"{path} is a folder; name a file")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: the folder {path.parent} does not exist")
-    if not os.access(path.parent, os.W_OK) or (path.exists() and not os.access(path, os.W_OK)):
-        raise InputError(f"{path} cannot be written: permission denied")
-    return path
-
-
-def save_trajectory(trajectory: Trajectory, file: str | FilePath) -> None:
-    """Write .json or .csv, by the ending; the CSV header is time, then <joint>_position and so on.
-
-    Raises InputError for another ending or a file that cannot be written.
-    """
-    path = check_output(file, tuple(TRAJECTORY_WRITERS))
-    write_atomically(path, TRAJECTORY_WRITERS[path.suffix.lower()](trajectory))
-
-
-def save_result(result: PlanResult, file: str | FilePath, problem: dict[str, Any] | None = None) -> None:
-    """Write .json (everything, and the problem if given) or .csv (the trajectory alone).
-
-    Raises InputError for another ending, a file that cannot be written, or .csv without a trajectory.
-    """
-    path = check_output(file, (".json", ".csv"))
-    if path.suffix.lower() == ".json":
-        write_atomically(path, _json(_result_record(result, problem)))
-    elif result.trajectory is None:
-        raise InputError(f"{path}: there is no trajectory to write ({result.status.value}); use .json")
-    else:
-        save_trajectory(result.trajectory, path)
 
 
 def load_result(file: str | FilePath) -> ResultFile:
@@ -91,37 +98,7 @@ def load_result(file: str | FilePath) -> ResultFile:
         raise InputError(f"{file}: {error}") from None
 
 
-def _json(record: dict[str, Any]) -> str:
-    return json.dumps(record, allow_nan=False) + "\n"
-
-
-def _trajectory_record(trajectory: Trajectory) -> dict[str, Any]:
-    return {
-        "joint_names": list(trajectory.joint_names),
-        "times": trajectory.times.tolist(),
-        "positions": trajectory.positions.tolist(),
-        "velocities": trajectory.velocities.tolist(),
-        "accelerations": trajectory.accelerations.tolist(),
-    }
-
-
-def _trajectory_csv(trajectory: Trajectory) -> str:
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    kinds = ("position", "velocity", "acceleration")
-    writer.writerow(["time", *(f"{name}_{kind}" for kind in kinds for name in trajectory.joint_names)])
-    columns = (trajectory.times[:, None], *(getattr(trajectory, rows) for rows in ROWS))
-    writer.writerows([repr(value) for value in row] for row in np.concatenate(columns, axis=1).tolist())
-    return stream.getvalue()
-
-
-TRAJECTORY_WRITERS: dict[str, Callable[[Trajectory], str]] = {
-    ".json": lambda trajectory: _json(_trajectory_record(trajectory)),
-    ".csv": _trajectory_csv,
-}
-
-
-def _result_record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any]:
+def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any]:
     record: dict[str, Any] = {
         "status": result.status.value,
         "reason": result.reason,
@@ -136,6 +113,8 @@ def _result_record(result: PlanResult, problem: dict[str, Any] | None) -> dict[s
         "scene_clearance": result.scene_clearance,
         "self_clearance": result.self_clearance,
         "notes": list(result.notes),
+        "progress": [list(found) for found in result.progress],
+        "refused": result.refused,
         "joint_names": [],
         "waypoints": None if result.path is None else result.path.positions.tolist(),
         "times": [],
@@ -146,7 +125,7 @@ def _result_record(result: PlanResult, problem: dict[str, Any] | None) -> dict[s
     if result.path is not None:
         record["joint_names"] = list(result.path.joint_names)
     if result.trajectory is not None:
-        record |= _trajectory_record(result.trajectory)
+        record |= result.trajectory.record()
     return record if problem is None else record | {"problem": problem}
 
 
@@ -175,7 +154,15 @@ def _result(record: dict[str, Any]) -> PlanResult:
         scene_clearance=_number_or_none(record, "scene_clearance"),
         self_clearance=_number_or_none(record, "self_clearance"),
         notes=_names(record, "notes") if "notes" in record else (),
+        progress=_progress(record),
+        refused=_text(record, "refused") if "refused" in record else "",
     )
+
+
+def _progress(record: dict[str, Any]) -> tuple[tuple[float, float], ...]:
+    if not record.get("progress"):
+        return ()
+    return tuple((at, length) for at, length in _rows(record, "progress", None, 2).tolist())
 
 
 def _trajectory(record: dict[str, Any], names: tuple[str, ...]) -> Trajectory:

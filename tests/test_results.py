@@ -2,15 +2,16 @@
 
 import csv
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.export import check_output, load_result, save_result, save_trajectory
-from robotdiffuse.types import Path, PlanResult, Status, Trajectory
+from robotdiffuse.files import check_output
+from robotdiffuse.results import PlanResult, load_result
+from robotdiffuse.types import Path, Status, Trajectory
 
 NAMES = ("shoulder", "elbow")
 
@@ -38,6 +39,8 @@ def solved(trajectory: Trajectory) -> PlanResult:
         scene_clearance=0.02,
         self_clearance=0.05,
         notes=("start clamped",),
+        progress=((0.002, 3.5), (0.008, 3.0)),
+        refused="scene_collision",
     )
 
 
@@ -48,22 +51,12 @@ def failed() -> PlanResult:
 
 def test_solved_result_round_trip(solved: PlanResult, tmp_path: FilePath) -> None:
     file = tmp_path / "result.json"
-    save_result(solved, file, {"robot": "panda", "scene": []})
+    solved.save(file, {"robot": "panda", "scene": []})
     read = load_result(file)
     assert read.problem == {"robot": "panda", "scene": []}
-    clearances = ("min_clearance", "scene_clearance", "self_clearance")
-    for name in (
-        "status",
-        "reason",
-        "planner",
-        "robot",
-        "planning_time",
-        "seed",
-        "stage",
-        "notes",
-        *clearances,
-    ):
-        assert getattr(read.result, name) == getattr(solved, name)
+    for field in fields(PlanResult):
+        if field.name not in ("path", "trajectory"):
+            assert getattr(read.result, field.name) == getattr(solved, field.name), field.name
     assert read.result.path_length == solved.path_length
     assert read.result.path is not None and solved.path is not None
     assert np.array_equal(read.result.path.positions, solved.path.positions)
@@ -83,14 +76,24 @@ def test_fields_are_those_that_the_design_promises(solved: PlanResult, tmp_path:
     assert len(record["times"]) == len(record["positions"]) == len(record["accelerations"]) == 4
 
 
-def test_results_of_earlier_versions_have_one_clearance(solved: PlanResult, tmp_path: FilePath) -> None:
+def test_progress_and_refused_survive_save_and_load(solved: PlanResult, tmp_path: FilePath) -> None:
+    """They were lost."""
+    for result in (solved, replace(solved, progress=(), refused="")):
+        result.save(tmp_path / "r.json")
+        read = load_result(tmp_path / "r.json").result
+        assert (read.progress, read.refused) == (result.progress, result.refused)
+
+
+def test_results_of_earlier_versions_lack_fields(solved: PlanResult, tmp_path: FilePath) -> None:
     file = tmp_path / "r.json"
-    solved.save(str(file))
+    solved.save(file)
     record = json.loads(file.read_text())
-    del record["scene_clearance"], record["self_clearance"]
+    for name in ("scene_clearance", "self_clearance", "progress", "refused"):
+        del record[name]
     file.write_text(json.dumps(record))
     read = load_result(file).result
     assert (read.min_clearance, read.scene_clearance, read.self_clearance) == (0.02, None, None)
+    assert (read.progress, read.refused) == ((), "")
 
 
 def test_failed_result_round_trip(failed: PlanResult, tmp_path: FilePath) -> None:
@@ -124,15 +127,15 @@ def test_trajectory_json(trajectory: Trajectory, tmp_path: FilePath) -> None:
 
 def test_unknown_ending_lists_the_known_ones(trajectory: Trajectory, tmp_path: FilePath) -> None:
     with pytest.raises(InputError, match=r"unknown ending '.txt'; known: .json, .csv"):
-        save_trajectory(trajectory, tmp_path / "motion.txt")
+        trajectory.save(tmp_path / "motion.txt")
 
 
 def test_unwritable(solved: PlanResult, tmp_path: FilePath) -> None:
     with pytest.raises(InputError, match="nowhere does not exist"):
-        save_result(solved, tmp_path / "nowhere" / "r.json")
+        solved.save(tmp_path / "nowhere" / "r.json")
     (tmp_path / "folder.json").mkdir()
     with pytest.raises(InputError, match="is a folder"):
-        save_result(solved, tmp_path / "folder.json")
+        solved.save(tmp_path / "folder.json")
 
 
 def test_a_failed_write_keeps_the_old_file(
@@ -146,13 +149,13 @@ def test_a_failed_write_keeps_the_old_file(
 
     monkeypatch.setattr(FilePath, "replace", full)
     with pytest.raises(InputError, match="No space left on device"):
-        save_result(solved, file)
+        solved.save(file)
     assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
 
 
 def test_not_finite_is_never_written(solved: PlanResult, tmp_path: FilePath) -> None:
     with pytest.raises(ValueError, match="not JSON compliant"):
-        save_result(replace(solved, min_clearance=float("nan")), tmp_path / "r.json")
+        replace(solved, min_clearance=float("nan")).save(tmp_path / "r.json")
     assert not list(tmp_path.iterdir())
 
 
@@ -167,6 +170,7 @@ DAMAGE = [
     ({"waypoints": [[0.0, None]]}, "waypoints holds numbers that are not finite"),
     ({"joint_names": [1, 2]}, r"joint_names is \[1, 2\]; it must be a list of texts"),
     ({"planning_time": "soon"}, "planning_time is 'soon'; it must be a finite number"),
+    ({"progress": [[0.1]]}, r"progress has shape 1x1; it must be nx2"),
     ({"reason": 7}, "reason is 7; it must be text"),
     ({"problem": [1]}, "problem is a list; it must be an object"),
 ]
@@ -177,7 +181,7 @@ def test_damaged_result_is_refused(
     change: dict, message: str, solved: PlanResult, tmp_path: FilePath
 ) -> None:
     file = tmp_path / "r.json"
-    save_result(solved, file)
+    solved.save(file)
     file.write_text(json.dumps(json.loads(file.read_text()) | change))
     with pytest.raises(InputError, match=message) as caught:
         load_result(file)
