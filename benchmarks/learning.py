@@ -44,10 +44,10 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motion import search_space
+from robotdiffuse.data.dataset import resample
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.trials import NETWORK_ALONE
-from robotdiffuse.generation.shard_maker import resample
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.ends import Ends
@@ -269,7 +269,7 @@ def compare(tasks: list[Task], planner: RobotDiffuse, title: str) -> dict[str, F
             for m, (path, free) in enumerate(answers(task, arena, tried)):
                 found[name].answered[i, m] = path is not None
                 if path is not None and free:
-                    even = resample(path.astype(np.float64), FRAMES)
+                    even = resample(path[None].astype(np.float64), FRAMES)[0]
                     length = float(path_length(path))
                     found[name].length[i, m] = length
                     found[name].links[i, m] = links(even[None])[0]

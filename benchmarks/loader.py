@@ -18,14 +18,14 @@ import torch
 from report import header, print_table
 
 from robotdiffuse.data.dataset import RopDataset
-from robotdiffuse.data.shards import SPLITS, Manifest, write_manifest, write_shard
+from robotdiffuse.data.manifest import Manifest, floor_record, write_manifest
+from robotdiffuse.data.shards import SPLITS, write_shard
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import pack_scene
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.packed import PackedScenes
 
 FRAMES, SLOTS, GOALS, SHARD = 254, 12, 10, 1000
 POINTS, BATCH, DENSE_SHARE = 1400, 256, 0.15
@@ -45,6 +45,7 @@ def write_store(folder: str, robot: Robot, trajectories: int) -> None:
         frames=FRAMES,
         timing="arc",
         families={"rop": {}, "rop_dense": {}},
+        floors=dict.fromkeys(("rop", "rop_dense"), floor_record(ROP.floor)),
         slots=SLOTS,
         goals=GOALS,
         trajectories=trajectories,
@@ -59,7 +60,7 @@ def write_store(folder: str, robot: Robot, trajectories: int) -> None:
         ends = rng.uniform(robot.lower, robot.upper, (2, n, robot.dof)).astype(np.float32)
         dense = rng.random(n) < DENSE_SHARE
         scenes = [(ROP_DENSE if d else ROP).scene(rng) for d in dense]
-        packed = [pack_scene(Scene(scene.shapes[1:]), SLOTS) for scene in scenes]
+        packed = PackedScenes.pack(scenes, SLOTS, floor=True)
         goals = np.repeat(ends[1][:, None], GOALS, axis=1)
         arrays = {
             "trajectories": ends[0][:, None] * (1 - s) + ends[1][:, None] * s,
@@ -68,8 +69,8 @@ def write_store(folder: str, robot: Robot, trajectories: int) -> None:
             "goal_costs": np.zeros((n, GOALS)),
             "goal_index": np.zeros(n),
             "target_pose": np.zeros((n, 7)),
-            "obstacle_kinds": np.stack([kinds for kinds, _ in packed]),
-            "obstacle_params": np.stack([params for _, params in packed]),
+            "obstacle_kinds": packed.kinds,
+            "obstacle_params": packed.params,
             "family": dense,
             "end_clearance": np.zeros((n, 2)),
             **{name: np.zeros(n) for name in ("cost", "clearance", "safety_distance", "line_free", "detour")},

@@ -14,7 +14,8 @@ import pytest
 
 from robotdiffuse.cli import main
 from robotdiffuse.cli.background_factory import filled_meanwhile
-from robotdiffuse.data.shards import check_shard, read_manifest, shard_indices, write_manifest
+from robotdiffuse.data.manifest import read_manifest, write_manifest
+from robotdiffuse.data.shards import check_shard, shard_indices
 from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.factory import manifest_of
 from robotdiffuse.learning.denoisers import PAPER_SIZE

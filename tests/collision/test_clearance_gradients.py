@@ -18,12 +18,11 @@ from robotdiffuse.learning.denoisers import TransformerSettings
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.planner import moving_links
-from robotdiffuse.learning.training.validation import FLOOR
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import pack_scene
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
@@ -60,16 +59,16 @@ def model_config(robot: Robot, **changes) -> MotionModelConfig:
 def test_training_is_told_what_planning_is() -> None:
     """In scenes of different size at once; clearances are those that are told without gradients."""
     rng = np.random.default_rng(1)
-    scenes = [Scene(family.scene(rng).shapes[1:]) for family in (ROP, ROP_DENSE, ROP_DENSE)]
-    packed = [pack_scene(scene, 12) for scene in [*scenes, Scene([])]]
-    kinds, params = (np.stack(part) for part in zip(*packed, strict=True))
+    scenes = [family.scene(rng) for family in (ROP, ROP_DENSE, ROP_DENSE)]
+    scenes.append(Scene(scenes[0].shapes[:1]))
+    packed = PackedScenes.pack(scenes, 12, floor=True)
     q, config = configurations(len(packed), 60), model_config(PANDA, sees_gradients=True)
-    given = compile_robot(PANDA), kinds, params, q, FLOOR, config.clearance_high
+    given = compile_robot(PANDA), packed, q, config.clearance_high
     clearances, gradients = packed_clearances_and_gradients(*given, config.gradient_margin)
     np.testing.assert_array_equal(clearances, packed_link_clearances(*given))
     told = np.concatenate([clearances, gradients], axis=-1)
-    for i, scene in enumerate([*scenes, Scene([])]):
-        checker = CollisionChecker(PANDA, Scene([*FLOOR.shapes, *scene.shapes]))
+    for i, scene in enumerate(scenes):
+        checker = CollisionChecker(PANDA, scene)
         np.testing.assert_allclose(link_clearances(checker, config)(q[i : i + 1])[0], told[i], atol=1e-4)
         assert (gradients[i].any(axis=1) <= (clearances[i].min(axis=1) < config.gradient_margin)).all()
     assert 0.3 < gradients.any(axis=-1).mean() < 0.9

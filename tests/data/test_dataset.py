@@ -11,19 +11,13 @@ from torch.utils.data import DataLoader
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays, write_store
-from robotdiffuse.data.dataset import RopBatch, RopDataset
+from robotdiffuse.data.dataset import RopBatch, RopDataset, resample
 from robotdiffuse.data.export import export_npz
-from robotdiffuse.data.shards import (
-    SPLITS,
-    read_shard,
-    shard_path,
-    split_of,
-    write_manifest,
-    write_shard,
-)
+from robotdiffuse.data.manifest import write_manifest
+from robotdiffuse.data.shards import SPLITS, read_shard, shard_path, split_of, write_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.packed import BOX, SPHERE
+from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
 
 ARM, FRAMES, SIZES = box_arm(), 20, (150, 0, 130, 40)
 
@@ -45,7 +39,7 @@ def stored(store, name):
 
 
 def test_every_row_of_a_split_once(store):
-    split = split_of(stored(store, "obstacle_kinds"), stored(store, "obstacle_params"))
+    split = split_of(PackedScenes(stored(store, "obstacle_kinds"), stored(store, "obstacle_params")))
     q, pose = stored(store, "trajectories"), stored(store, "target_pose")
     scaled = (q - (ARM.upper + ARM.lower) / 2) / ((ARM.upper - ARM.lower) / 2)
     for i, name in enumerate(SPLITS):
@@ -122,6 +116,25 @@ def test_standard_loader(store, workers):
     torch.testing.assert_close(data[-1]["trajectories"], q[-1], atol=0, rtol=0)
     with pytest.raises(IndexError, match=f"there are {len(data)} items"):
         data[len(data)]
+
+
+def test_resampling():
+    q = np.array([[[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [3.0, 1.0]], [[1.0, 2.0]] * 4], np.float32)
+    even = resample(q, 5)
+    np.testing.assert_allclose(even[0], [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]], atol=1e-6)
+    np.testing.assert_array_equal(even[1], q[1, [0] * 5])
+    assert resample(q[:0], 5).shape == (0, 5, 2)
+    assert (resample(q[1:], 3) == q[1, 0]).all()
+    long = np.random.default_rng(0).standard_normal((4, 254, 3)).cumsum(1).astype(np.float32)
+    long[2, 40:80] = long[2, 40]
+    for exact in (False, True):
+        for path, found in zip(long, resample(long, 48, exact), strict=True):
+            at = np.concatenate([[0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum(dtype=np.float64)])
+            wanted = [np.interp(np.linspace(0, at[-1], 48), at, path[:, j]) for j in range(3)]
+            np.testing.assert_allclose(found, np.stack(wanted, 1), atol=1e-5)
+            np.testing.assert_array_equal(found[[0, -1]], path[[0, -1]])
+            if exact:
+                np.testing.assert_array_equal(found, np.stack(wanted, 1).astype(np.float32))
 
 
 def test_pickled_without_the_trajectories(store):

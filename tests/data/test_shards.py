@@ -17,22 +17,22 @@ from zarr.codecs import ZstdCodec
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.data import shards
+from robotdiffuse.data.manifest import read_manifest, write_manifest
 from robotdiffuse.data.shards import (
     ARRAYS,
     SPLITS,
     check_shard,
-    read_manifest,
     read_shard,
     remove_leftovers,
     shard_indices,
     shard_path,
     split_of,
-    write_manifest,
     write_shard,
 )
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.scenes.packed import PackedScenes
 
 ARM, FRAMES = box_arm(), 12
 
@@ -297,13 +297,13 @@ def test_robot_fingerprint():
 def test_splits_keep_scenes_together():
     rng = np.random.default_rng(0)
     arrays = random_arrays(ARM, 4000, rng, 2)
-    kinds, params = arrays["obstacle_kinds"], arrays["obstacle_params"]
-    split = split_of(kinds, params)
+    scenes = PackedScenes(arrays["obstacle_kinds"], arrays["obstacle_params"])
+    split = split_of(scenes)
     shares = np.bincount(split, minlength=len(SPLITS)) / len(split)
     # three standard errors of 5 % of 4000
     np.testing.assert_allclose(shares, [0.9, 0.05, 0.05], atol=3 * np.sqrt(0.05 * 0.95 / 4000))
     order = rng.permutation(4000)
-    np.testing.assert_array_equal(split_of(kinds[order], params[order]), split[order])
+    np.testing.assert_array_equal(split_of(scenes[order]), split[order])
 
 
 def test_without_zarr(tmp_path, arrays, monkeypatch):

@@ -9,10 +9,9 @@ import pytest
 
 from helpers.box_arm import box_arm
 from helpers.motion_stores import line, random_motions, record, write_motions
-from robotdiffuse.data.shards import read_shard, shard_path, write_shard
+from robotdiffuse.data.shards import motion_of, pick_rows, problem_of, read_shard, shard_path, write_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.data.check import KINDS, check_data
-from robotdiffuse.evaluation.data.rows import motion_of, pick_rows, problem_of, scene_of
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -179,16 +178,13 @@ def test_rows_are_problems_again(tmp_path):
     motion = motion_of(ARM, shard, 0)
     assert isinstance(motion, Motion) and np.array_equal(motion.positions, near["trajectories"])
 
-    floored = replace(
-        manifest, families={"rop": {"floor_size": 3.0, "floor_thickness": 0.1, "x": [0.0, 1.0]}}
-    )
-    first, *others = scene_of(floored, shard, 0).shapes
-    assert isinstance(first, Box) and first.size.tolist() == [3.0, 3.0, 0.1]
+    floor = {"center": [0.0, 0.0, -0.2], "size": [3.0, 2.0, 0.4]}
+    floored = replace(manifest, floors={"rop": floor, "rop_dense": None})
+    first, *others = problem_of(floored, ARM, shard, 0).scene.shapes
+    assert isinstance(first, Box) and first.size.tolist() == floor["size"] and first.name == "floor"
     assert len(others) == 2
-    with pytest.raises(InputError, match="family 'rap'"):
-        scene_of(replace(manifest, families={"rap": {}}), shard, 0)
     with pytest.raises(InputError, match="family is 0; the manifest has 0"):
-        scene_of(replace(manifest, families={}), shard, 0)
+        problem_of(replace(manifest, families={}, floors={}), ARM, shard, 0)
 
 
 def test_timed_rows_move_in_time(tmp_path):

@@ -16,17 +16,16 @@ from numpy import ndarray
 
 from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.data.shards import check_shard, read_manifest, read_shard
+from robotdiffuse.data.manifest import read_manifest
+from robotdiffuse.data.shards import check_shard, path_of, problem_of, read_shard
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data.rows import path_of, problem_of
 from robotdiffuse.generation import GenerationSettings, factory, generate
-from robotdiffuse.generation.shard_maker import NUMBERS, draw, make_shard, resample
+from robotdiffuse.generation.shard_maker import NUMBERS, draw, make_shard
 from robotdiffuse.problems.families import family, rop
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.packed import pack_scene
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion
 from robotdiffuse.types import Path as Motion
 from robotdiffuse.verify import verify
@@ -100,9 +99,9 @@ def checked_problem(row: dict[str, Any]) -> tuple[Problem, CollisionChecker]:
     number, drawn = draw(SETTINGS, PANDA, rng)
     assert row["family"] == number
     floor = list(SETTINGS.families.values())[number].floor
-    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor is not None :]), SETTINGS.slots)
-    np.testing.assert_array_equal(row["obstacle_kinds"], kinds)
-    np.testing.assert_array_equal(row["obstacle_params"], params)
+    packed = PackedScenes.pack([drawn.scene], SETTINGS.slots, floor is not None)
+    np.testing.assert_array_equal(row["obstacle_kinds"], packed.kinds[0])
+    np.testing.assert_array_equal(row["obstacle_params"], packed.params[0])
     np.testing.assert_array_equal(row["start"], drawn.start)
     k = len(drawn.goals)
     np.testing.assert_array_equal(row["goals"][:k], drawn.goals)
@@ -191,13 +190,6 @@ def test_frames_in_time_keep_the_velocity_limits() -> None:
     # some joint is near a limit of it, or the motion would take longer than it needs
     assert (rates / PANDA.velocity).max(axis=(1, 2)).min() > 0.2
     np.testing.assert_array_equal(q[:, 0], arrays["start"])
-
-
-def test_frames_are_even_in_length() -> None:
-    path = np.array([[0.0, 0], [3, 0], [3, 1]])
-    np.testing.assert_allclose(resample(path, 5), [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]])
-    np.testing.assert_array_equal(resample(path, 2), path[[0, -1]])
-    np.testing.assert_array_equal(resample(path[[0, 0]], 3), np.zeros((3, 2)))
 
 
 @pytest.mark.parametrize(

@@ -7,14 +7,15 @@ from numpy import ndarray
 
 from helpers.stores import GOALS, SLOTS, manifest_of
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.data.shards import Manifest, write_manifest, write_shard
+from robotdiffuse.data.manifest import Manifest, write_manifest
+from robotdiffuse.data.shards import write_shard
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import pack_scene
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
 FRAMES = 20
-FLOORLESS = {"rop": {"floor": False}, "rop_dense": {"floor": False}}
+FAMILIES = ("rop", "rop_dense")
 
 
 def line(start: ndarray, goal: ndarray, frames: int = FRAMES) -> ndarray:
@@ -30,7 +31,7 @@ def record(
     goals[0], goals[1] = q[-1], q[-1] + 0.1
     length = np.linalg.norm(np.diff(q.astype(np.float64), axis=0), axis=1).sum()
     costs[:2] = length, np.inf
-    kinds, params = pack_scene(scene, SLOTS)
+    packed = PackedScenes.pack([scene], SLOTS)
     return {
         "trajectories": q,
         "start": q[0],
@@ -38,8 +39,8 @@ def record(
         "goal_costs": costs,
         "goal_index": np.array(0),
         "target_pose": np.array([1.0, 0, 0, 0, 0.3, 0, 0.5]),
-        "obstacle_kinds": kinds,
-        "obstacle_params": params,
+        "obstacle_kinds": packed.kinds[0],
+        "obstacle_params": packed.params[0],
         "family": np.array(family),
         "cost": length,
         "clearance": CollisionChecker(robot, scene).link_clearances(q).min(initial=1.0),
@@ -54,8 +55,9 @@ def record(
 def write_motions(
     folder: Path, robot: Robot, rows: list[dict[str, ndarray]], shard: int = 100, frames: int = FRAMES
 ) -> Manifest:
-    """A data set of these rows, so many in a shard."""
-    manifest = manifest_of(robot, frames, families=FLOORLESS, trajectories=len(rows), shard=shard)
+    """A data set of these rows without a floor, so many in a shard."""
+    of = {"families": {name: {} for name in FAMILIES}, "floors": dict.fromkeys(FAMILIES)}
+    manifest = manifest_of(robot, frames, trajectories=len(rows), shard=shard, **of)
     write_manifest(folder, manifest)
     for i in range(0, len(rows), shard):
         part = rows[i : i + shard]

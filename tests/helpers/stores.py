@@ -7,7 +7,8 @@ import numpy as np
 from numpy import ndarray
 from numpy.random import Generator
 
-from robotdiffuse.data.shards import Manifest, write_manifest, write_shard
+from robotdiffuse.data.manifest import Manifest, write_manifest
+from robotdiffuse.data.shards import write_shard
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import BOX, SPHERE
@@ -25,6 +26,7 @@ def manifest_of(robot: Robot, frames: int = FRAMES, **changes: Any) -> Manifest:
         "frames": frames,
         "timing": "arc",
         "families": {"rop": {"sphere_radius": [0.25, 0.25]}},
+        "floors": {"rop": {"center": [0.0, 0.0, -0.05], "size": [2.0, 2.0, 0.1]}},
         "slots": SLOTS,
         "goals": GOALS,
         "trajectories": 100,

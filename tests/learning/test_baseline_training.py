@@ -22,9 +22,9 @@ from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import pack_scene
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.scenes.shapes import Box, Sphere
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Reversal(BaselineNetwork):
         return (middle - q[:, q.shape[1] // 2]).square().mean()
 
     def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float:
-        return float(motions_free(robot, data.kinds[:4], data.params[:4], data.q[:4]).mean())
+        return float(motions_free(robot, data.scenes[:4], data.q[:4]).mean())
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def test_motion_through_the_floor_or_an_obstacle_is_not_free() -> None:
     beside, down = start.copy(), start.copy()
     beside[0], down[1] = 1.0, 1.7
     motions = np.linspace([start, start, start], [beside, beside, down], 5, axis=1)
-    packed = [pack_scene(Scene(shapes), 1) for shapes in ([], [Sphere((0.4, 0.2, 0.6), 0.1)], [])]
-    kinds, params = (np.stack(part) for part in zip(*packed, strict=True))
-    free = motions_free(panda, kinds, params, motions)
+    floor = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1))
+    scenes = [Scene([floor, *shapes]) for shapes in ([], [Sphere((0.4, 0.2, 0.6), 0.1)], [])]
+    free = motions_free(panda, PackedScenes.pack(scenes, 1, floor=True), motions)
     assert free.tolist() == [True, False, False]

@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.cli import main
-from robotdiffuse.data.shards import write_manifest, write_shard
+from robotdiffuse.data.manifest import write_manifest
+from robotdiffuse.data.shards import write_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
 from robotdiffuse.learning.denoisers import TransformerSettings
@@ -35,10 +36,9 @@ from robotdiffuse.learning.training import encoder as encoder_training
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.batches import Batches, load_data, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
-from robotdiffuse.learning.training.encoder import linear_readout, scene_distances, train_encoder
+from robotdiffuse.learning.training.encoder import linear_readout, train_encoder
 from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.scenes.packed import BOX, SPHERE
-from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.scenes.packed import SPHERE
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 
 SMALL_CAE = CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16))
@@ -86,11 +86,12 @@ def test_any_number_of_points(name, n):
 @every_encoder
 def test_any_number_of_obstacles(name):
     encoder = small(name)
-    kinds, params = random_scenes(13, 12, np.random.default_rng(0))
+    scenes = random_scenes(13, 12, np.random.default_rng(0))
+    kinds, params = scenes.kinds, scenes.params
     kinds[:] = np.where(np.arange(12) < np.arange(13)[:, None], SPHERE, 0)
     params[..., :3] = np.random.default_rng(1).uniform([-0.5, -0.5, 0.2], [0.5, 0.5, 1.2], (13, 12, 3))
     params[..., 3] = 0.1
-    clouds = scene_clouds(encoder, kinds, params, np.random.default_rng(0))
+    clouds = scene_clouds(encoder, scenes, np.random.default_rng(0))
     assert clouds.shape == (13, encoder.settings.cloud, 3)
     z = encoder(clouds)
     assert z.isfinite().all()
@@ -208,8 +209,8 @@ def test_compression_autoencoder_has_the_papers_layers():
 def test_arranged_clouds():
     """Sorted as the ordered clouds of `surface_clouds` are already, and thinned or repeated evenly."""
     encoder = CompressionAutoencoder(SMALL_CAE)
-    scenes = [torch.from_numpy(a) for a in random_scenes(20, 12, np.random.default_rng(0))]
-    clouds = partial(surface_clouds, *scenes, region=encoder.settings.region)
+    scenes = random_scenes(20, 12, np.random.default_rng(0))
+    clouds = partial(surface_clouds, scenes, region=encoder.settings.region)
     ordered = clouds(40, torch.Generator().manual_seed(0), ordered=True)
     loose = clouds(40, torch.Generator().manual_seed(0))
     torch.testing.assert_close(encoder.arrange(ordered), ordered, atol=1e-6, rtol=0)
@@ -273,7 +274,7 @@ def test_training_alone(name, tmp_path, monkeypatch):
     drawn = set()
 
     def clouds(*given):
-        drawn.add(given[4] if len(given) > 4 else None)
+        drawn.add(given[3] if len(given) > 3 else None)
         return scene_clouds(*given)
 
     monkeypatch.setattr(encoder_training, "scene_clouds", clouds)
@@ -286,7 +287,7 @@ def test_training_alone(name, tmp_path, monkeypatch):
     encoder = load_encoder(tmp_path / "long")
     assert encoder_name(encoder) == name
     scenes = random_scenes(300, 12, np.random.default_rng(5))
-    z = encoder(scene_clouds(encoder, *scenes, np.random.default_rng(6)))
+    z = encoder(scene_clouds(encoder, scenes, np.random.default_rng(6)))
     torch.testing.assert_close(z.std(0), torch.ones(8), atol=0.35, rtol=0)
 
 
@@ -305,31 +306,6 @@ def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
     assert load_encoder(out).settings == CompressionAutoencoderSettings()
     assert main([*command, "pointnett"]) == 2
     assert "known: compression_autoencoder, dgcnn" in capsys.readouterr().err
-
-
-def test_scene_distances_against_the_shapes():
-    rng = np.random.default_rng(0)
-    kinds, params = random_scenes(30, 5, rng)
-    at = rng.uniform([-1, -1, 0], [1, 1, 1.2], (25, 3))
-    found = scene_distances(kinds, params, at)
-    for row, scene_kinds, scene_params in zip(found, kinds, params, strict=True):
-        shapes = []
-        for kind, p in zip(scene_kinds, scene_params.astype(float), strict=True):
-            if kind == SPHERE:
-                shapes.append(Sphere(p[:3], p[3]))
-            elif kind == BOX:
-                shapes.append(Box(p[:3], p[3:6], p[6:]))
-        for place, distance in zip(at, row, strict=True):
-            wanted = min((float(_distance(shape, place)) for shape in shapes), default=np.inf)
-            assert distance == pytest.approx(wanted, abs=1e-6)
-
-
-def _distance(shape, place):
-    if isinstance(shape, Sphere):
-        return np.linalg.norm(place - shape.center) - shape.radius
-    local = shape.rotation.T @ (place - shape.center)
-    beyond = np.abs(local) - np.asarray(shape.size) / 2
-    return np.linalg.norm(beyond.clip(0)) if (beyond > 0).any() else beyond.max()
 
 
 def test_readout_of_codes_that_tell_nothing(monkeypatch):
@@ -416,7 +392,7 @@ def test_batches_with_clouds_instead_of_codes(data):
     )  # fmt: skip
     kept = load_data(str(data), arm, None, config.frames, lambda text: None)
     assert kept.codes is None
-    batches = Batches(kept, MotionModel(config), lambda k, p, q: np.ones((*q.shape[:2], 3)), 0.1, 5.0)
+    batches = Batches(kept, MotionModel(config), lambda scenes, q: np.ones((*q.shape[:2], 3)), 0.1, 5.0)
     first, again = (batches.draw(8, np.random.default_rng(3)) for _ in range(2))
     assert first.clouds is not None and again.clouds is not None
     assert first.clouds.shape == (8, 32, 3)

@@ -11,7 +11,7 @@ from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics, link_pose
-from robotdiffuse.scenes.packed import pack_scene
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 
@@ -31,12 +31,10 @@ def test_distances_are_those_of_the_kernel(floor: bool) -> None:
     scenes = [Scene(family.scene(rng).shapes[1:]) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     turned = rng.normal(size=4)
     scenes += [Scene([]), Scene([Box([0.4, 0.1, 0.5], [0.1, 0.3, 0.6], turned / np.linalg.norm(turned))])]
-    packed = [pack_scene(scene, 12) for scene in scenes]
-    kinds, params = (np.stack(part) for part in zip(*packed, strict=True))
+    scenes = [Scene([*([ROP.floor] if floor else []), *scene.shapes]) for scene in scenes]
     q = configurations(len(scenes), 20)
-    distance = ArmDistance(DOUBLE, floor)(q, kinds, params).numpy()
-    for i, scene in enumerate(scenes):
-        full = Scene([*scene.shapes, *([ROP.floor] if floor else [])])
+    distance = ArmDistance(DOUBLE)(q, PackedScenes.pack(scenes, 12, floor)).numpy()
+    for i, full in enumerate(scenes):
         expected = CollisionChecker(PANDA, full).link_clearances(q[i].numpy()).min(axis=1)
         # the floor's box is as wide as the arm reaches; deep in it the plane and the box differ
         checked = (expected > -0.05) & (expected < 0.8)
@@ -47,11 +45,11 @@ def test_distances_are_those_of_the_kernel(floor: bool) -> None:
 
 def test_the_hinge_and_its_gradient() -> None:
     rng = np.random.default_rng(2)
-    kinds, params = pack_scene(Scene(ROP.scene(rng).shapes[1:]), 2)
+    scenes = PackedScenes.pack([ROP.scene(rng)], 2, floor=True)
     arm, q = ArmDistance(DOUBLE), configurations(1, 6, 3).requires_grad_()
 
     def loss(at: torch.Tensor) -> torch.Tensor:
-        return hinge(arm(at, kinds[None], params[None]), 0.2).square().mean()
+        return hinge(arm(at, scenes), 0.2).square().mean()
 
     loss(q).backward()
     assert q.grad is not None and q.grad.abs().max() > 0

@@ -20,7 +20,8 @@ from helpers.box_arm import box_arm
 from helpers.stores import FRAMES as STORED
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.data.shards import shard_path, split_of, write_manifest, write_shard
+from robotdiffuse.data.manifest import write_manifest
+from robotdiffuse.data.shards import shard_path, split_of, write_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.files import alone_in
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors, save_encoder
@@ -37,7 +38,6 @@ from robotdiffuse.learning.training.batches import (
     fast_bf16,
     load_data,
     random_scenes,
-    resample_evenly,
 )
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.encoder import train_encoder
@@ -45,11 +45,10 @@ from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.training.planner import moving_links, train_planner
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.run import TrainingRun, Validation
-from robotdiffuse.learning.training.validation import FLOOR
-from robotdiffuse.scenes.packed import BOX, SPHERE
-from robotdiffuse.scenes.sampling import sample_surfaces_batch
+from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.scenes.shapes import Box, Sphere
 
 SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
 SMALL_DENOISER = TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8)
@@ -120,13 +119,13 @@ def stop_at(monkeypatch, step):
 
 
 def test_random_scenes():
-    kinds, params = random_scenes(300, 12, np.random.default_rng(0))
+    scenes = random_scenes(300, 12, np.random.default_rng(0))
+    kinds, params = scenes.kinds, scenes.params
     assert set(np.unique(kinds)) == {0, SPHERE, BOX}
     assert (params[kinds == 0] == 0).all()
     assert (params[kinds == SPHERE, 3] > 0).all()
     np.testing.assert_allclose(np.linalg.norm(params[kinds != 0, 6:], axis=1), 1, atol=1e-5)
     assert (kinds != 0).sum(1).max() == 12
-    assert np.isfinite(sample_surfaces_batch(kinds, params, 20, np.random.default_rng(0))).all()
 
 
 def test_encoder_learns(tmp_path):
@@ -198,8 +197,9 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
             return draw(self, count, rng)
         parts = [draw(self, count // 2, np.random.default_rng(seed)) for seed in (0, [0, 1])]
         fields = ((name, [getattr(part, name) for part in parts]) for name in vars(parts[0]))
-        joined: dict[str, Any] = {n: None if a is None else np.concatenate([a, b]) for n, (a, b) in fields}
-        return Batch(**joined)
+        of: dict[type, Any] = {PackedScenes: PackedScenes.joined, np.ndarray: np.concatenate}
+        joined = {name: None if a is None else of[type(a)]([a, b]) for name, (a, b) in fields}
+        return Batch(**joined)  # type: ignore[arg-type]
 
     def step(self, loss):
         original(self, loss)
@@ -256,7 +256,7 @@ def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
     model = MotionModel(training._model_config(settings, arm, encoder))
     loaded = load_data(str(data), arm, encoder, FRAMES, lambda text: None)
 
-    def far(kinds, params, q):
+    def far(scenes, q):
         return np.full((*q.shape[:-1], len(model.config.links)), 0.4, np.float32)
 
     rng = np.random.default_rng(0)
@@ -353,9 +353,7 @@ def test_errors_in_space_weigh_the_same_whatever_is_predicted(data, arm, objecti
     loaded = load_data(str(data), arm, None, FRAMES, print)
     settings = planner_settings(data, objective=objective)
     model = MotionModel(training._model_config(settings, arm, encoder))
-    batches = Batches(
-        loaded, model, lambda kinds, params, q: np.zeros((*q.shape[:2], 3), np.float32), 0.1, 5.0
-    )
+    batches = Batches(loaded, model, lambda _, q: np.zeros((*q.shape[:2], 3), np.float32), 0.1, 5.0)
     levels = np.arange(1, model.schedule.steps + 1)
     batch = batches.at(np.zeros(len(levels), np.int64), levels, np.random.default_rng(0))
     of_clean = model.schedule.weight(levels, 5.0)
@@ -381,10 +379,9 @@ def test_planner_learns_which_side(tmp_path, data, arm):
     rng = np.random.default_rng(0)
     start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
     for side in (-1.0, 1.0):
-        kinds, params = np.array([[SPHERE]], np.int8), np.zeros((1, 1, 10), np.float32)
-        params[0, 0, :4] = 0.0, 0.5 * side, 1.0, 0.2
-        z = model.encode(sample_surfaces_batch(kinds, params, 256, rng)[0])
-        checker = CollisionChecker(arm, Scene([FLOOR.shapes[0], Sphere(params[0, 0, :3], 0.2)]))
+        scene = Scene([Box([0, 0, -0.05], [2, 2, 0.1]), Sphere([0.0, 0.5 * side, 1.0], 0.2)])
+        z = model.encode(sample_surface(scene, 256, rng))
+        checker = CollisionChecker(arm, scene)
 
         def clearances(q, checker=checker):
             return checker.link_clearances(q.reshape(-1, 3)).reshape(*q.shape[:2], 3)
@@ -485,25 +482,11 @@ def test_splits_and_frames(data, arm):
     """Training and validation share no scene, the test split stays out, and frames are even again."""
     loaded = load_data(str(data), arm, load_encoder(data.parent / "encoder"), FRAMES, print)
     kept, held_out = loaded.split(1000)
-    assert set(split_of(kept.kinds, kept.params)) == {0}
-    assert set(split_of(held_out.kinds, held_out.params)) == {1}
+    assert set(split_of(kept.scenes)) == {0}
+    assert set(split_of(held_out.scenes)) == {1}
     assert 120 < len(kept) + len(held_out) == len(loaded) < 160
     assert len(loaded.split(2)[1]) == 2
     assert kept.q.shape[1:] == (FRAMES, arm.dof)
-
-
-def test_resampling():
-    q = np.array([[[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [3.0, 1.0]], [[1.0, 2.0]] * 4], np.float32)
-    even = resample_evenly(q, 5)
-    np.testing.assert_allclose(even[0], [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]], atol=1e-6)
-    np.testing.assert_array_equal(even[1], q[1, [0] * 5])
-    assert resample_evenly(q[:0], 5).shape == (0, 5, 2)
-    long = np.random.default_rng(0).standard_normal((4, 254, 3)).cumsum(1).astype(np.float32)
-    for path, found in zip(long, resample_evenly(long, 48), strict=True):
-        at = np.concatenate([[0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum()])
-        wanted = [np.interp(np.linspace(0, at[-1], 48), at, path[:, j]) for j in range(3)]
-        np.testing.assert_allclose(found, np.stack(wanted, 1), atol=1e-3)  # float32 sums of 400 rad
-        np.testing.assert_array_equal(found[[0, -1]], path[[0, -1]])
 
 
 @pytest.mark.parametrize("case", ["none", "damaged", "robot"])

@@ -19,7 +19,7 @@ from robotdiffuse.planners.mpinets import MPiNets, MPiNetsSettings
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.packed import BOX
+from robotdiffuse.scenes.packed import BOX, PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.types import Status
@@ -57,12 +57,12 @@ def line_data(walls: bool) -> TrajectoryData:
     q = (ends[:, :1] * (1 - share) + ends[:, 1:] * share).astype(np.float32)
     kinds = np.full((8, 1), BOX if walls else 0, np.int8)
     params = np.tile(np.array(WALL, np.float32), (8, 1, 1)) * walls
-    return TrajectoryData(q, kinds, params, np.zeros(8, bool), None, "", 0)
+    return TrajectoryData(q, PackedScenes(kinds, params), np.zeros(8, bool), None, "", 0)
 
 
 def clouds_of(network: MPiNetsNetwork, count: int, seed: int = 0) -> torch.Tensor:
     data = line_data(True)
-    return network.clouds(data.kinds[:count], data.params[:count], np.random.default_rng(seed))
+    return network.clouds(data.scenes[:count], np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("points", [20, 300])

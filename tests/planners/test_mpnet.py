@@ -10,6 +10,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import path_length
+from robotdiffuse.data.dataset import resample
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.base import JointRanges
 from robotdiffuse.learning.networks.checkpoint import save_baseline
@@ -20,13 +21,13 @@ from robotdiffuse.learning.networks.mpnet import (
     arranged,
     squared_slope,
 )
-from robotdiffuse.learning.training.batches import TrajectoryData, resample_evenly
+from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_code
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.packed import pack_scene
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.types import Status
@@ -49,17 +50,15 @@ def network(settings: MPNetSettings = SMALL, seed: int = 0) -> MPNetNetwork:
 
 def motions(frames: int = 48) -> TrajectoryData:
     """Motions from left to right over walls of several heights, and back; and a straight one."""
-    q, kinds, params = [], [], []
+    q, scenes = [], []
     s = np.linspace(0, 1, frames)[:, None]
     for i, height in enumerate((0.3, 0.4, 0.5, 0.6)):
         way = (1 - s) * LEFT + s * RIGHT + height * np.sin(np.pi * s) * np.eye(7)[1] * -1.5
         q.append((way if i % 2 else way[::-1]).astype(np.float32))
-        scene = pack_scene(Scene([Box([0.5, 0.0, height / 2], [0.3, 0.05, height])]), 2)
-        kinds.append(scene[0])
-        params.append(scene[1])
+        scenes.append(Scene([Box([0.5, 0.0, height / 2], [0.3, 0.05, height])]))
     trivial = np.array([False, False, False, True])
-    even = resample_evenly(np.stack(q), frames)
-    return TrajectoryData(even, np.stack(kinds), np.stack(params), trivial, None, "made", 0)
+    even = resample(np.stack(q), frames)
+    return TrajectoryData(even, PackedScenes.pack(scenes, 2), trivial, None, "made", 0)
 
 
 @pytest.fixture(scope="module")
@@ -292,7 +291,7 @@ def test_success_is_a_share(weights: str) -> None:
     assert share is not None and 0 <= share <= 1
     nothing = replace(data, trivial=np.ones(4, bool))
     assert net.success(nothing, PANDA, np.random.default_rng(0)) is None
-    free = replace(data, kinds=np.zeros_like(data.kinds))
+    free = replace(data, scenes=PackedScenes.pack([Scene([])] * 4, 2))
     assert net.success(free, PANDA, np.random.default_rng(0)) == 1.0
 
 

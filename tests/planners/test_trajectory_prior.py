@@ -32,6 +32,7 @@ from robotdiffuse.planners.guided_prior import collision_gradient, shared_out
 from robotdiffuse.planners.mpd import MPD, MPDSettings, gaussian_process, state_precision
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
 from robotdiffuse.types import Status
@@ -82,10 +83,8 @@ def data_of(count: int, frames: int = FRAMES) -> TrajectoryData:
     middle, half = (PANDA.lower + PANDA.upper) / 2, (PANDA.upper - PANDA.lower) / 2
     ends = middle + half * rng.uniform(-0.6, 0.6, (2, count, 1, PANDA.dof))
     q = (1 - t) * ends[0] + t * ends[1] + 0.3 * np.sin(np.pi * t) * rng.normal(size=(count, 1, PANDA.dof))
-    params = np.zeros((count, 1, 10), np.float32)
-    params[:, 0, :4] = [*BALL.center, BALL.radius]
-    kinds = np.ones((count, 1), np.int8)
-    return TrajectoryData(q.astype(np.float32), kinds, params, np.arange(count) % 3 == 0, None, "x", 0)
+    scenes = PackedScenes.pack([Scene([BALL])] * count, 1)
+    return TrajectoryData(q.astype(np.float32), scenes, np.arange(count) % 3 == 0, None, "x", 0)
 
 
 def test_the_loss_falls() -> None:

@@ -17,7 +17,7 @@ from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.packed import pack_scene
+from robotdiffuse.scenes.packed import PackedScenes
 
 PANDA = load_robot("panda")
 every_family = pytest.mark.parametrize("name", FAMILIES)
@@ -37,7 +37,7 @@ def test_problems_are_as_the_family_says(name: str, target: str) -> None:
         np.testing.assert_allclose(poses[1:, :3, 3], [drawn.T_base_tip[:3, 3]] * len(drawn.goals), atol=1e-3)
         floors = () if family.floor is None else (family.floor,)
         assert drawn.scene.shapes[: len(floors)] == floors
-        pack_scene(drawn.scene, family.most_obstacles + len(floors))
+        PackedScenes.pack([drawn.scene], family.most_obstacles, floor=bool(floors))
 
 
 @every_family

@@ -24,7 +24,7 @@ from robotdiffuse.problems.families.table import TABLE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import pack_scene
+from robotdiffuse.scenes.packed import BOX, PackedScenes
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
 BASE = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])
@@ -58,9 +58,9 @@ def test_scenes_pack_and_stand_on_the_ground(name: str) -> None:
     for furnished in drawn(name, 30):
         floor, *shapes = furnished.scene.shapes
         assert floor is FLOOR
-        kinds, params = pack_scene(furnished.scene, slots + 1)
-        assert (kinds > 0).sum() == len(shapes) + 1
-        boxes = params[kinds == 2]
+        packed = PackedScenes.pack([furnished.scene], slots, floor=True)
+        assert (packed.kinds > 0).sum() == len(shapes)
+        boxes = packed.params[packed.kinds == BOX]
         assert (boxes[:, 7:9] == 0).all(), "turned about the vertical only"
         assert min(shape.bounds[0, 2] for shape in shapes) > -1e-12
 
@@ -135,7 +135,8 @@ def test_tables_as_their_settings_say() -> None:
 @every_family
 def test_same_seed_same_scene(name: str) -> None:
     (a,), (b,) = drawn(name, 1, seed=3), drawn(name, 1, seed=3)
-    assert (pack_scene(a.scene, 25)[1] == pack_scene(b.scene, 25)[1]).all()
+    packed = PackedScenes.pack([a.scene, b.scene], 25)
+    assert (packed.params[0] == packed.params[1]).all()
     targets = [sample_target(f.regions[0], np.random.default_rng(4)) for f in (a, b)]
     assert (targets[0] == targets[1]).all()
 

@@ -8,10 +8,10 @@ import pytest
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
-from robotdiffuse.scenes.packed import pack_scene, unpack_scene
-from robotdiffuse.scenes.sampling import VisibleRegion, sample_surface, sample_surfaces_batch
+from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.scenes.sampling import VisibleRegion, sample_surface
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Cylinder, Sphere
+from robotdiffuse.scenes.shapes import Box, Sphere
 
 FLOOR = 1
 
@@ -54,8 +54,8 @@ def test_every_setting_counts() -> None:
 
 
 def test_same_seed_same_scene() -> None:
-    packs = [pack_scene(ROP_DENSE.scene(np.random.default_rng(3)), 13) for _ in range(2)]
-    assert (packs[0][0] == packs[1][0]).all() and (packs[0][1] == packs[1][1]).all()
+    packed = PackedScenes.pack([ROP_DENSE.scene(np.random.default_rng(3)) for _ in range(2)], 13)
+    assert (packed.kinds[0] == packed.kinds[1]).all() and (packed.params[0] == packed.params[1]).all()
 
 
 def test_obstacles_stay_clear_of_the_base() -> None:
@@ -85,61 +85,3 @@ def test_obstacles_stay_clear_of_the_base() -> None:
 def test_wrong_settings(change: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         replace(ROP, **change)  # type: ignore[arg-type]
-
-
-def test_packing() -> None:
-    scene = replace(ROP_DENSE, yaw=True).scene(np.random.default_rng(5))
-    kinds, params = pack_scene(scene, 15)
-    assert kinds.shape == (15,) and params.shape == (15, 10)
-    back = unpack_scene(kinds, params)
-    again = pack_scene(back, 15)
-    assert [type(shape) for shape in back.shapes] == [type(shape) for shape in scene.shapes]
-    assert (again[0] == kinds).all()
-    # Unpacking makes a quaternion of float32 one of length 1 in float64.
-    np.testing.assert_allclose(again[1], params, atol=1e-7)
-    with pytest.raises(InputError, match="2 slots"):
-        pack_scene(scene, 2)
-    with pytest.raises(InputError, match="cylinder"):
-        pack_scene(Scene([Cylinder([0, 0, 0], 1, 1)]), 2)
-
-
-def test_batch_has_the_distribution_of_single_scenes() -> None:
-    """Shares of points by shape and by half of space, against sample_surface on the same scenes."""
-    rng = np.random.default_rng(6)
-    scenes = [replace(ROP_DENSE, yaw=True).scene(rng) for _ in range(12)]
-    kinds, params = map(np.stack, zip(*(pack_scene(scene, 13) for scene in scenes), strict=True))
-    batch = sample_surfaces_batch(kinds, params, 4096, rng)
-    region = VisibleRegion()
-    assert batch.dtype == np.float32 and batch.shape == (12, 4096, 3)
-    assert (batch[..., 2] > region.floor - 1e-6).all()
-    assert (np.linalg.norm(batch - np.array(region.center), axis=2) < region.reach + 1e-6).all()
-    for scene, points in zip(scenes, batch, strict=True):
-        single = sample_surface(scene, 4096, rng)
-        # Six standard deviations of a mean of points spread over about 1 m; repeats make it less sharp.
-        np.testing.assert_allclose(points.mean(axis=0), single.mean(axis=0), atol=0.06)
-        np.testing.assert_allclose(points.std(axis=0), single.std(axis=0), atol=0.04)
-        assert surface_gap(scene, points.astype(np.float64)).max() < 1e-5
-
-
-def surface_gap(scene: Scene, points: np.ndarray) -> np.ndarray:
-    gaps = []
-    for shape in scene.shapes:
-        assert isinstance(shape, Sphere | Box)
-        local = points - shape.center
-        if isinstance(shape, Sphere):
-            gaps.append(np.abs(np.linalg.norm(local, axis=1) - shape.radius))
-        else:
-            gaps.append(np.abs((np.abs(local @ shape.rotation) - shape.size / 2).max(axis=1)))
-    return np.min(gaps, axis=0)
-
-
-def test_batch_of_nothing_visible_is_zero() -> None:
-    floor = Box([0, 0, -0.05], [2, 2, 0.1])
-    scenes = [Scene([]), Scene([floor]), Scene([floor, Sphere([9, 9, 9], 0.2)])]
-    kinds, params = map(np.stack, zip(*(pack_scene(scene, 2) for scene in scenes), strict=True))
-    assert (sample_surfaces_batch(kinds, params, 32, np.random.default_rng(7)) == 0).all()
-    assert sample_surfaces_batch(kinds[:, :0], params[:, :0], 32, np.random.default_rng(7)).shape == (
-        3,
-        32,
-        3,
-    )

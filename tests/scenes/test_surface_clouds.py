@@ -7,8 +7,10 @@ from numpy import ndarray
 
 from robotdiffuse.learning.training.batches import random_scenes
 from robotdiffuse.scenes import surface_clouds as module
-from robotdiffuse.scenes.packed import BOX, SPHERE
-from robotdiffuse.scenes.sampling import PANDA_REGION, sample_surfaces_batch
+from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.sampling import PANDA_REGION, sample_surface
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 from robotdiffuse.transforms import rotation_from_quaternion
 
@@ -26,13 +28,15 @@ def seeded(seed: int = 0) -> torch.Generator:
 
 
 def some_scenes(n: int, k: int, seed: int = 0):
-    """Scenes of up to k shapes in varied places of k + 2 slots, as tensors, and cameras around them."""
+    """Scenes of up to k shapes in varied places of k + 2 slots, and cameras around them."""
     rng = np.random.default_rng(seed)
-    kinds, params = random_scenes(n, k, rng)
-    kinds, params = np.pad(kinds, [(0, 0), (1, 1)]), np.pad(params, [(0, 0), (1, 1), (0, 0)])
+    drawn = random_scenes(n, k, rng)
+    scenes = PackedScenes(
+        np.pad(drawn.kinds, [(0, 0), (1, 1)]), np.pad(drawn.params, [(0, 0), (1, 1), (0, 0)])
+    )
     camera = rng.standard_normal((n, 3))
     camera *= 2.5 / np.linalg.norm(camera, axis=1, keepdims=True)
-    return torch.from_numpy(kinds), torch.from_numpy(params), torch.from_numpy(camera.astype(np.float32))
+    return scenes, torch.from_numpy(camera.astype(np.float32))
 
 
 def depths(kinds: ndarray, params: ndarray, points: ndarray) -> ndarray:
@@ -58,10 +62,10 @@ def is_seen(kinds: ndarray, params: ndarray, points: ndarray, eye: ndarray, marg
 
 @pytest.mark.parametrize("seen", [False, True])
 def test_points_lie_on_surfaces(seen):
-    kinds, params, camera = some_scenes(60, 6)
-    clouds = surface_clouds(kinds, params, 200, seeded(), camera=camera if seen else None)
+    scenes, camera = some_scenes(60, 6)
+    clouds = surface_clouds(scenes, 200, seeded(), camera=camera if seen else None)
     assert clouds.shape == (60, 200, 3)
-    for scene in zip(kinds.numpy(), params.numpy(), clouds.double().numpy(), strict=True):
+    for scene in zip(scenes.kinds, scenes.params, clouds.double().numpy(), strict=True):
         if not scene[0].any():
             assert not scene[2].any()
         else:
@@ -73,24 +77,23 @@ def test_points_lie_on_surfaces(seen):
 def test_extreme_random_numbers(number, monkeypatch):
     """No product of the greatest number below 1 and an area is rounded up to the area, beyond which there is
     no face; among these are areas close to a power of two, from both sides."""
-    kinds, params = torch.full((40, 1), SPHERE, dtype=torch.int8), torch.zeros(40, 1, 10)
-    params[:, 0, 0] = 3.0
-    params[:, 0, 3] = float(np.sqrt(2 / np.pi)) * (1 + torch.arange(-20, 20) * 2.0**-24)
+    scenes = PackedScenes(np.full((40, 1), SPHERE, np.int8), np.zeros((40, 1, 10), np.float32))
+    scenes.params[:, 0, 0] = 3.0
+    scenes.params[:, 0, 3] = np.float32(np.sqrt(2 / np.pi)) * (1 + np.arange(-20, 20) * 2.0**-24)
     monkeypatch.setattr(torch, "rand", lambda *shape, **_: torch.full(shape, number))
-    clouds = surface_clouds(kinds, params, 2, seeded())
-    for scene in zip(kinds.numpy(), params.numpy(), clouds.double().numpy(), strict=True):
+    clouds = surface_clouds(scenes, 2, seeded())
+    for scene in zip(scenes.kinds, scenes.params, clouds.double().numpy(), strict=True):
         np.testing.assert_allclose(depths(*scene), 0, atol=2e-6)
 
 
 def test_uniform_by_area():
     """Shares of shapes and of the six faces of a turned box; heights on a sphere."""
-    kinds = torch.tensor([[0, BOX, SPHERE]], dtype=torch.int8)
-    params = torch.zeros(1, 3, 10)
-    params[0, 1] = torch.tensor([0.5, -0.3, 0.4, 0.2, 0.5, 0.3, 0.5, 0.5, -0.5, 0.5])
-    params[0, 2, :4] = torch.tensor([-0.4, 0.2, 0.6, 0.15])
+    kinds, params = np.array([[0, BOX, SPHERE]], np.int8), np.zeros((1, 3, 10), np.float32)
+    params[0, 1] = [0.5, -0.3, 0.4, 0.2, 0.5, 0.3, 0.5, 0.5, -0.5, 0.5]
+    params[0, 2, :4] = [-0.4, 0.2, 0.6, 0.15]
     n = 40_000
-    cloud = surface_clouds(kinds, params, n, seeded())[0].double().numpy()
-    row = params[0, 1].double().numpy()
+    cloud = surface_clouds(PackedScenes(kinds, params), n, seeded())[0].double().numpy()
+    row = params[0, 1].astype(np.float64)
     local = (cloud - row[:3]) @ rotation_from_quaternion(row[6:]) / (row[3:6] / 2)
     on_box = np.isclose(np.abs(local).max(1), 1, atol=1e-5)
     x, y, z = row[3:6]
@@ -101,16 +104,17 @@ def test_uniform_by_area():
     for axis in range(3):  # even on the faces: second and third moments of a uniform number
         on = local[on_box & (np.abs(local[:, axis]) < 0.9999), axis]
         np.testing.assert_allclose([(on**2).mean(), on.mean()], [1 / 3, 0], atol=4 / np.sqrt(len(on)))
-    heights = (cloud[~on_box] - params[0, 2, :3].numpy()) / 0.15
+    heights = (cloud[~on_box] - params[0, 2, :3]) / 0.15
     np.testing.assert_allclose(heights.mean(0), 0, atol=4 / np.sqrt(3 * len(heights)))
     np.testing.assert_allclose(heights.T @ heights / len(heights), np.eye(3) / 3, atol=0.015)
 
 
-def test_agrees_with_the_other_sampler():
-    kinds, params, _ = some_scenes(20, 5, 3)
-    n = 4000
-    ours = surface_clouds(kinds, params, n, seeded(), region=PANDA_REGION).numpy()
-    theirs = sample_surfaces_batch(kinds.numpy(), params.numpy(), n, np.random.default_rng(0), PANDA_REGION)
+def test_agrees_with_the_sampler_of_single_scenes():
+    scenes, _ = some_scenes(20, 5, 3)
+    n, rng = 4000, np.random.default_rng(0)
+    ours = surface_clouds(scenes, n, seeded(), region=PANDA_REGION).numpy()
+    single = [sample_surface(scenes.scene(i), n, rng, PANDA_REGION) for i in range(len(scenes))]
+    theirs = np.stack([points if len(points) else np.zeros((n, 3)) for points in single])
     assert PANDA_REGION.holds(ours[ours.any((1, 2))]).all()
     np.testing.assert_array_equal(ours.any((1, 2)), theirs.any((1, 2)))
     # means and spreads of n points that are spread over up to 1.2 m, some of them repeated
@@ -122,12 +126,12 @@ def test_agrees_with_the_other_sampler():
 def test_what_a_camera_sees():
     """Every point is seen, by walking to the camera; and what is seen of each shape has the share of points
     that it has among points drawn everywhere and filtered."""
-    kinds, params, camera = some_scenes(12, 5, 5)
-    seen = surface_clouds(kinds, params, 400, seeded(), camera=camera).double().numpy()
-    every = surface_clouds(kinds, params, 4000, seeded(1)).double().numpy()
+    scenes, camera = some_scenes(12, 5, 5)
+    seen = surface_clouds(scenes, 400, seeded(), camera=camera).double().numpy()
+    every = surface_clouds(scenes, 4000, seeded(1)).double().numpy()
     compared = 0
-    for i in range(len(kinds)):
-        scene = kinds[i].numpy(), params[i].numpy()
+    for i in range(len(scenes)):
+        scene = scenes.kinds[i], scenes.params[i]
         eye = camera[i].double().numpy()
         if not seen[i].any():
             continue
@@ -145,25 +149,23 @@ def test_what_a_camera_sees():
 
 
 def test_a_camera_sees_a_cap_and_the_front():
-    kinds = torch.tensor([[SPHERE, 0], [BOX, SPHERE]], dtype=torch.int8)
-    params = torch.zeros(2, 2, 10)
-    params[0, 0, :4] = torch.tensor([0.0, 0.0, 0.0, 0.5])
-    params[1, 0] = torch.tensor([0.0, 0.0, 0.0, 0.4, 0.4, 0.4, 1.0, 0.0, 0.0, 0.0])
-    params[1, 1, :4] = torch.tensor([-0.8, 0.0, 0.0, 0.1])  # behind the box
+    behind = Sphere([-0.8, 0, 0], 0.1)
+    two = [Scene([Sphere([0, 0, 0], 0.5)]), Scene([Box([0, 0, 0], [0.4, 0.4, 0.4]), behind])]
+    scenes = PackedScenes.pack(two, 2)
     camera = torch.tensor([[0.0, 0.0, 1.0], [2.0, 0.0, 0.0]])
-    cap, front = surface_clouds(kinds, params, 4000, seeded(), camera=camera)
+    cap, front = surface_clouds(scenes, 4000, seeded(), camera=camera)
     height = cap[:, 2] / 0.5  # even between the horizon, at r / distance, and the top
     assert height.min() >= 0.5 - 1e-5
     assert height.mean() == pytest.approx(0.75, abs=4 * 0.25 / np.sqrt(3 * 4000))
     assert (front[:, 0] == 0.2).all()
     inside = torch.tensor([[0.0, 0.1, 0.0], [0.0, 0.1, 0.0]])
-    assert not surface_clouds(kinds, params, 50, seeded(), camera=inside).any()
+    assert not surface_clouds(scenes, 50, seeded(), camera=inside).any()
 
 
 def test_ordered_clouds_are_the_same_points():
-    kinds, params, _ = some_scenes(30, 4, 2)
-    loose = surface_clouds(kinds, params, 300, seeded()).numpy()
-    tidy = surface_clouds(kinds, params, 300, seeded(), ordered=True).numpy()
+    scenes, _ = some_scenes(30, 4, 2)
+    loose = surface_clouds(scenes, 300, seeded()).numpy()
+    tidy = surface_clouds(scenes, 300, seeded(), ordered=True).numpy()
     for a, b in zip(loose, tidy, strict=True):
         assert (np.lexsort(b.T[::-1]) == np.arange(300)).all()
         steps = 1e-6 * np.abs(a).max() + 1e-7
@@ -173,20 +175,21 @@ def test_ordered_clouds_are_the_same_points():
 
 @pytest.mark.parametrize("how", ["full", "region", "camera"])
 def test_same_seed_same_cloud(how, monkeypatch):
-    kinds, params, camera = some_scenes(9, 3)
+    scenes, camera = some_scenes(9, 3)
     extra = {"full": {}, "region": {"region": PANDA_REGION}, "camera": {"camera": camera}}[how]
-    a, b, c = (surface_clouds(kinds, params, 64, seeded(seed), **extra) for seed in (0, 0, 1))
+    a, b, c = (surface_clouds(scenes, 64, seeded(seed), **extra) for seed in (0, 0, 1))
     torch.testing.assert_close(a, b, atol=0, rtol=0)
     assert (a != c).any()
     monkeypatch.setattr(module, "PART", 1)
-    assert surface_clouds(kinds, params, 64, seeded(), **extra).shape == a.shape
+    assert surface_clouds(scenes, 64, seeded(), **extra).shape == a.shape
 
 
 def test_nothing_to_draw():
-    kinds, params = torch.zeros(3, 4, dtype=torch.int8), torch.zeros(3, 4, 10)
-    assert not surface_clouds(kinds, params, 5, seeded()).any()
-    assert surface_clouds(kinds[:, :0], params[:, :0], 5, seeded()).shape == (3, 5, 3)
-    assert surface_clouds(kinds[:0], params[:0], 5, seeded()).shape == (0, 5, 3)
-    kinds[1, 2], params[1, 2, :4] = SPHERE, torch.tensor([5.0, 0.0, 0.5, 0.2])  # out of reach
-    assert not surface_clouds(kinds, params, 5, seeded(), region=PANDA_REGION, ordered=True).any()
-    assert surface_clouds(kinds, params, 5, seeded())[1].any()
+    floor = Scene([Box([0, 0, -0.05], [2, 2, 0.1])])
+    nothing = PackedScenes.pack([floor] * 3, 4, floor=True)
+    assert not surface_clouds(nothing, 5, seeded()).any()
+    assert surface_clouds(PackedScenes.pack([floor] * 3, 0, floor=True), 5, seeded()).shape == (3, 5, 3)
+    assert surface_clouds(nothing[:0], 5, seeded()).shape == (0, 5, 3)
+    out_of_reach = PackedScenes.pack([Scene([]), Scene([Sphere([5, 0, 0.5], 0.2)]), floor], 4)
+    assert not surface_clouds(out_of_reach, 5, seeded(), region=PANDA_REGION, ordered=True).any()
+    assert surface_clouds(out_of_reach, 5, seeded())[1].any()

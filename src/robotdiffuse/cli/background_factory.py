@@ -121,7 +121,7 @@ def _fill(folder: str, workers: int, robot: str, connection: Connection) -> None
 
 
 def _settings(folder: str, robot: str) -> "GenerationSettings":
-    from robotdiffuse.data.shards import MANIFEST, read_manifest
+    from robotdiffuse.data.manifest import MANIFEST, read_manifest
     from robotdiffuse.generation import GenerationSettings
     from robotdiffuse.planners.shared_tree.planner import SharedTreeSettings
 

@@ -214,7 +214,7 @@ def print_check(check: "DataCheck") -> None:
 
 def run_view(arguments: argparse.Namespace) -> int:
     from robotdiffuse.cli.draw import show
-    from robotdiffuse.data.shards import read_manifest
+    from robotdiffuse.data.manifest import read_manifest
     from robotdiffuse.files import check_output
     from robotdiffuse.robots import load_robot
     from robotdiffuse.viewer.gallery import write_gallery
@@ -240,19 +240,20 @@ def run_view(arguments: argparse.Namespace) -> int:
 
 def _exhibits(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[Exhibit]":
     """Random rows, in the order of the shards."""
-    from robotdiffuse.data.shards import read_manifest
-    from robotdiffuse.evaluation.data.rows import family_names, motion_of, random_rows, scene_of
+    from robotdiffuse.data.manifest import read_manifest
+    from robotdiffuse.data.shards import motion_of, random_rows, scenes_of
     from robotdiffuse.viewer.gallery import Exhibit
 
     manifest = read_manifest(folder)
     for shard, rows in random_rows(folder, number, seed):
         for row in rows.tolist():
-            family = family_names(manifest)[int(shard["family"][row])]
+            family = list(manifest.families)[int(shard["family"][row])]
+            scene = scenes_of(manifest, shard, slice(row, row + 1)).scene(0)
             cost, detour, clearance = (float(shard[name][row]) for name in ("cost", "detour", "clearance"))
             line = "line free" if shard["line_free"][row] else f"detour {detour:.2f}"
             caption = f"{cost:.2f} rad · {line} · {100 * clearance:.1f} cm clear"
             title = f"{family} · shard {shard.index}, row {row}"
-            yield Exhibit(title, caption, scene_of(manifest, shard, row), motion_of(robot, shard, row))
+            yield Exhibit(title, caption, scene, motion_of(robot, shard, row))
 
 
 def run_export(arguments: argparse.Namespace) -> int:

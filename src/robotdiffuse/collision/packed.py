@@ -2,7 +2,7 @@
 training."""
 
 import numpy as np
-from jaxtyping import Float32, Int8
+from jaxtyping import Float32
 from numba import njit
 from numpy import ndarray
 
@@ -10,10 +10,9 @@ from robotdiffuse.collision.arrays import RobotArrays, SceneArrays, compile_scen
 from robotdiffuse.collision.kernels.clearance_gradients import clearances_and_gradients_into
 from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_clearance import clearances_into, make_clearance_workspace
+from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.scene import Scene
-
-SPHERE, BOX = 1, 2
-"""Kinds in a packed scene; 0 means no obstacle. Parameters: centre, radius; or centre, size, wxyz."""
+from robotdiffuse.scenes.shapes import Box
 
 
 @allocation_free()
@@ -52,11 +51,16 @@ def _unpack(kinds, params, spheres, boxes):
 
 
 @njit(cache=True)
-def _scene(empty, spheres, boxes):
-    """These spheres and boxes, and nothing else."""
+def _scene(empty, floors, floor, kinds, params, spheres, boxes):
+    """A packed scene with its floor, one of `floors`, first of the boxes; spheres and boxes hold its rows."""
+    fixed = 0
+    if floor >= 0:
+        boxes[0] = floors[floor]
+        fixed = 1
+    n, m = _unpack(kinds, params, spheres, boxes[fixed:])
     return SceneArrays(
-        spheres,
-        boxes,
+        spheres[:n],
+        boxes[: fixed + m],
         empty.cylinders,
         empty.capsules,
         empty.points,
@@ -68,66 +72,57 @@ def _scene(empty, spheres, boxes):
 
 
 @njit(cache=True, nogil=True)
-def _packed_link_clearances(robot, empty, fixed_boxes, kinds, params, q, limit):
+def _packed_link_clearances(robot, empty, floors, floor, kinds, params, q, limit):
     first = np.searchsorted(robot.frame, 1)
     out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
     spheres = np.empty((kinds.shape[1], 4), np.float32)
-    fixed = len(fixed_boxes)
-    boxes = np.empty((kinds.shape[1] + fixed, 15), np.float32)
-    boxes[:fixed] = fixed_boxes
+    boxes = np.empty((kinds.shape[1] + 1, 15), np.float32)
     work = make_clearance_workspace(robot, len(spheres) + len(boxes) + 1)
     for b in range(len(q)):
-        n, m = _unpack(kinds[b], params[b], spheres, boxes[fixed:])
-        scene = _scene(empty, spheres[:n], boxes[: fixed + m])
+        scene = _scene(empty, floors, floor[b], kinds[b], params[b], spheres, boxes)
         clearances_into(robot, scene, q[b], limit, work, out[b])
     return out
 
 
 @njit(cache=True, nogil=True)
-def _packed_gradients(robot, empty, fixed_boxes, kinds, params, q, limit, margin):
+def _packed_gradients(robot, empty, floors, floor, kinds, params, q, limit, margin):
     first = np.searchsorted(robot.frame, 1)
     out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
     gradients = np.empty(q.shape, np.float32)
     spheres = np.empty((kinds.shape[1], 4), np.float32)
-    fixed = len(fixed_boxes)
-    boxes = np.empty((kinds.shape[1] + fixed, 15), np.float32)
-    boxes[:fixed] = fixed_boxes
+    boxes = np.empty((kinds.shape[1] + 1, 15), np.float32)
     work = make_clearance_workspace(robot, len(spheres) + len(boxes) + 1)
     for b in range(len(q)):
-        n, m = _unpack(kinds[b], params[b], spheres, boxes[fixed:])
-        scene = _scene(empty, spheres[:n], boxes[: fixed + m])
+        scene = _scene(empty, floors, floor[b], kinds[b], params[b], spheres, boxes)
         clearances_and_gradients_into(robot, scene, q[b], limit, margin, work, out[b], gradients[b])
     return out, gradients
 
 
 def packed_link_clearances(
-    robot: RobotArrays,
-    kinds: Int8[ndarray, "batch obstacles"],
-    params: Float32[ndarray, "batch obstacles 10"],
-    q: Float32[ndarray, "batch frames dof"],
-    fixed: Scene,
-    limit: float,
+    robot: RobotArrays, scenes: PackedScenes, q: Float32[ndarray, "batch frames dof"], limit: float
 ) -> Float32[ndarray, "batch frames links"]:
-    """Signed distances of the moving links to the obstacles of each sample's own scene [m], at most `limit`.
-
-    `fixed` holds the boxes that are part of every scene (the floor). `robot` comes from `compile_robot`.
-    """
-    fixed_arrays = compile_scene(fixed)
-    return _packed_link_clearances(
-        robot, fixed_arrays, fixed_arrays.boxes, kinds, params, q, np.float32(limit)
-    )
+    """Signed distances of the moving links to obstacles and floor of each sample's own scene [m], at most
+    `limit`. `robot` comes from `compile_robot`."""
+    return _packed_link_clearances(robot, *_arrays(scenes), q, np.float32(limit))
 
 
 def packed_clearances_and_gradients(
     robot: RobotArrays,
-    kinds: Int8[ndarray, "batch obstacles"],
-    params: Float32[ndarray, "batch obstacles 10"],
+    scenes: PackedScenes,
     q: Float32[ndarray, "batch frames dof"],
-    fixed: Scene,
     limit: float,
     margin: float,
 ) -> tuple[Float32[ndarray, "batch frames links"], Float32[ndarray, "batch frames dof"]]:
     """`packed_link_clearances` and the gradients of `CollisionChecker.clearances_and_gradients` [m/rad]."""
-    fixed_arrays = compile_scene(fixed)
-    arguments = robot, fixed_arrays, fixed_arrays.boxes, kinds, params, q
-    return _packed_gradients(*arguments, np.float32(limit), np.float32(margin))
+    return _packed_gradients(robot, *_arrays(scenes), q, np.float32(limit), np.float32(margin))
+
+
+def _arrays(scenes: PackedScenes) -> tuple[SceneArrays, ndarray, ndarray, ndarray, ndarray]:
+    """No obstacle at all, the different floors, the floor of each scene or -1, kinds and params."""
+    kinds, params = (np.ascontiguousarray(array) for array in (scenes.kinds, scenes.params))
+    floors = np.zeros((len(scenes), 6)) if scenes.floors is None else scenes.floors
+    different, floor = np.unique(floors, axis=0, return_inverse=True)
+    there = different.any(axis=1)
+    boxes = compile_scene(Scene([Box(row[:3], row[3:]) for row in different[there]])).boxes
+    place = np.where(there, np.cumsum(there) - 1, -1)
+    return compile_scene(Scene([])), boxes, place[floor.reshape(-1)], kinds, params

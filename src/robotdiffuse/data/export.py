@@ -5,7 +5,8 @@ from pathlib import Path as FilePath
 
 import numpy as np
 
-from robotdiffuse.data.shards import check_shapes, read_manifest, read_shard, shard_indices
+from robotdiffuse.data.manifest import read_manifest
+from robotdiffuse.data.shards import check_shapes, read_shard, shard_indices
 from robotdiffuse.errors import InputError
 from robotdiffuse.scenes.packed import SPHERE
 

@@ -1,7 +1,7 @@
-"""The data set on disk: a manifest, and shards of planned trajectories as Zarr v3 groups.
+"""The rows of a data set: their schema, their shards on disk, and the way from a motion to a row and back.
 
-    FOLDER/manifest.json             what the data are of: robot, limits, settings, versions
-    FOLDER/shard_00000.zarr/         one group, one chunk per array
+    FOLDER/manifest.json             what the data are of, see `manifest.py`
+    FOLDER/shard_00000.zarr/         a Zarr v3 group, one chunk per array
 
 A shard is written beside its place and renamed, so what has its name is whole. The same arrays give the same
 files, byte for byte. `trajectories` is not compressed: its chunk is a file that can be mapped into memory.
@@ -13,22 +13,24 @@ import re
 import shutil
 import tempfile
 import zlib
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path as FilePath
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int8
+from jaxtyping import Float, Float32, Int, Int8
 from numpy import ndarray
 
+from robotdiffuse.data.manifest import FORMAT, MANIFEST, Manifest, check_format
 from robotdiffuse.errors import InputError
-from robotdiffuse.files import write_atomically
-from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.packed import PackedScenes, floor_row
+from robotdiffuse.transforms import quaternion_from_rotation
+from robotdiffuse.types import Path, Trajectory
 
-FORMAT = 1
-MANIFEST = "manifest.json"
 COMPRESSION = 3
 """Zstandard's level."""
 
@@ -59,7 +61,7 @@ ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
 Joint values [rad], times [s], lengths [m]. `trajectories` begin at `start` and end at `goals[goal_index]`,
 exactly. Rows of `goals` beyond those that a problem has are NaN, and so are their `goal_costs`; the cost of a
 goal that was not reached is inf. `target_pose` is wxyz_xyz of the tip in the base frame. Obstacles are as
-`pack_scene` packs them, without the floor. `cost` is the joint-space length of the path [rad], `clearance` a
+`PackedScenes` has them, without the floor. `cost` is the joint-space length of the path [rad], `clearance` a
 lower bound of its distance to obstacles [m], `end_clearance` that of start and reached goal alone,
 `safety_distance` the distance that the search kept but near ends that are closer themselves [m],
 `line_free` whether the straight line would have done, `detour` the cost in units of the straight line's,
@@ -69,57 +71,6 @@ UNBOUNDED = {"goals", "goal_costs"}
 """Arrays that may hold NaN or inf."""
 
 _SHARD_NAME = re.compile(r"shard_(\d{5,})\.zarr")
-
-
-@dataclass(frozen=True)
-class Manifest:
-    """What a data set is of."""
-
-    robot: str
-    """A bundled name, or the path of a URDF."""
-    robot_fingerprint: str
-    joint_names: tuple[str, ...]
-    lower: tuple[float, ...]
-    """Limits [rad]."""
-    upper: tuple[float, ...]
-    frames: int
-    timing: str
-    """How frames are spaced: "arc", evenly in joint-space length, or "time"."""
-    families: dict[str, dict[str, Any]]
-    """Settings of the scenes by name, in the order of the numbers in `family`."""
-    slots: int
-    """Most obstacles of a scene."""
-    goals: int
-    """Most goal configurations of a problem."""
-    trajectories: int
-    """Planned in all."""
-    shard: int
-    """Rows per shard."""
-    settings: dict[str, Any]
-    """All of the generation's."""
-    versions: dict[str, str]
-
-    def __post_init__(self) -> None:
-        if not len(self.joint_names) == len(self.lower) == len(self.upper) > 0:
-            raise InputError(
-                f"joint_names, lower and upper have {len(self.joint_names)}, {len(self.lower)} and "
-                f"{len(self.upper)} entries; they must have as many as there are joints"
-            )
-        if self.timing not in ("arc", "time"):
-            raise InputError(f"timing is {self.timing!r}; it must be arc or time")
-
-    @property
-    def dof(self) -> int:
-        return len(self.joint_names)
-
-    def check_robot(self, robot: Robot) -> None:
-        """Raises InputError if the data were made with another robot."""
-        found = robot_fingerprint(robot)
-        if found != self.robot_fingerprint:
-            raise InputError(
-                f"the data are of the robot {self.robot} with fingerprint {self.robot_fingerprint}; "
-                f"{robot.name} has {found}; use the robot of the data"
-            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,43 +91,6 @@ class Shard:
         return len(next(iter(self.arrays.values())))
 
 
-def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
-    """Write manifest.json, whole or not at all; makes the folder. Raises InputError if it cannot."""
-    data = {"format": FORMAT, "dof": manifest.dof} | asdict(manifest)
-    write_atomically(FilePath(folder) / MANIFEST, json.dumps(data, indent=1) + "\n", make_folder=True)
-
-
-def read_manifest(folder: str | FilePath) -> Manifest:
-    """Raises InputError if there is none, or it is damaged or of another version of the format."""
-    file = FilePath(folder) / MANIFEST
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(
-            f"no data set: there is no {file}; make one with: robotdiffuse data generate"
-        ) from None
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror}") from None
-    except ValueError as error:
-        raise InputError(f"{file} is damaged: {error}") from None
-    if not isinstance(data, dict) or "format" not in data:
-        raise InputError(f"{file} is no manifest of a data set: it has no format")
-    _check_format(file, data["format"])
-    del data["format"]
-    try:
-        data.pop("dof")
-        for name in ("joint_names", "lower", "upper"):
-            data[name] = tuple(data[name])
-        return Manifest(**data)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{file} is damaged: {error}") from None
-
-
-def _check_format(file: FilePath, found: object) -> None:
-    if found != FORMAT:
-        raise InputError(f"{file}: format is {found}; this version reads {FORMAT}")
-
-
 def shard_path(folder: str | FilePath, index: int) -> FilePath:
     return FilePath(folder) / f"shard_{index:05d}.zarr"
 
@@ -185,6 +99,16 @@ def shard_indices(folder: str | FilePath) -> list[int]:
     """Numbers of the shards that a folder has, rising."""
     matches = (_SHARD_NAME.fullmatch(path.name) for path in FilePath(folder).glob("shard_*.zarr"))
     return sorted(int(match[1]) for match in matches if match)
+
+
+def existing_shards(folder: str | FilePath) -> list[int]:
+    """`shard_indices`, of which there must be some. Raises InputError if there are none."""
+    indices = shard_indices(folder)
+    if not indices:
+        raise InputError(
+            f"{folder} holds no shards; make some with: robotdiffuse data generate --out {folder}"
+        )
+    return indices
 
 
 def remove_leftovers(folder: str | FilePath) -> None:
@@ -277,7 +201,7 @@ def read_shard(folder: str | FilePath, index: int, names: tuple[str, ...] | None
     path = shard_path(folder, index)
     group = _open(path)
     attributes = dict(group.attrs)
-    _check_format(path, attributes.get("format"))
+    check_format(path, attributes.get("format"))
     if attributes.get("index") != index or not isinstance(attributes.get("counts"), dict):
         raise InputError(f"shard {path} is damaged: its attributes are not those of shard {index}")
     if names is None:
@@ -376,8 +300,121 @@ def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard
     return shard
 
 
-def split_of(kinds: Int8[ndarray, "n slots"], params: Float32[ndarray, "n slots 10"]) -> Int8[ndarray, "n"]:
+def split_of(scenes: PackedScenes) -> Int8[ndarray, "n"]:
     """The split of each row, as an index into SPLITS: by a hash of its scene, so that no scene is in two."""
     ends = np.cumsum(SPLIT_PERCENT)
-    hashes = [zlib.crc32(p.tobytes(), zlib.crc32(k.tobytes())) for k, p in zip(kinds, params, strict=True)]
+    rows = zip(scenes.kinds, scenes.params, strict=True)
+    hashes = [zlib.crc32(params.tobytes(), zlib.crc32(kinds.tobytes())) for kinds, params in rows]
     return np.searchsorted(ends, np.array(hashes, np.int64) % 100, side="right").astype(np.int8)
+
+
+Row = dict[str, ndarray | np.generic]
+"""A row of each of ARRAYS."""
+
+
+def row_of(
+    scene: PackedScenes,
+    q: Float32[ndarray, "frames dof"],
+    clearances: Float[ndarray, "frames"],
+    goals: Float[ndarray, "k dof"],
+    goal_costs: Float[ndarray, "k"],
+    goal_index: int,
+    T_base_tip: Float[ndarray, "4 4"],
+    family: int,
+    cost: float,
+    safety_distance: float,
+    line_free: bool,
+    seed: int,
+    most_goals: int,
+    times: Float[ndarray, "frames"] | None = None,
+) -> Row:
+    """The row of a motion q in a packed scene of its own, with these `clearances` at its frames [m].
+
+    T_base_tip: the target. most_goals: rows for goals. The others are as the columns of their names, ARRAYS.
+    """
+    missing = [(0, most_goals - len(goals)), (0, 0)]
+    straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
+    wxyz = quaternion_from_rotation(T_base_tip[:3, :3])
+    row: Row = {
+        "trajectories": q,
+        "start": q[0],
+        "goals": np.pad(goals.astype(np.float32), missing, constant_values=np.nan),
+        "goal_costs": np.pad(goal_costs.astype(np.float32), missing[0], constant_values=np.nan),
+        "goal_index": np.int8(goal_index),
+        "target_pose": np.concatenate([wxyz, T_base_tip[:3, 3]]).astype(np.float32),
+        "obstacle_kinds": scene.kinds[0],
+        "obstacle_params": scene.params[0],
+        "family": np.int8(family),
+        "cost": np.float32(cost),
+        "clearance": np.float32(clearances.min()),
+        "end_clearance": clearances[[0, -1]].astype(np.float32),
+        "safety_distance": np.float32(safety_distance),
+        "line_free": np.bool_(line_free),
+        "detour": np.float32(cost / max(straight, 1e-9)),
+        "seed": np.uint64(seed),
+    }
+    if times is not None:
+        row["times"] = times.astype(np.float32)
+    return row
+
+
+def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> PackedScenes:
+    """The scenes of some rows, with the floors of their families.
+
+    Raises InputError if the manifest has no such family.
+    """
+    family, names = shard["family"][rows], list(manifest.families)
+    if len(family) and not 0 <= family.min() <= family.max() < len(names):
+        wrong = family[(family < 0) | (family >= len(names))][0]
+        raise InputError(f"family is {wrong}; the manifest has {len(names)}: {', '.join(names)}")
+    floors = np.array([floor_row(manifest.floor(i)) for i in range(len(names))]).reshape(-1, 6)
+    return PackedScenes(shard["obstacle_kinds"][rows], shard["obstacle_params"][rows], floors[family])
+
+
+def problem_of(manifest: Manifest, robot: Robot, shard: Shard, row: int) -> Problem:
+    """The problem that a row solves, with all its goal configurations.
+
+    Raises InputError if the row makes no problem, such as a start out of limits.
+    """
+    goals = np.asarray(shard["goals"][row], np.float64)
+    goals = goals[~np.isnan(goals).any(axis=1)]
+    start = np.asarray(shard["start"][row], np.float64)
+    scene = scenes_of(manifest, shard, slice(row, row + 1)).scene(0)
+    return Problem(robot, scene, start, JointGoal(goals))
+
+
+def path_of(robot: Robot, shard: Shard, row: int) -> Path:
+    """The frames of a row as a path."""
+    return Path(robot.joint_names, np.asarray(shard["trajectories"][row], np.float64))
+
+
+def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
+    """The frames of a row as they move: timed, with rates by differences, where the data have times."""
+    path = path_of(robot, shard, row)
+    times = np.asarray(shard.arrays.get("times", ()), np.float64)
+    if not len(times) or not (np.diff(times[row]) > 0).all():
+        return path
+    velocities = np.gradient(path.positions, times[row], axis=0)
+    accelerations = np.gradient(velocities, times[row], axis=0)
+    return Trajectory(robot.joint_names, times[row], path.positions, velocities, accelerations)
+
+
+def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, Int[ndarray, "n"]]:
+    """Random rows without repetition, all where `count` is None, from shards of these sizes by number."""
+    total, first, picked = sum(sizes.values()), 0, {}
+    if count is None or count >= total:
+        rows = np.arange(total)
+    else:
+        rows = np.sort(np.random.default_rng(seed).choice(total, count, replace=False))
+    for index, size in sizes.items():
+        picked[index] = rows[(rows >= first) & (rows < first + size)] - first
+        first += size
+    return picked
+
+
+def random_rows(folder: str | FilePath, count: int, seed: int) -> Iterator[tuple[Shard, Int[ndarray, "n"]]]:
+    """The shards that random rows are from, with these rows. Raises InputError for a damaged shard."""
+    sizes = {index: len(read_shard(folder, index, ("family",))) for index in shard_indices(folder)}
+    for index, rows in pick_rows(sizes, count, seed).items():
+        if len(rows):
+            yield read_shard(folder, index), rows

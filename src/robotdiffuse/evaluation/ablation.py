@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.data.shards import read_manifest
+from robotdiffuse.data.manifest import read_manifest
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.problem_sets import hard_cases

@@ -9,15 +9,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.data.shards import (
-    MANIFEST,
-    Manifest,
-    read_manifest,
-    remove_leftovers,
-    shard_indices,
-    write_manifest,
-    write_shard,
-)
+from robotdiffuse.data.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
+from robotdiffuse.data.shards import remove_leftovers, shard_indices, write_shard
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.files import alone_in
 from robotdiffuse.generation.settings import GenerationSettings
@@ -116,6 +109,7 @@ def manifest_of(settings: GenerationSettings) -> Manifest:
         frames=settings.frames,
         timing=settings.timing,
         families={name: asdict(family) for name, family in settings.families.items()},
+        floors={name: floor_record(family.floor) for name, family in settings.families.items()},
         slots=settings.slots,
         goals=settings.goals,
         trajectories=settings.trajectories,

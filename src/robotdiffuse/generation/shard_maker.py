@@ -1,13 +1,15 @@
 """One shard of the data: problems drawn and solved until it is full; it depends on settings and number."""
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motion import search_space
+from robotdiffuse.data.dataset import resample
+from robotdiffuse.data.shards import Row, row_of
 from robotdiffuse.errors import InputError
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.paths.timing import time_parameterize
@@ -15,9 +17,7 @@ from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch
 from robotdiffuse.problems.families import Drawn
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import pack_scene
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.transforms import quaternion_from_rotation
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.types import Path
 from robotdiffuse.verify import Verifier, VerifySettings
 
@@ -28,7 +28,6 @@ NUMBERS = 2**32
 """Problem numbers of a shard; shards do not share any."""
 
 Arrays = dict[str, ndarray]
-Row = dict[str, ndarray | np.generic]
 Counts = dict[str, int]
 
 
@@ -86,14 +85,23 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     q[0], q[-1] = drawn.start, goal
     if not judge.path(Path(robot.joint_names, q.astype(np.float64))).valid:
         return "refused"
-    row = _row(settings, family, drawn, search, q)
-    clearances = checker.link_clearances(q).min(axis=1)
-    row["clearance"], row["end_clearance"] = clearances.min(), clearances[[0, -1]]
-    row["line_free"] = np.bool_(line_free)
-    row["seed"] = np.uint64(number)
-    if settings.timing == "time":
-        row["times"] = times.astype(np.float32)
-    return row
+    floor = list(settings.families.values())[family].floor
+    return row_of(
+        PackedScenes.pack([drawn.scene], settings.slots, floor is not None),
+        q,
+        checker.link_clearances(q).min(axis=1),
+        drawn.goals,
+        search.goal_costs,
+        search.best_goal,
+        drawn.T_base_tip,
+        family,
+        search.cost,
+        search.safety_distance,
+        line_free,
+        number,
+        settings.goals,
+        times if settings.timing == "time" else None,
+    )
 
 
 def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -> tuple[int, Drawn]:
@@ -102,36 +110,6 @@ def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -
     number = int(rng.choice(len(shares), p=shares / shares.sum()))
     family = list(settings.families.values())[number]
     return number, family.draw(robot, rng, settings.goals, settings.target)
-
-
-def _row(
-    settings: GenerationSettings,
-    family: int,
-    drawn: Drawn,
-    search: SharedTreeSearch,
-    q: Float32[ndarray, "n dof"],
-) -> Row:
-    k, dof = drawn.goals.shape
-    goals, goal_costs = np.full((settings.goals, dof), np.nan), np.full(settings.goals, np.nan)
-    goals[:k], goal_costs[:k] = drawn.goals, search.goal_costs
-    floor = list(settings.families.values())[family].floor
-    kinds, params = pack_scene(Scene(drawn.scene.shapes[floor is not None :]), settings.slots)
-    wxyz = quaternion_from_rotation(drawn.T_base_tip[:3, :3])
-    straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
-    return {
-        "trajectories": q,
-        "start": drawn.start,
-        "goals": goals.astype(np.float32),
-        "goal_costs": goal_costs.astype(np.float32),
-        "goal_index": np.int8(search.best_goal),
-        "target_pose": np.concatenate([wxyz, drawn.T_base_tip[:3, 3]]).astype(np.float32),
-        "obstacle_kinds": kinds,
-        "obstacle_params": params,
-        "family": np.int8(family),
-        "cost": np.float32(search.cost),
-        "safety_distance": np.float32(search.safety_distance),
-        "detour": np.float32(search.cost / max(straight, 1e-9)),
-    }
 
 
 def _line_is_free(
@@ -146,7 +124,7 @@ def _frames(
 ) -> tuple[ndarray, Float32[ndarray, "frames dof"]] | None:
     """Times and joint values of the frames; None if the timed motion does not pass the judge."""
     if settings.timing == "arc":
-        return np.zeros(0), resample(path, settings.frames).astype(np.float32)
+        return np.zeros(0), resample(path[None], settings.frames, exact=True)[0]
     waypoints = Path(robot.joint_names, path.astype(np.float64))
     if not judge.path(waypoints).valid:
         return None
@@ -158,12 +136,3 @@ def _frames(
     times = np.linspace(0.0, timed.duration, settings.frames)
     rows = [np.interp(times, timed.times, timed.positions[:, j]) for j in range(robot.dof)]
     return times, np.stack(rows, axis=1).astype(np.float32)
-
-
-def resample(path: Float[ndarray, "n dof"], frames: int) -> Float[ndarray, "frames dof"]:
-    """The path at `frames` places evenly spaced in joint-space length, both ends included."""
-    steps = np.linalg.norm(np.diff(path, axis=0), axis=1)
-    at = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
-    wanted = np.linspace(0.0, at[-1], frames)
-    rows = [np.interp(wanted, at, path[:, j]) for j in range(path.shape[1])]
-    return np.stack(rows, axis=1).astype(path.dtype)

@@ -10,11 +10,10 @@ from robotdiffuse.collision.arrays import compile_robot
 from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.learning.motion_model import ClearanceFn, MotionModelConfig
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.packed import PackedScenes
 
-PackedClearanceFn = Callable[[ndarray, ndarray, ndarray], ndarray]
-"""Packed scenes, kinds [n, k] and params [n, k, 10], and joint values [n, rows, dof] to what `ClearanceFn`
-gives."""
+PackedClearanceFn = Callable[[PackedScenes, ndarray], ndarray]
+"""A scene for each trajectory and joint values [n, rows, dof] to what `ClearanceFn` gives."""
 
 
 def link_clearances(checker: CollisionChecker, config: MotionModelConfig) -> ClearanceFn:
@@ -31,12 +30,12 @@ def link_clearances(checker: CollisionChecker, config: MotionModelConfig) -> Cle
     return clearances
 
 
-def packed_clearances(robot: Robot, config: MotionModelConfig, fixed: Scene) -> PackedClearanceFn:
-    """The same for training, each trajectory in a scene of its own; `fixed` is part of every scene."""
+def packed_clearances(robot: Robot, config: MotionModelConfig) -> PackedClearanceFn:
+    """The same for training, each trajectory in a scene of its own."""
     arrays = compile_robot(robot)
 
-    def clearances(kinds: ndarray, params: ndarray, q: ndarray) -> ndarray:
-        given = arrays, kinds, params, q, fixed, config.clearance_high
+    def clearances(scenes: PackedScenes, q: ndarray) -> ndarray:
+        given = arrays, scenes, q, config.clearance_high
         if config.sees_gradients:
             told = packed_clearances_and_gradients(*given, config.gradient_margin)
             return np.concatenate(told, axis=-1)

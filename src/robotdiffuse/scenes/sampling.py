@@ -1,22 +1,17 @@
-"""Points on the surfaces of obstacles: what the encoder sees of a scene.
-
-Two forms of the same rule: `sample_surface` for any scene, `sample_surfaces_batch` for many scenes of spheres
-and boxes at once, as training needs them.
-"""
+"""Points on the surfaces of obstacles: what the encoder sees of a scene. Of many scenes at once, see
+`surface_clouds`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Float32, Int8
+from jaxtyping import Float
 from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.scenes.packed import BOX, SPHERE
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, Triangulated
-from robotdiffuse.transforms import rotation_from_quaternion
 
 ROUNDS = 6
 """How often `sample_surface` draws before it repeats points that it has."""
@@ -149,83 +144,3 @@ def _may_be_seen(shape: Shape, region: VisibleRegion) -> bool:
         return False
     gap = np.maximum(0, np.maximum(low - region.center, region.center - high))
     return bool(gap @ gap < region.reach**2)
-
-
-def sample_surfaces_batch(
-    kinds: Int8[ndarray, "n k"],
-    params: Float32[ndarray, "n k 10"],
-    count: int,
-    rng: Generator,
-    region: VisibleRegion = PANDA_REGION,
-) -> Float32[ndarray, "n count 3"]:
-    """`count` points for each of n packed scenes, by the rule of `sample_surface` [m].
-
-    Each scene is drawn from `count` times; draws outside the region are replaced by repeating those inside.
-    A scene of which nothing lies in the region is all zeros.
-    """
-    n, k = kinds.shape
-    if k == 0:
-        return np.zeros((n, count, 3), np.float32)
-    box = kinds == BOX
-    size = np.where(box[..., None], params[..., 3:6], 0)
-    wxyz = np.where(box[..., None], params[..., 6:10], np.array([1, 0, 0, 0], np.float32))
-    rotation = rotation_from_quaternion(wxyz).astype(np.float32)
-    faces = np.stack(
-        [size[..., 1] * size[..., 2], size[..., 2] * size[..., 0], size[..., 0] * size[..., 1]], -1
-    )
-    radius = np.where(kinds == SPHERE, params[..., 3], 0)
-    area = 4 * np.float32(np.pi) * radius**2 + 2 * faces.sum(-1)
-    half = np.where(box[..., None], (np.abs(rotation) @ size[..., None])[..., 0] / 2, radius[..., None])
-    area *= _may_be_seen_batch(params[..., :3] - half, params[..., :3] + half, region)
-
-    ends = np.cumsum(area, axis=1)
-    pick = rng.random((n, count), dtype=np.float32) * ends[:, -1:]
-    shape = (pick[:, :, None] >= ends[:, None, :-1]).sum(axis=2)
-    shape += np.arange(n)[:, None] * k
-    flat = shape.reshape(-1)
-    points = np.empty((n * count, 3), np.float32)
-    is_box = (kinds == BOX).reshape(-1)[flat]
-    for mask, draw in ((~is_box, _spheres), (is_box, _boxes)):
-        rows = np.flatnonzero(mask)
-        of = flat[rows]
-        points[rows] = draw(of, radius.reshape(-1), size.reshape(-1, 3), faces, rotation, rng)
-    points += params[..., :3].reshape(-1, 3)[flat]
-    points = points.reshape(n, count, 3)
-
-    inside = region.holds(points) & (ends[:, -1:] > 0)
-    total = inside.sum(axis=1, keepdims=True)
-    order = np.argsort(~inside, axis=1, kind="stable")
-    source = np.take_along_axis(order, np.arange(count)[None] % np.maximum(total, 1), axis=1)
-    points = points.reshape(-1, 3)[source + np.arange(n)[:, None] * count]
-    points[total[:, 0] == 0] = 0
-    return points
-
-
-def _may_be_seen_batch(low: ndarray, high: ndarray, region: VisibleRegion) -> ndarray:
-    center = np.array(region.center, np.float32)
-    gap = np.maximum(0, np.maximum(low - center, center - high))
-    return (high[..., 2] > region.floor) & ((gap**2).sum(-1) < region.reach**2)
-
-
-def _spheres(
-    of: ndarray, radius: ndarray, _size: ndarray, _faces: ndarray, _rotation: ndarray, rng: Generator
-) -> ndarray:
-    z = 2 * rng.random(len(of), dtype=np.float32) - 1
-    angle = np.float32(2 * np.pi) * rng.random(len(of), dtype=np.float32)
-    ring = np.sqrt(1 - z * z)
-    directions = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1)
-    return directions * radius[of][:, None]
-
-
-def _boxes(
-    of: ndarray, _radius: ndarray, size: ndarray, faces: ndarray, rotation: ndarray, rng: Generator
-) -> ndarray:
-    points = rng.random((len(of), 3), dtype=np.float32) - np.float32(0.5)
-    ends = np.cumsum(faces.reshape(-1, 3), axis=1)[of]
-    pick = rng.random(len(of), dtype=np.float32) * ends[:, 2]
-    axis = (pick >= ends[:, 0]).astype(np.int64) + (pick >= ends[:, 1])
-    at = np.arange(0, 3 * len(of), 3) + axis
-    flat = points.reshape(-1)
-    flat[at] = np.copysign(np.float32(0.5), flat[at])
-    points *= size[of]
-    return np.einsum("nij,nj->ni", rotation.reshape(-1, 3, 3)[of], points)

@@ -1,11 +1,11 @@
 """Point clouds of many packed scenes at once, on any device: what training makes on the fly.
 
-The rule is that of `sample_surfaces_batch`: points uniform by area over the spheres and boxes of a scene.
-Here it is written for speed, in PyTorch: a point is center + M d: on a sphere, d is a direction and M the
-radius; on a box, M has half of a face's normal and edges as columns, and d is (+-1, u, v). What a point needs
-of its face is gathered from a table of faces; there is no array of points times shapes; and scenes are done
-in parts that stay in the processor's cache. For whole surfaces on the CPU, what training needs most, compiled
-code is three times as fast again (`surface_kernel`).
+The rule is that of `sample_surface`: points uniform by area over the spheres and boxes of a scene. Here it is
+written for speed, in PyTorch: a point is center + M d: on a sphere, d is a direction and M the radius; on a
+box, M has half of a face's normal and edges as columns, and d is (+-1, u, v). What a point needs of its face
+is gathered from a table of faces; there is no array of points times shapes; and scenes are done in parts that
+stay in the processor's cache. For whole surfaces on the CPU, what training needs most, compiled code is three
+times as fast again (`surface_kernel`).
 """
 
 import math
@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float32, Int8
 from torch import Generator, Tensor
 
-from robotdiffuse.scenes.packed import BOX, NONE, SPHERE
+from robotdiffuse.scenes.packed import BOX, NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.sampling import VisibleRegion
 from robotdiffuse.scenes.surface_kernel import fill_clouds
 
@@ -35,8 +35,7 @@ COMPILED_ON = ("cpu",)
 
 
 def surface_clouds(
-    kinds: Int8[Tensor, "n k"],
-    params: Float32[Tensor, "n k 10"],
+    scenes: PackedScenes,
     count: int,
     generator: Generator,
     *,
@@ -44,25 +43,27 @@ def surface_clouds(
     camera: Float32[Tensor, "n 3"] | None = None,
     ordered: bool = False,
 ) -> Float32[Tensor, "n count 3"]:
-    """`count` points on the surfaces of each scene, independent and uniform by area [m].
+    """`count` points on the obstacles of each scene, independent and uniform by area, on the generator's
+    device [m].
 
-    kinds, params: packed scenes, as of `pack_scene`; the generator is on their device. `region`: only points
-    in it. `camera`: a position for each scene [m]; only points that it sees, on faces turned to it and
-    neither behind nor within another shape. Where few of the drawn points count, they repeat; a scene of
-    which none does is all zeros. `ordered`: sorted by x, then y, then z, and rounded to a millionth of the
-    scene's largest coordinate, for encoders to which the order matters.
+    `region`: only points in it. `camera`: a position for each scene [m]; only points that it sees, on faces
+    turned to it and neither behind nor within another shape. Where few of the drawn points count, they
+    repeat; a scene of which none does is all zeros. `ordered`: sorted by x, then y, then z, and rounded to a
+    millionth of the scene's largest coordinate, for encoders to which the order matters.
     """
+    kinds, params = np.ascontiguousarray(scenes.kinds), np.ascontiguousarray(scenes.params)
     n, k = kinds.shape
-    clouds = torch.empty(n, count, 3, device=params.device)
+    clouds = torch.empty(n, count, 3, device=generator.device)
     if not n or not k or not count:
         return clouds.zero_()
-    if region is None and camera is None and params.device.type in COMPILED_ON:
+    if region is None and camera is None and clouds.device.type in COMPILED_ON:
         seeds = torch.randint(2**62, (n,), generator=generator).numpy().view(np.uint64)
-        fill_clouds(kinds.contiguous().numpy(), params.contiguous().numpy(), seeds, clouds.numpy())
+        fill_clouds(kinds, params, seeds, clouds.numpy())
         if ordered:
             for part in clouds.split(max(1, PART // count)):
                 sort_points(list(part.unbind(-1)))
         return clouds
+    kinds, params = (torch.from_numpy(array).to(clouds.device) for array in (kinds, params))
     return _by_tensors(kinds, params, clouds, generator, region, camera, ordered)
 
 

@@ -23,7 +23,7 @@ def _next(x):
 def fill_clouds(kinds, params, seeds, out):
     """Points uniform by area over the shapes of each scene, in out[n, count, 3]; zeros where there is none.
 
-    kinds [n, k] and params [n, k, 10] as of `pack_scene`; seeds uint64[n].
+    kinds [n, k] and params [n, k, 10] of `PackedScenes`; seeds uint64[n].
     """
     n, k = kinds.shape
     count = out.shape[1]

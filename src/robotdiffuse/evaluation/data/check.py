@@ -16,16 +16,18 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.data.manifest import Manifest, read_manifest
 from robotdiffuse.data.shards import (
-    Manifest,
     Shard,
     check_shard,
-    read_manifest,
+    existing_shards,
+    path_of,
+    pick_rows,
+    problem_of,
     read_shard,
-    shard_indices,
+    scenes_of,
 )
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data.rows import path_of, pick_rows, problem_of, scene_of
 from robotdiffuse.generation.workers import prepare_worker
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
@@ -134,11 +136,7 @@ def check_data(
     manifest.check_robot(robot)
     if pybullet:
         _need_pybullet()
-    indices = shard_indices(folder)
-    if not indices:
-        raise InputError(
-            f"{folder} holds no shards; continue with: robotdiffuse data generate --out {folder}"
-        )
+    indices = existing_shards(folder)
     task = _Task(str(folder), manifest, robot, pybullet)
     with _Processes(workers) as processes:
         sizes = dict(zip(indices, processes.map(task.size, indices), strict=True))
@@ -249,7 +247,7 @@ class _Task:
         with PyBulletOracle(self.robot, Scene([])) as oracle:
             for row in rows.tolist():
                 try:
-                    oracle.set_scene(scene_of(self.manifest, shard, row))
+                    oracle.set_scene(scenes_of(self.manifest, shard, slice(row, row + 1)).scene(0))
                 except InputError:
                     continue  # found already
                 path = path_of(self.robot, shard, row)

@@ -7,17 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.data.shards import (
-    SPLITS,
-    Manifest,
-    read_manifest,
-    read_shard,
-    shard_indices,
-    shard_path,
-    split_of,
-)
+from robotdiffuse.data.manifest import Manifest, read_manifest
+from robotdiffuse.data.shards import SPLITS, existing_shards, read_shard, scenes_of, shard_path, split_of
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data.rows import family_names
 
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 SAMPLE = 20_000
@@ -134,11 +126,7 @@ def describe(folder: str | FilePath) -> DataSummary:
 def read_columns(folder: str | FilePath) -> DataColumns:
     """Read what figures and plots need, one shard at a time. Raises InputError as `describe`."""
     manifest = read_manifest(folder)
-    indices = shard_indices(folder)
-    if not indices:
-        raise InputError(
-            f"{folder} holds no shards; continue with: robotdiffuse data generate --out {folder}"
-        )
+    indices = existing_shards(folder)
     every = max(1, manifest.trajectories // SAMPLE)
     frames = np.unique(np.linspace(0, manifest.frames - 1, FRAMES_KEPT).round().astype(int))
     small: list[dict[str, ndarray]] = []
@@ -153,9 +141,7 @@ def read_columns(folder: str | FilePath) -> DataColumns:
         small.append({name: shard[name] for name in SMALL})
         picked = {name: np.array(shard[name][rows]) for name in {*SMALL, *LARGE} - {"trajectories"}}
         sample.append(picked | {"trajectories": np.array(shard["trajectories"][np.ix_(rows, frames)])})
-        splits += np.bincount(
-            split_of(shard["obstacle_kinds"], shard["obstacle_params"]), minlength=len(SPLITS)
-        )
+        splits += np.bincount(split_of(scenes_of(manifest, shard)), minlength=len(SPLITS))
         for name, value in shard.counts.items():
             counts[name] = counts.get(name, 0) + value
         size += sum(file.stat().st_size for file in shard_path(folder, index).rglob("*") if file.is_file())
@@ -177,7 +163,7 @@ def summarize(columns: DataColumns) -> DataSummary:
     rows, manifest = columns.all, columns.manifest
     families = {
         name: _family(columns, rows["family"] == i)
-        for i, name in enumerate(family_names(manifest))
+        for i, name in enumerate(manifest.families)
         if (rows["family"] == i).any()
     }
     whole, ends = safety_distance(columns), rows["end_clearance"].min(axis=1)

@@ -33,7 +33,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int8
+from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from torch import Tensor, nn
 
@@ -46,6 +46,7 @@ from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.sampling import VisibleRegion
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 
@@ -147,8 +148,7 @@ class Steps(NamedTuple):
     goal: Float32[Tensor, "n dof"]
     clouds: Float32[Tensor, "n points 3"]
     """Of the scenes [m]."""
-    kinds: Int8[ndarray, "n k"]
-    params: Float32[ndarray, "n k 10"]
+    scenes: PackedScenes
 
 
 class MPiNetsNetwork(BaselineNetwork):
@@ -232,7 +232,7 @@ class MPiNetsNetwork(BaselineNetwork):
         q = self(steps.clouds, steps.q, steps.goal)
         error = self._surface(q) - self._surface(steps.expert)
         match = error.square().mean() + error.abs().mean()
-        close = hinge(self._distance(q[:, None], steps.kinds, steps.params), s.margin).mean()
+        close = hinge(self._distance(q[:, None], steps.scenes), s.margin).mean()
         return (s.point_match * match + s.collision * close) / LOSS_UNIT
 
     def draw(self, data: TrajectoryData, count: int, rng: np.random.Generator) -> Steps:
@@ -245,18 +245,15 @@ class MPiNetsNetwork(BaselineNetwork):
         q, expert, goal = data.q[rows, np.where(way > 0, frames, last - frames)]
         q = q + self.settings.noise * rng.standard_normal(q.shape, dtype=np.float32)
         q = self.joints(np.clip(self.normalized(q), -1, 1))
-        kinds, params = data.kinds[rows], data.params[rows]
-        clouds = self.clouds(kinds, params, rng)
+        scenes = data.scenes[rows]
+        clouds = self.clouds(scenes, rng)
         here, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
-        return Steps(here, after, end, clouds, kinds, params)
+        return Steps(here, after, end, clouds, scenes)
 
-    def clouds(
-        self, kinds: Int8[ndarray, "n k"], params: Float32[ndarray, "n k 10"], rng: np.random.Generator
-    ) -> Float32[Tensor, "n points 3"]:
-        """Random clouds of packed scenes as the network wants them [m]; zeros where nothing is in reach."""
+    def clouds(self, scenes: PackedScenes, rng: np.random.Generator) -> Float32[Tensor, "n points 3"]:
+        """Random clouds of scenes as the network wants them [m]; zeros where nothing is in reach."""
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-        scenes = torch.from_numpy(kinds), torch.from_numpy(params)
-        return surface_clouds(*scenes, self.settings.scene_points, generator, region=self.settings.region)
+        return surface_clouds(scenes, self.settings.scene_points, generator, region=self.settings.region)
 
     def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
         """Share of some motions that are not trivial that a single roll-out brings, free of collision, near
@@ -264,8 +261,8 @@ class MPiNetsNetwork(BaselineNetwork):
         rows = np.flatnonzero(~data.trivial)[:ROLL_OUTS]
         if not len(rows):
             return None
-        kinds, params, q = data.kinds[rows], data.params[rows], data.q[rows].astype(np.float32)
-        roll_outs = RollOuts(self, self.clouds(kinds, params, rng), q[:, 0], q[:, -1])
+        scenes, q = data.scenes[rows], data.q[rows].astype(np.float32)
+        roll_outs = RollOuts(self, self.clouds(scenes, rng), q[:, 0], q[:, -1])
         for _ in range(ROLL_OUT_STEPS):
             roll_outs.stop(roll_outs.distances() < self.settings.near)
             if not roll_outs.running.any():
@@ -273,7 +270,7 @@ class MPiNetsNetwork(BaselineNetwork):
             roll_outs.advance()
         arrived = roll_outs.distances() < self.settings.near
         motions = np.concatenate([np.stack(roll_outs.frames, 1), q[:, -1:]], 1)
-        return float((arrived & motions_free(robot, kinds, params, motions)).mean())
+        return float((arrived & motions_free(robot, scenes, motions)).mean())
 
 
 class RollOuts:

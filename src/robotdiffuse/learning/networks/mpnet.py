@@ -194,8 +194,7 @@ class MPNetNetwork(BaselineNetwork):
         self, data: TrajectoryData, rows: Int[ndarray, "scenes"], generator: Generator
     ) -> Float[Tensor, "scenes points 3"]:
         """A random cloud of the obstacles of each of these trajectories [m]."""
-        scenes = torch.from_numpy(data.kinds[rows]), torch.from_numpy(data.params[rows])
-        return surface_clouds(*scenes, self.settings.points, generator, region=self.region)
+        return surface_clouds(data.scenes[rows], self.settings.points, generator, region=self.region)
 
     def success(self, data: TrajectoryData, robot: Robot, rng: np.random.Generator) -> float | None:
         """Share of held-out problems solved by one run of bidirectional planning, without any replanning."""
@@ -203,7 +202,7 @@ class MPNetNetwork(BaselineNetwork):
         if not len(rows):
             return None
         generator = torch.Generator().manual_seed(int(rng.integers(2**63)))
-        kinds, params, q = data.kinds[rows], data.params[rows], data.q[rows]
+        scenes, q = data.scenes[rows], data.q[rows]
         with torch.inference_mode():
             z = self.encode(self.clouds(data, rows, generator))
             forth, back = ([torch.from_numpy(np.ascontiguousarray(q[:, at]))] for at in (0, -1))
@@ -213,9 +212,9 @@ class MPNetNetwork(BaselineNetwork):
                 path = torch.stack([*forth, *back[::-1]], 1).numpy()
                 gap = refined(path[:, len(forth) - 1 : len(forth) + 1], 8)
                 joined = np.flatnonzero(~ended)
-                joined = joined[motions_free(robot, kinds[joined], params[joined], gap[joined])]
+                joined = joined[motions_free(robot, scenes[joined], gap[joined])]
                 fine = refined(path[joined], 3)
-                found[joined] = motions_free(robot, kinds[joined], params[joined], fine)
+                found[joined] = motions_free(robot, scenes[joined], fine)
                 ended[joined] = True
                 forth, back = back, forth
         return float(found.mean())

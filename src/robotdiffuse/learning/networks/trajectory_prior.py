@@ -33,6 +33,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.denoisers.layers import Linear
 from robotdiffuse.learning.denoisers.unet import UNet, UNetSettings
@@ -42,7 +43,7 @@ from robotdiffuse.learning.motion_model import one_thread
 from robotdiffuse.learning.networks.base import BaselineNetwork, JointRanges
 from robotdiffuse.learning.objectives import objective_for
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
-from robotdiffuse.learning.training.validation import motions_free, row_checker
+from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots.robot import Robot
 
 SUCCESS_PROBLEMS = 24
@@ -152,10 +153,8 @@ class TrajectoryPrior(BaselineNetwork):
         rows = np.flatnonzero(~data.trivial)[:SUCCESS_PROBLEMS]
         if not len(rows):
             return None
-        kinds, params, q = data.kinds[rows], data.params[rows], data.q[rows]
-        guidance = [
-            CollisionGuidance(row_checker(robot, *scene)) for scene in zip(kinds, params, strict=True)
-        ]
+        scenes, q = data.scenes[rows], data.q[rows]
+        guidance = [CollisionGuidance(CollisionChecker(robot, scenes.scene(i))) for i in range(len(scenes))]
 
         def guide(q: ndarray, left: int) -> ndarray:
             if left >= SUCCESS_STEPS // 4:
@@ -167,7 +166,7 @@ class TrajectoryPrior(BaselineNetwork):
         levels = self.schedule.sampling_levels(SUCCESS_STEPS)[:-1]
         sampled = self.sample(q[:, 0], q[:, -1], levels, rng, guide)
         assert sampled is not None
-        return float(motions_free(robot, kinds, params, sampled).mean())
+        return float(motions_free(robot, scenes, sampled).mean())
 
     def sample(
         self,

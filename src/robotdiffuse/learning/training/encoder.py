@@ -2,8 +2,7 @@
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int8
-from numpy import ndarray
+from jaxtyping import Float
 from torch import Tensor
 
 from robotdiffuse.learning.checkpoint import save_encoder
@@ -14,8 +13,7 @@ from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.run import TrainingRun, Validation
 from robotdiffuse.learning.versions import versions
-from robotdiffuse.scenes.packed import BOX, NONE
-from robotdiffuse.transforms import rotation_from_quaternion
+from robotdiffuse.scenes.packed import PackedScenes
 
 READ, CHECKED = 2048, 512
 """Scenes that a linear read-out is fitted to, and further ones that it is judged by."""
@@ -56,7 +54,7 @@ def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
     def loss(rng: np.random.Generator) -> Float[Tensor, ""]:
         points = int(rng.integers(max(1, most // 8), most + 1)) if module.any_size else most
         scenes = random_scenes(settings.batch, settings.max_obstacles, rng)
-        error, _ = _reconstruction(module, *scenes, points, rng, processes)
+        error, _ = _reconstruction(module, scenes, points, rng, processes)
         theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()
         return error + settings.regularization * theta
 
@@ -64,7 +62,7 @@ def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
         rng = np.random.default_rng(seed)
         with torch.no_grad():
             scenes = random_scenes(count, settings.max_obstacles, rng)
-            return _reconstruction(module, *scenes, most, rng, processes)
+            return _reconstruction(module, scenes, most, rng, processes)
 
     run.loop(loss, lambda: Validation(judge(128, 123)[0].item()), "encoder")
     if not processes.first:
@@ -74,7 +72,7 @@ def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
         scenes = random_scenes(READ, settings.max_obstacles, rng)
         report = judge(512, settings.seed + 2)[1]
         trained = on_cpu(module)
-        clouds = scene_clouds(trained, *scenes, rng).split(256)
+        clouds = scene_clouds(trained, scenes, rng).split(256)
         trained.standardize(torch.cat([trained.encode(part) for part in clouds]))
         report |= linear_readout(trained, settings.max_obstacles, rng)
         about = {"settings": settings_to_json(settings), "samples": run.at.samples, **report, **versions()}
@@ -84,13 +82,12 @@ def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
 
 def _reconstruction(
     module: Autoencoder,
-    kinds: Int8[ndarray, "n k"],
-    params: Float32[ndarray, "n k 10"],
+    scenes: PackedScenes,
     points: int,
     rng: np.random.Generator,
     processes: Processes,
 ) -> tuple[Float[Tensor, ""], dict[str, float]]:
-    cloud = scene_clouds(module, kinds, params, rng, points).to(processes.device)
+    cloud = scene_clouds(module, scenes, rng, points).to(processes.device)
     with processes.autocast():
         return module.loss(cloud, rng)
 
@@ -102,11 +99,11 @@ def linear_readout(encoder: Encoder, max_obstacles: int, rng: np.random.Generato
     random scenes and judged by others. `readout`: its mean error [m]; `readout_of_constant`: that of the mean
     distances, with no z at all.
     """
-    kinds, params = random_scenes(READ + CHECKED, max_obstacles, rng)
+    scenes = random_scenes(READ + CHECKED, max_obstacles, rng)
     with torch.no_grad():
-        clouds = scene_clouds(encoder, kinds, params, rng).split(256)
+        clouds = scene_clouds(encoder, scenes, rng).split(256)
         z = torch.cat([encoder(part) for part in clouds]).numpy().astype(np.float64)
-    wanted = scene_distances(kinds, params, SPOTS).clip(-NEAR, NEAR).astype(np.float64)
+    wanted = scenes.distances(SPOTS).clip(-NEAR, NEAR).astype(np.float64)
     z -= z[:READ].mean(0)
     mean = wanted[:READ].mean(0)
     gram = z[:READ].T @ z[:READ]
@@ -117,19 +114,3 @@ def linear_readout(encoder: Encoder, max_obstacles: int, rng: np.random.Generato
         "readout": float(np.abs(error - z[READ:] @ weights).mean()),
         "readout_of_constant": float(np.abs(error).mean()),
     }
-
-
-def scene_distances(
-    kinds: Int8[ndarray, "n k"], params: Float32[ndarray, "n k 10"], at: Float[ndarray, "places 3"]
-) -> Float[ndarray, "n places"]:
-    """Signed distance [m] of places to the nearest of each packed scene's shapes; infinite if it has none."""
-    nearest = np.full((len(kinds), len(at)), np.inf)
-    for kind, p in zip(kinds.T, params.transpose(1, 0, 2).astype(np.float64), strict=True):
-        box, some = kind == BOX, kind != NONE
-        away = at - p[:, None, :3]
-        distance = np.linalg.norm(away, axis=-1) - p[:, 3, None]
-        local = np.abs(away[box] @ rotation_from_quaternion(p[box, 6:])) - p[box, None, 3:6] / 2
-        outside = np.linalg.norm(local.clip(min=0), axis=-1)
-        distance[box] = outside + local.max(-1).clip(max=0)
-        nearest[some] = np.minimum(nearest[some], distance[some])
-    return nearest

@@ -3,7 +3,8 @@
 import sys
 from collections.abc import Callable
 
-from robotdiffuse.data.shards import read_manifest, shard_indices
+from robotdiffuse.data.manifest import read_manifest
+from robotdiffuse.data.shards import shard_indices
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.processes import Processes
 

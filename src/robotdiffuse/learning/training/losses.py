@@ -15,7 +15,7 @@ from torch import Tensor
 from robotdiffuse.collision.arrays import compile_robot
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.kinematics import ForwardKinematics
-from robotdiffuse.scenes.packed import BOX, SPHERE
+from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
 from robotdiffuse.transforms import rotation_from_quaternion
 
 POINT_UNIT = 0.1
@@ -99,28 +99,29 @@ def _on_triangles(corners: Float[ndarray, "n 3 3"], count: int, rng: np.random.G
 class ArmDistance:
     """Signed distance of an arm's covering spheres to packed scenes, a different one for each trajectory."""
 
-    def __init__(self, kinematics: ForwardKinematics, floor: bool = True) -> None:
-        """floor: whether the plane z = 0 is part of every scene, as in ROP."""
+    def __init__(self, kinematics: ForwardKinematics) -> None:
         arrays = compile_robot(kinematics.robot)
         groups = np.repeat(arrays.frame, np.diff(arrays.first))
         spheres = torch.as_tensor(
             arrays.spheres[groups > 0], dtype=kinematics.dtype, device=kinematics.device
         )
-        self._kinematics, self._floor = kinematics, floor
+        self._kinematics = kinematics
         self._frame = torch.as_tensor(groups[groups > 0], device=kinematics.device).long()
         self._centres = torch.nn.functional.pad(spheres[:, :3], (0, 1), value=1.0)
         self._radii = spheres[:, 3]
 
     def __call__(
-        self,
-        q: Float[Tensor, "n frames dof"],
-        kinds: Int8[ndarray, "n k"],
-        params: Float32[ndarray, "n k 10"],
+        self, q: Float[Tensor, "n frames dof"], scenes: PackedScenes
     ) -> Float[Tensor, "n frames spheres"]:
-        """D of the paper [m], negative inside; q in [rad], scenes as `pack_scene` packs them."""
+        """D of the paper [m], negative inside; q in [rad]. A floor counts as the plane of its top."""
+        kinds, params = scenes.kinds, scenes.params
         T = self._kinematics(q)[..., self._frame, :3, :]
         centres = (T @ self._centres[..., None])[..., 0]
-        least = centres[..., 2] if self._floor else torch.full_like(centres[..., 0], FAR)
+        least = torch.full_like(centres[..., 0], FAR)
+        if scenes.floors is not None:
+            top = torch.from_numpy(scenes.floors[:, 2] + scenes.floors[:, 5] / 2).to(centres)[:, None, None]
+            there = torch.from_numpy(scenes.floors.any(1)).to(centres.device)[:, None, None]
+            least = torch.where(there, centres[..., 2] - top, least)
         rotation = rotation_from_quaternion(
             np.where((kinds == BOX)[..., None], params[..., 6:], [1, 0, 0, 0])
         )

@@ -21,7 +21,7 @@ from robotdiffuse.learning.training.growing_data import GrowingData
 from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.run import TrainingRun, Validation
-from robotdiffuse.learning.training.validation import FLOOR, planning_success
+from robotdiffuse.learning.training.validation import planning_success
 from robotdiffuse.learning.versions import versions
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import ForwardKinematics
@@ -80,7 +80,7 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     # batches are made, and validations planned, on the CPU
     here = on_cpu(model)
 
-    clearances = packed_clearances(robot, model.config, FLOOR)
+    clearances = packed_clearances(robot, model.config)
 
     def batches_of(rows: TrajectoryData) -> Batches:
         return Batches(rows, here, clearances, settings.trivial_share, settings.weight_limit)
@@ -225,6 +225,6 @@ class _Loss:
             moved = self.points(q) - self.points(model.joints_at(clean, base, frames))
             error = error + losses.point * (moved / POINT_UNIT).square().sum(-1).mean((1, 2))
         if self.arm is not None and collision_weight > 0:
-            near = hinge(self.arm(q, batch.kinds, batch.params), losses.safe_distance) / POINT_UNIT
+            near = hinge(self.arm(q, batch.scenes), losses.safe_distance) / POINT_UNIT
             error = error + collision_weight * near.sum(-1).mean(1)
         return error

@@ -12,12 +12,8 @@ from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.training.batches import TrajectoryData, encode_scenes
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import unpack_scene
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box
+from robotdiffuse.scenes.packed import PackedScenes
 
-FLOOR = Scene([Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")])
-"""Part of every scene of the data, as in ROP."""
 SAMPLING_STEPS = 6
 """Of every network alike, so that all of the levels do not take longer than the training."""
 BETWEEN = 6
@@ -49,10 +45,9 @@ def _sampled_free(
     candidates: int,
     rng: np.random.Generator,
 ) -> Bool[ndarray, "candidates"]:
-    kinds, params, q = data.kinds[row], data.params[row], data.q[row]
-    checker = row_checker(robot, kinds, params)
+    q, checker = data.q[row], CollisionChecker(robot, data.scenes.scene(row))
     if data.codes is None:
-        code = encode_scenes(model.encoder, kinds[None], params[None], rng)[0]
+        code = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
     else:
         code = data.codes[row]
     start, goal = q[0].astype(np.float64), q[-1].astype(np.float64)
@@ -60,11 +55,6 @@ def _sampled_free(
     steps = min(SAMPLING_STEPS, model.schedule.steps)
     q = model.sample(code.astype(np.float32), start, goal, candidates, rng, clearances, steps)
     return free_in(checker, q)
-
-
-def row_checker(robot: Robot, kinds: ndarray, params: ndarray) -> CollisionChecker:
-    """The checker for a packed scene of the data, kinds [k] and params [k, 10], with its floor."""
-    return CollisionChecker(robot, Scene([*FLOOR.shapes, *unpack_scene(kinds, params).shapes]))
 
 
 def free_in(checker: CollisionChecker, q: Float[ndarray, "n frames dof"]) -> Bool[ndarray, "n"]:
@@ -76,9 +66,7 @@ def free_in(checker: CollisionChecker, q: Float[ndarray, "n frames dof"]) -> Boo
     return np.all(free, axis=1, keepdims=True)[:, 0]
 
 
-def motions_free(
-    robot: Robot, kinds: ndarray, params: ndarray, q: Float[ndarray, "n frames dof"]
-) -> Bool[ndarray, "n"]:
-    """Which motions are free, each in a packed scene of its own, kinds [n, k] and params [n, k, 10]."""
-    rows = zip(kinds, params, q[:, None], strict=True)
-    return np.array([free_in(row_checker(robot, *scene), motion)[0] for *scene, motion in rows], bool)
+def motions_free(robot: Robot, scenes: PackedScenes, q: Float[ndarray, "n frames dof"]) -> Bool[ndarray, "n"]:
+    """Which motions are free, each in a scene of its own."""
+    checkers = (CollisionChecker(robot, scenes.scene(i)) for i in range(len(scenes)))
+    return np.array([free_in(of, motion)[0] for of, motion in zip(checkers, q[:, None], strict=True)], bool)

@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 
 
@@ -24,10 +25,10 @@ def turns_about_vertical(robot: Robot) -> bool:
 def turned(
     robot: Robot,
     q: Float32[ndarray, "n frames dof"],
-    params: Float32[ndarray, "n k 10"],
+    scenes: PackedScenes,
     rng: np.random.Generator,
-) -> tuple[Float32[ndarray, "n frames dof"], Float32[ndarray, "n k 10"], Bool[ndarray, "n"]]:
-    """Each motion and its packed scene turned by an angle, uniform among those that the first joint's limits
+) -> tuple[Float32[ndarray, "n frames dof"], PackedScenes, Bool[ndarray, "n"]]:
+    """Each motion and its scene turned by an angle, uniform among those that the first joint's limits
     allow; and which of the turned motions keep clear of the base.
 
     The robot must be one of `turns_about_vertical`.
@@ -39,18 +40,4 @@ def turned(
     q = q.copy()
     q[:, :, 0] = np.clip(first + angle[:, None], robot.lower[0], robot.upper[0])
     free = CollisionChecker(robot, Scene([])).free(q.reshape(-1, q.shape[-1])).reshape(len(q), -1)
-    return q, _turned_scenes(params, angle), free.min(axis=1)
-
-
-def _turned_scenes(
-    params: Float32[ndarray, "n k 10"], angle: Float32[ndarray, "n"]
-) -> Float32[ndarray, "n k 10"]:
-    params = params.copy()
-    c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
-    x, y = params[..., 0].copy(), params[..., 1].copy()
-    params[..., 0], params[..., 1] = c * x - s * y, s * x + c * y
-    # the quaternion of the turn, (cos, 0, 0, sin) of half the angle, times that of the obstacle
-    c, s = np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None]
-    w, i, j, k = np.moveaxis(params[..., 6:].copy(), -1, 0)
-    params[..., 6:] = np.stack([c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w], -1)
-    return params
+    return q, scenes.turned(angle), free.min(axis=1)
