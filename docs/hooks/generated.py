@@ -10,7 +10,10 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
-READING_ORDER = ("planners", "problems", "robots", "scenes", "results", "types", "verify", "paths", "data", "errors")
+READING_ORDER = (
+    *("planners", "problems", "robots", "scenes", "results"),
+    *("types", "verify", "paths", "data", "errors"),
+)
 """Of the rooms that public names are from."""
 TABLES = {
     "Planners": "planners:PLANNERS",
