@@ -41,7 +41,7 @@ docs: .venv/dev.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 # not benchmarks but parts of them, and curves of runs that are to be named
-BENCHMARKS := $(filter-out %/report.py %/problems.py %/curves.py,$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out %/report.py %/problems.py %/searches.py %/curves.py,$(wildcard benchmarks/*.py))
 
 bench: .venv/dev.stamp
 	set -e; for file in $(BENCHMARKS); do echo "== $$file"; $(BIN)/python "$$file"; done
@@ -66,7 +66,7 @@ SETS = rop,rop_dense$(if $(MBM),$(comma)$(MBM))
 RUN = $(BIN)/robotdiffuse bench run --out runs/table1 --problems $(SETS)
 
 table1: .venv/dev.stamp
-	$(RUN) --planners all --count 300 --time-limit 1
+	$(RUN) --planners all --count 300 --time-limit 1 --equal-time
 	$(RUN) --planners all --count 60 --time-limit 10
 	$(RUN) --planners ompl_rrt_star,ompl_informed_rrt_star,ompl_bit_star --count 5 --time-limit 60
 	$(BIN)/robotdiffuse bench confirm runs/table1

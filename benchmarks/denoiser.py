@@ -28,7 +28,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from problems import PANDA, SEED, draw_cases, goal_of
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.trials import NETWORK_ALONE
+from robotdiffuse.evaluation.methods import NETWORK_ALONE
 from robotdiffuse.learning import motion_model
 from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance

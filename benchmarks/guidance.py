@@ -10,20 +10,23 @@ with the usual gradient steps only.
 """
 
 import argparse
-import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from report import header, print_table, progress, wilson
+from report import WIDTH, header
 
-from problems import SEED, Case, draw_cases, goal_of, judged
-from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.trials import NETWORK_ALONE
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings, encode
+from problems import PANDA, Case, draw_cases
+from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled
+from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.statistics import wilson_interval
+from robotdiffuse.evaluation.summary import BEST, CPU, SINGLE, half_width, summary
+from robotdiffuse.evaluation.tables import show
+from robotdiffuse.evaluation.trial import tried
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse
 from robotdiffuse.problems.families import FAMILIES
 
 STEPS = (1, 2, 5, 10, 50, 200)
@@ -39,124 +42,57 @@ SCALED_STEPS = (1, 2, 5, 10)
 """Sampling steps that the scales are tried with."""
 COLORS = ("#8a94a3", "#7fb3e0", "#3f7fc4", "#14487f", "#d1495b")
 
-
-class Share(NamedTuple):
-    """What became of one setting."""
-
-    single: float
-    half: float
-    """Of the 95 % interval of `single`, over the problems."""
-    best: float
-    best_low: float
-    """95 % interval of `best`."""
-    best_high: float
-    problems: int
-    seconds: float
-    """CPU time of a batch, median."""
-
-    @property
-    def row(self) -> list[str]:
-        best = f"{100 * self.best:.1f} % ({100 * self.best_low:.0f} to {100 * self.best_high:.0f})"
-        single = f"{100 * self.single:.1f} ± {100 * self.half:.1f} %"
-        return [f"{self.problems}", single, best, f"{1e3 * self.seconds:.0f}"]
+Setting = tuple[int, float, int]
+"""Gradient steps, classifier-free scale, sampling steps."""
+Found = dict[Setting, list[Record]]
 
 
-def success(settings: RobotDiffuseSettings, loaded: RobotDiffuse, cases: list[Case], title: str) -> Share:
-    """Of a batch for each problem; the same random numbers for all settings."""
-    planner = RobotDiffuse(replace(settings, weights=None))
-    single, best, seconds = [], [], []
-    for i, case in enumerate(progress(cases, title)):
-        problem, rng = case.problem, np.random.default_rng([SEED, 5, i])
-        model = loaded.model(problem.robot)
-        assert model is not None
-        checker = CollisionChecker(problem.robot, problem.scene)
-        code = encode(model, checker, settings.points, rng)
-        began = time.process_time()
-        q = planner.sample(model, checker, code, problem.start, goal_of(problem)[None], rng).q
-        seconds.append(time.process_time() - began)
-        passed = judged(problem, q)
-        single.append(passed.mean())
-        best.append(bool(passed.any()))
-    half = 1.96 * float(np.std(single)) / len(cases) ** 0.5
-    return Share(float(np.mean(single)), half, *wilson(best), len(cases), float(np.median(seconds)))
+def name_of(setting: Setting) -> str:
+    gradient, scale, steps = setting
+    guided = f"{gradient} gradient steps" if gradient else "no gradient steps"
+    scaled = "" if scale == 1.0 else f", scale {scale:g}"
+    return f"{guided}{scaled}, {steps} sampling steps"
 
 
-def collision_guidance(loaded: RobotDiffuse, cases: list[Case]) -> dict[int, dict[int, Share]]:
-    """By gradient steps and sampling steps."""
-    found: dict[int, dict[int, Share]] = {}
-    for gradient in GRADIENT_STEPS:
-        found[gradient] = {}
-        for steps in STEPS:
-            if steps >= LONG and gradient not in (0, loaded.settings.guidance_steps):
-                continue
-            settings = replace(loaded.settings, guidance_steps=gradient, sampling_steps=steps)
-            title = f"{gradient} gradient steps, {steps} sampling steps"
-            found[gradient][steps] = success(settings, loaded, cases, title)
-    rows = [
-        [f"{gradient}" if gradient else "none", f"{steps}", *share.row]
-        for gradient, by_steps in found.items()
-        for steps, share in by_steps.items()
-    ]
-    columns = ["gradient steps", "sampling steps", "problems", "single", "best of 16", "CPU ms"]
-    print_table("Collision guidance", columns, rows)
-    return found
+def try_all(loaded: RobotDiffuse, cases: list[Case], settings: Sequence[Setting], title: str) -> Found:
+    """One batch for each problem; the same random numbers for all settings."""
+    methods = {}
+    for gradient, scale, steps in settings:
+        changed = {"guidance_steps": gradient, "guidance_scale": scale, "sampling_steps": steps}
+        planner = RobotDiffuse(replace(loaded.settings, **changed))
+        methods[name_of((gradient, scale, steps))] = sampled(from_network(planner))
+    found = tried(cases, methods, seeds=(5,), title=title)
+    show(summary(f"{title}, {len(cases)} problems", found, (SINGLE, BEST, CPU)), width=WIDTH)
+    return {setting: found[name_of(setting)] for setting in settings}
 
 
-def classifier_free(loaded: RobotDiffuse, cases: list[Case]) -> dict[int, dict[float, dict[int, Share]]]:
-    """By gradient steps (none, and as usual), scale and sampling steps."""
-    usual = loaded.settings.guidance_steps
-    found: dict[int, dict[float, dict[int, Share]]] = {0: {}, usual: {}}
-    for gradient, by_scale in found.items():
-        for scale in SCALES:
-            by_scale[scale] = {}
-            for steps in SCALED_STEPS:
-                settings = replace(
-                    loaded.settings, guidance_steps=gradient, sampling_steps=steps, guidance_scale=scale
-                )
-                title = f"scale {scale}, {gradient} gradient steps, {steps} sampling steps"
-                by_scale[scale][steps] = success(settings, loaded, cases, title)
-    rows = [
-        [f"{scale:g}", f"{gradient}" if gradient else "none", f"{steps}", *share.row]
-        for gradient, by_scale in found.items()
-        for scale, by_steps in by_scale.items()
-        for steps, share in by_steps.items()
-    ]
-    columns = ["scale", "gradient steps", "sampling steps", "problems", "single", "best of 16", "CPU ms"]
-    print_table("Classifier-free guidance", columns, rows)
-    return found
-
-
-def line(axes: Axes, by_steps: dict[int, Share], what: str, place: int, label: str) -> None:
+def line(axes: Axes, found: Found, what: str, place: int, label: str) -> None:
     """Success over sampling steps with its interval; lines stand a little apart."""
-    shares = list(by_steps.values())
-    at = np.array(list(by_steps)) * 1.035 ** (place - 2)
-    middle = np.array([getattr(share, what) for share in shares])
-    if what == "single":
-        half = np.array([share.half for share in shares])
-        low, high = (middle - half).clip(0, 1), (middle + half).clip(0, 1)
-    else:
-        low, high = (np.array([getattr(share, f"best_{end}") for share in shares]) for end in ("low", "high"))
+    at = np.array([steps for *_, steps in found]) * 1.035 ** (place - 2)
+    rows = []
+    for records in found.values():
+        single, best = [r.passed or 0.0 for r in records], [r.solved for r in records]
+        mean, half = float(np.mean(single)), half_width(single)
+        low, high = wilson_interval(sum(best), len(best))
+        rows.append((mean, mean - half, mean + half) if what == "single" else (np.mean(best), low, high))
+    middle, low, high = np.array(rows).clip(0, 1).T
     error = 100 * np.stack([middle - low, high - middle]).clip(0)
     axes.errorbar(at, 100 * middle, error, fmt="o-", color=COLORS[place], label=label, ms=4, elinewidth=0.8)
 
 
-def draw(
-    collision: dict[int, dict[int, Share]],
-    free: dict[int, dict[float, dict[int, Share]]],
-    title: str,
-    file: Path,
-) -> None:
+def draw(collision: Found, free: Found, title: str, file: Path) -> None:
     rows = 2 if free else 1
     figure = Figure(figsize=(11, 4 * rows), layout="constrained")
     panels = figure.subplots(rows, 2, sharey=True, squeeze=False)
     for axes, what, name in zip(panels[0], ("single", "best"), ("single sample", "best of 16"), strict=True):
-        for place, (gradient, by_steps) in enumerate(collision.items()):
+        for place, gradient in enumerate(GRADIENT_STEPS):
             label = f"{gradient} gradient steps" if gradient else "no collision guidance"
-            line(axes, by_steps, what, place, label)
+            line(axes, {s: r for s, r in collision.items() if s[0] == gradient}, what, place, label)
         axes.set_title(f"{name}, {title}")
-    for axes, (gradient, by_scale) in zip(panels[-1], free.items() if free else (), strict=False):
-        for place, (scale, by_steps) in enumerate(by_scale.items()):
-            line(axes, by_steps, "single", place, f"scale {scale:g}")
+    for axes, gradient in zip(panels[-1], sorted({s[0] for s in free}), strict=False):
+        for place, scale in enumerate(SCALES):
+            of = {s: r for s, r in free.items() if s[:2] == (gradient, scale)}
+            line(axes, of, "single", place, f"scale {scale:g}")
         guided = f"{gradient} gradient steps" if gradient else "no collision guidance"
         axes.set_title(f"single sample by classifier-free scale, {guided}")
     for axes in panels.flat:
@@ -186,16 +122,18 @@ def main() -> None:
     print(f"weights: {arguments.weights or 'the bundled ones'}; {arguments.family}")
     cases = draw_cases(arguments.family, arguments.problems, arguments.cases).hard
     loaded = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
-    model = loaded.model(cases[0].problem.robot)
+    model, usual = loaded.model(PANDA), loaded.settings.guidance_steps
     assert model is not None
-    success(loaded.settings, loaded, cases[:1], "compiling")
-    collision = collision_guidance(loaded, cases)
-    free = {}
+    tried(cases[:1], {"": sampled(from_network(loaded))}, title="compiling")
+    grid = [(g, 1.0, n) for g in GRADIENT_STEPS for n in STEPS if n < LONG or g in (0, usual)]
+    collision, free = try_all(loaded, cases, grid, "Collision guidance"), {}
     if model.config.null_condition:
-        free = classifier_free(loaded, cases[: max(len(cases) // 2, 1)])
+        scaled = [(g, scale, n) for g in (0, usual) for scale in SCALES for n in SCALED_STEPS]
+        free = try_all(loaded, cases[: max(len(cases) // 2, 1)], scaled, "Classifier-free guidance")
     else:
         print("Classifier-free guidance: left out, these weights were trained without dropping the condition")
-    print("95 % intervals over the problems; CPU time of a batch of 16, without encoder and judge, median")
+    print("single: of 16 samples; best: problems with one that passes. 95 % intervals over the problems;")
+    print("CPU time of a batch, encoder included, without the judge")
     draw(collision, free, arguments.family, arguments.plot)
 
 

@@ -16,28 +16,27 @@ other where the judge, which is not timed, refuses it.
 
 import argparse
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path as File
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from report import header, print_table, progress
+from searches import Arena
 
-from problems import PANDA, SEED, draw_cases
-from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.compiled import random_state
-from robotdiffuse.collision.kernels.motions import Space, motions_free, path_length
-from robotdiffuse.collision.motion import search_space
-from robotdiffuse.evaluation.trials import NETWORK_ALONE
+from problems import PANDA, Case, draw_cases
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.evaluation.methods import NETWORK_ALONE
+from robotdiffuse.evaluation.tables import Column
+from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial, tried
 from robotdiffuse.paths.shortcut import shortcut
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, encode, unlearned_starts
+from robotdiffuse.planners.robotdiffuse import Candidates, RobotDiffuse, unlearned_starts
 from robotdiffuse.planners.rrt_connect import kernel
 from robotdiffuse.problems.families import FAMILIES, Family, load_family
 from robotdiffuse.problems.families.family import uniform_configurations
-from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.types import Path
 from robotdiffuse.verify import VerifySettings, verifier
 
@@ -48,110 +47,77 @@ NODES = 2_000
 REACH = np.float32(1.0)
 SHORTCUTS = 25
 
-
-class Scene(NamedTuple):
-    problem: Problem
-    checker: CollisionChecker
-    space: Space
-    start: Float[ndarray, "dof"]
-    goals: Float[ndarray, "k dof"]
-    rng: np.random.Generator
-    state: ndarray
-
-
 Paths = list[ndarray | None]
 """One for each goal."""
 
 
-def prepare(problem: Problem, family: Family, count: int, resolution: float, seed: int) -> Scene | None:
-    """With goals; None if not enough of those that were drawn are worth it."""
-    checker, rng = CollisionChecker(PANDA, problem.scene), np.random.default_rng([SEED, 6, seed])
-    space, state = search_space(checker, resolution), random_state(SEED, seed)
-    start, goals = problem.start.astype(np.float32), []
+def with_goals(case: Case, planner: RobotDiffuse, family: Family, count: int, place: int) -> Case | None:
+    """To so many goals; None if not enough of those that were drawn are worth it."""
+    arena, goals = Arena(Trial(case, place, "", 6), planner), []
+    start = case.problem.start.astype(np.float32)
     for _ in range(8 * count):
-        found = uniform_configurations(PANDA, family.region, checker, 1, rng)
+        found = uniform_configurations(PANDA, family.region, arena.checker, 1, arena.rng)
         if not len(found):
             break
         goal = found[0].astype(np.float32)
-        if motions_free(space, np.stack([start, goal])).all():
-            continue
-        if len(search(space, start, goal, state)):
-            goals.append(goal)
+        if not motions_free(arena.space, np.stack([start, goal])).all() and len(search(arena, goal)):
+            goals.append(goal.astype(np.float64))
         if len(goals) == count:
-            whole = Problem(PANDA, problem.scene, problem.start, JointGoal(np.stack(goals)))
-            return Scene(whole, checker, space, start, np.stack(goals), rng, state)
+            return replace(case, problem=replace(case.problem, goal=JointGoal(np.stack(goals))))
     return None
 
 
-def search(space: Space, start: ndarray, goal: ndarray, state: ndarray) -> Float[ndarray, "n dof"]:
-    """No rows if a pair of trees is full without a path."""
-    return kernel.search(space, kernel.make_trees(start, goal[None], NODES), REACH, 2 * NODES, state)
+def search(arena: Arena, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+    """Shortened; no rows if a pair of trees is full without a path."""
+    trees = kernel.make_trees(arena.start, goal[None], NODES)
+    path = kernel.search(arena.space, trees, REACH, 2 * NODES, arena.state)
+    return shortcut(arena.space, path, SHORTCUTS, arena.state) if len(path) else path
 
 
-def by_network(planner: RobotDiffuse, scene: Scene, _seconds: float) -> Paths:
-    model = planner.model(PANDA)
-    assert model is not None
-    count = EACH * len(scene.goals)
-    batch = RobotDiffuse(replace(planner.settings, weights=None, samples=count))
-    code = encode(model, scene.checker, planner.settings.points, scene.rng)
-    found = batch.sample(model, scene.checker, code, scene.start, scene.goals, scene.rng)
-    return shortest_free(planner, scene, found.q, found.free)
+def by_network(arena: Arena, _seconds: float) -> Paths:
+    planner = RobotDiffuse(replace(arena.planner.settings, weights=None, samples=EACH * len(arena.goals)))
+    return shortest_free(arena, arena.sampled(planner, arena.code()))
 
 
-def by_bumps(planner: RobotDiffuse, scene: Scene, _seconds: float) -> Paths:
-    model = planner.model(PANDA)
-    assert model is not None
-    starts = [
-        unlearned_starts(scene.start, goal, EACH, model.config.frames, PANDA, scene.rng)
-        for goal in scene.goals
-    ]
+def by_bumps(arena: Arena, _seconds: float) -> Paths:
+    frames = arena.model.config.frames
+    starts = [unlearned_starts(arena.start, goal, EACH, frames, PANDA, arena.rng) for goal in arena.goals]
     q = np.concatenate(starts).astype(np.float32)
-    return shortest_free(planner, scene, q, np.zeros(len(q), bool))
+    return shortest_free(arena, Candidates(q, np.zeros(len(q), bool), ""))
 
 
-def shortest_free(planner: RobotDiffuse, scene: Scene, q: ndarray, free: ndarray) -> Paths:
+def shortest_free(arena: Arena, found: Candidates) -> Paths:
     """Of the candidates of each goal, which are refined where none is free."""
-    goal_of = np.linalg.norm(q[:, -1, None] - scene.goals, axis=-1).argmin(axis=1)
-    reached = np.zeros(len(scene.goals), bool)
-    reached[goal_of[free]] = True
-    again = ~reached[goal_of]
+    q, free = found.q.copy(), found.free.copy()
+    goal_of = np.linalg.norm(q[:, -1, None] - arena.goals, axis=-1).argmin(axis=1)
+    again = ~np.isin(goal_of, goal_of[free])
     if again.any():
-        refined = planner.refine(scene.checker, q[again])
-        q, free = q.copy(), free.copy()
+        refined = arena.refined(q[again])
         q[again], free[again] = refined.q, refined.free
-    paths: Paths = []
-    for g in range(len(scene.goals)):
-        candidates = q[free & (goal_of == g)]
-        paths.append(min(candidates, key=path_length) if len(candidates) else None)
-    return paths
+    of = [q[free & (goal_of == g)] for g in range(len(arena.goals))]
+    return [min(candidates, key=path_length) if len(candidates) else None for candidates in of]
 
 
-def by_search(_planner: RobotDiffuse, scene: Scene, _seconds: float) -> Paths:
-    paths: Paths = []
-    for goal in scene.goals:
-        path = search(scene.space, scene.start, goal, scene.state)
-        paths.append(shortcut(scene.space, path, SHORTCUTS, scene.state) if len(path) else None)
-    return paths
+def by_search(arena: Arena, _seconds: float) -> Paths:
+    return [path if len(path) else None for path in (search(arena, goal) for goal in arena.goals)]
 
 
-def by_long_search(_planner: RobotDiffuse, scene: Scene, seconds: float) -> Paths:
+def by_long_search(arena: Arena, seconds: float) -> Paths:
     paths: Paths = []
     began = time.process_time()
-    for g, goal in enumerate(scene.goals):
+    for g, goal in enumerate(arena.goals):
         best: ndarray | None = None
-        while best is None or time.process_time() - began < seconds * (g + 1) / len(scene.goals):
-            path = search(scene.space, scene.start, goal, scene.state)
+        while best is None or time.process_time() - began < seconds * (g + 1) / len(arena.goals):
+            path = search(arena, goal)
             if not len(path):
                 break
-            path = shortcut(scene.space, path, SHORTCUTS, scene.state)
-            if best is None or path_length(path) < path_length(best):
-                best = path
-            best = shortcut(scene.space, best, SHORTCUTS, scene.state)
+            best = path if best is None else min(path, best, key=path_length)
+            best = shortcut(arena.space, best, SHORTCUTS, arena.state)
         paths.append(best)
     return paths
 
 
-METHODS: dict[str, Callable[[RobotDiffuse, Scene, float], Paths]] = {
+METHODS: dict[str, Callable[[Arena, float], Paths]] = {
     "network": by_network,
     "bumps": by_bumps,
     "rrt_connect": by_search,
@@ -160,12 +126,22 @@ METHODS: dict[str, Callable[[RobotDiffuse, Scene, float], Paths]] = {
 """In the order of running; they are told the CPU time that the first one took [s]."""
 
 
-def passes(scene: Scene, path: ndarray | None) -> bool:
-    if path is None:
-        return False
-    full = path.astype(np.float64)
-    full[0] = scene.problem.start
-    return verifier(scene.problem, VerifySettings()).path(Path(PANDA.joint_names, full)).valid
+def method(name: str, planner: RobotDiffuse, first_took: dict[int, float]) -> Method:
+    """A record for each goal, with an equal share of the time."""
+
+    def call(trial: Trial) -> Iterator[Fields]:
+        arena, names = Arena(trial, planner), PANDA.joint_names
+        judge = verifier(trial.problem, VerifySettings())
+        with Clock() as clock:
+            paths = METHODS[name](arena, first_took.get(trial.place, 0.1))
+        first_took.setdefault(trial.place, clock.cpu)
+        for g, path in enumerate(paths):
+            passed = path is not None and judge.path(Path(names, arena.ends.complete(path))).valid
+            about = {"name": f"{trial.case.name}#{g}", "time": clock.wall, "cpu": clock.cpu / len(paths)}
+            length = {"joint_length": float(path_length(path))} if passed else {}
+            yield about | length | {"status": "solved" if passed else "no_path"}
+
+    return call
 
 
 def main() -> None:
@@ -179,52 +155,34 @@ def main() -> None:
     print(header("numpy", "numba", "torch"))
     print(f"weights: {arguments.weights or 'the bundled ones'}")
     planner = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
-    family = load_family(arguments.family)
-    cases = draw_cases(arguments.family, arguments.problems, arguments.cases).hard
-    resolution = planner.settings.resolution
-    scenes = [
-        scene
-        for i, case in enumerate(progress(cases, "goals"))
-        if (scene := prepare(case.problem, family, arguments.goals, resolution, i)) is not None
-    ]
-    if not scenes:
+    family, count = load_family(arguments.family), arguments.goals
+    drawn = enumerate(draw_cases(arguments.family, arguments.problems, arguments.cases).hard)
+    found = [with_goals(case, planner, family, count, i) for i, case in progress(list(drawn), "goals")]
+    cases = [case for case in found if case is not None]
+    if not cases:
         print("no scene leaves so many goals; ask for fewer")
         return
-    for method in METHODS.values():
-        method(planner, scenes[0], 0.1)  # compiles
-    lengths = {name: np.full((len(scenes), arguments.goals), np.nan) for name in METHODS}
-    seconds = dict.fromkeys(METHODS, 0.0)
-    for i, scene in enumerate(progress(scenes, "methods")):
-        spent = 0.0
-        for name, method in METHODS.items():
-            began = time.process_time()
-            paths = method(planner, scene, spent)
-            took = time.process_time() - began
-            seconds[name] += took
-            spent = spent or took
-            for g, path in enumerate(paths):
-                if path is not None and passes(scene, path):
-                    lengths[name][i, g] = path_length(path)
+    tried(cases[:1], {name: method(name, planner, {0: 0.1}) for name in METHODS}, title="compiling")
+    took: dict[int, float] = {}
+    records = tried(cases, {name: method(name, planner, took) for name in METHODS}, seeds=(6,))
+    lengths = {name: np.array([r.joint_length or np.nan for r in of]) for name, of in records.items()}
     every = np.isfinite(np.stack(list(lengths.values()))).all(axis=0)
     rows = []
-    for name, found in lengths.items():
-        reached = np.isfinite(found)
-        rows.append(
-            [
-                name,
-                f"{100 * reached.mean():.1f} %",
-                f"{1e3 * seconds[name] / len(scenes):.0f}",
-                f"{reached.sum() / seconds[name]:.0f}",
-                f"{found[every].mean():.3f}" if every.any() else "",
-            ]
-        )
-    columns = ["", "goals reached", "CPU ms a scene", "goals per s", "length, rad*"]
-    print_table(
-        f"{arguments.goals} goals in one scene, {len(scenes)} scenes of {arguments.family}", columns, rows
+    for name, of in records.items():
+        reached, seconds = np.isfinite(lengths[name]), sum(record.cpu or 0.0 for record in of)
+        length = float(lengths[name][every].mean()) if every.any() else None
+        rate = float(reached.sum() / seconds)
+        rows.append((name, float(reached.mean()), seconds / len(cases), rate, length))
+    columns = (
+        "",
+        Column("goals reached", "%", ".1f", "more", scale=100.0),
+        Column("CPU ms a scene", "", ".0f", scale=1000.0),
+        Column("goals per s", "", ".0f", "more"),
+        Column("length, rad*", "", ".3f", "less"),
     )
-    print("* of the motions to goals that all methods reach")
-    best = max(METHODS, key=lambda name: np.isfinite(lengths[name]).sum() / seconds[name])
-    print(f"most goals per second: {best}")
+    title = f"{arguments.goals} goals in one scene, {len(cases)} scenes of {arguments.family}"
+    print_table(title, columns, rows, ["* of the motions to goals that all methods reach"])
+    print(f"most goals per second: {max(rows, key=lambda row: row[3])[0]}")
 
 
 if __name__ == "__main__":

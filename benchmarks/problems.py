@@ -11,19 +11,15 @@ import argparse
 from pathlib import Path as File
 from typing import NamedTuple
 
-from jaxtyping import Bool, Float
-from numpy import ndarray
 from rich.console import Console
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation import trials
 from robotdiffuse.evaluation.problem_sets import RUNS, SEARCH_TIME, case_file, judge, search
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import SEED, Case, goal_of
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 
-__all__ = ["PANDA", "RUNS", "SEARCH_TIME", "SEED", "Case", "draw_cases", "families_of", "goal_of", "judged"]
+__all__ = ["PANDA", "RUNS", "SEARCH_TIME", "SEED", "Case", "draw_cases", "families_of", "goal_of"]
 
 PANDA = load_robot("panda")
 
@@ -45,11 +41,6 @@ def draw_cases(family: str, count: int, folder: File | None = None) -> Drawn:
     drawn = kept.held_out(family, 1 + int(hard[-1].name.partition("/")[2]), judge)
     cases = [case for case in drawn if case.trivial or case.hard]
     return Drawn(hard, cases, len(drawn) - len(cases))
-
-
-def judged(problem: Problem, q: Float[ndarray, "count frames dof"]) -> Bool[ndarray, "count"]:
-    """Which trajectories, taken frame by frame as they are, pass the judge."""
-    return trials.judged(problem, q)[0]
 
 
 def families_of(text: str) -> list[str]:

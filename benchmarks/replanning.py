@@ -9,16 +9,17 @@ random direction, while the arm waits at the start. The path's cost must be that
 
 import argparse
 import time
+from collections.abc import Iterator
 from dataclasses import replace
-from itertools import count
 
 import numpy as np
-from report import header, print_table, progress
+from report import header, print_table
 
+from problems import goal_of
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.problem_sets import judge
+from robotdiffuse.evaluation.problem_sets import case_file, judge
+from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial, tried
 from robotdiffuse.planners.lattice.planner import DStarLiteSearch, DStarLiteSettings, Outcome
-from robotdiffuse.problems.held_out import SEED, goal_of, held_out_problem, line_length
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
 
@@ -28,18 +29,19 @@ PATIENCE = 3.0
 """CPU time of a search until it is given up [s]."""
 
 
-def search(problem: Problem) -> DStarLiteSearch:
-    """A search that has not begun."""
+def begun(problem: Problem) -> DStarLiteSearch:
+    """A search that has not run yet."""
     checker = CollisionChecker(problem.robot, problem.scene)
     return DStarLiteSearch(checker, problem.start, goal_of(problem)[None], DStarLiteSettings())
 
 
-def ran(found: DStarLiteSearch) -> tuple[Outcome | None, float, int]:
-    """How it ended, None if it was given up; CPU time [s]; expansions."""
-    began, before = time.process_time(), found.expansions
-    outcome = found.run(lambda: time.process_time() - began > PATIENCE)
-    ended = None if outcome is Outcome.GOING else outcome
-    return ended, time.process_time() - began, found.expansions - before
+def ran(search: DStarLiteSearch) -> tuple[float | None, float, int]:
+    """Cost of the path, None without one; CPU time [s]; expansions."""
+    before, until = search.expansions, time.process_time() + PATIENCE
+    with Clock() as clock:
+        outcome = search.run(lambda: time.process_time() > until)
+    cost = search.cost if outcome is Outcome.FOUND else None
+    return cost, clock.cpu, search.expansions - before
 
 
 def with_one_moved(problem: Problem, distance: float, rng: np.random.Generator) -> Problem | None:
@@ -53,42 +55,44 @@ def with_one_moved(problem: Problem, distance: float, rng: np.random.Generator) 
     return replace(problem, scene=scene) if CollisionChecker(problem.robot, scene).free(ends).all() else None
 
 
+def repaired(distance: float) -> Method:
+    """Ratios of the repair to a search anew; none where an end is in collision, or there is no path."""
+
+    def call(trial: Trial) -> Iterator[Fields]:
+        moved = with_one_moved(trial.problem, distance, trial.rng())
+        cost, seconds, expansions = (None, 0.0, 0) if moved is None else ran(begun(moved))
+        found: Fields = {"status": "timeout", "time": 0.0}
+        if moved is not None and cost is not None:
+            search = begun(trial.problem)
+            search.run()
+            with Clock() as clock:
+                search.update(CollisionChecker(moved.robot, moved.scene))
+            again, more, expanded = ran(search)
+            found |= {"status": "solved", "same": float(again == cost), "expansions": expanded / expansions}
+            found["seconds"] = (clock.cpu + more) / seconds
+        yield found
+
+    return call
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Repairs of D* Lite against searches anew.")
     parser.add_argument("--problems", type=int, default=40, help="(40)")
     arguments = parser.parse_args()
     print(header("numba", "numpy"))
-    solvable = []
-    for index in count():
-        problem = held_out_problem("rop", index)
-        if line_length(problem, judge) is None and ran(search(problem))[0] is Outcome.FOUND:
-            solvable.append(problem)
-        if len(solvable) == arguments.problems:
-            break
-    rng, rows = np.random.default_rng(SEED), []
-    for distance in MOVES:
-        expanded, seconds, same, left_out = [], [], 0, 0
-        for problem in progress(solvable, f"{100 * distance:g} cm"):
-            moved = with_one_moved(problem, distance, rng)
-            if moved is None:
-                left_out += 1
-                continue
-            repaired, fresh = search(problem), search(moved)
-            repaired.run()
-            outcome, fresh_seconds, fresh_expansions = ran(fresh)
-            if outcome is not Outcome.FOUND:
-                left_out += 1
-                continue
-            began = time.process_time()
-            repaired.update(CollisionChecker(moved.robot, moved.scene))
-            updated = time.process_time() - began
-            _, repair_seconds, repair_expansions = ran(repaired)
-            same += repaired.cost == fresh.cost
-            expanded.append(repair_expansions / fresh_expansions)
-            seconds.append((updated + repair_seconds) / fresh_seconds)
-        ratios = [np.percentile(values, (50, 90)) for values in (expanded, seconds)]
+    found, number = [], arguments.problems
+    kept = case_file(None, "rop")
+    while len(found) < arguments.problems:
+        found = [c for c in kept.held_out("rop", number, judge) if not c.trivial and ran(begun(c.problem))[0]]
+        number += arguments.problems
+    methods = {f"{100 * distance:g} cm": repaired(distance) for distance in MOVES}
+    rows = []
+    for name, records in tried(found[: arguments.problems], methods, title="obstacles moved").items():
+        done = [record.measures for record in records if record.solved]
+        ratios = [np.percentile([of[what] for of in done], (50, 90)) for what in ("expansions", "seconds")]
         shares = (f"{median:.2f} ({most:.2f})" for median, most in ratios)
-        rows.append([f"{100 * distance:g} cm", f"{len(expanded)}", f"{left_out}", f"{same}", *shares])
+        same = sum(of["same"] for of in done)
+        rows.append((name, len(done), len(records) - len(done), f"{same:.0f}", *shares))
     columns = ["obstacle moved by", "problems", "left out", "same cost", "expansions*", "CPU time*"]
     print_table("Repair of D* Lite over a search anew", columns, rows)
     print("* median of the ratios, and the 90 % that are below. Left out: an end in collision, or no path.")

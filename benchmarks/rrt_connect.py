@@ -9,122 +9,113 @@ Prints the report that is kept in benchmarks/results/rrt_connect.txt. FOLDER hol
 
 import argparse
 import json
-import time
+from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 from report import header, print_table
-from rich.progress import track
 
+from problems import PANDA, Case, goal_of
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import path_length
 from robotdiffuse.collision.motion import search_space
-from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.methods import planned
+from robotdiffuse.evaluation.problem_sets import gather_cases
+from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.tables import Column
+from robotdiffuse.evaluation.trial import Clock, Fields, Trial, tried
 from robotdiffuse.paths.shortcut import shortcut
+from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import Ends, RRTConnect, RRTConnectSettings
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect, RRTConnectSettings
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
-from robotdiffuse.problems.files import load_motion_bench_maker
-from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.robots import load_robot
 
 SEED = 20261122
+SETTINGS = RRTConnectSettings()
 
 
-def search_seconds(problem: Problem, settings: RRTConnectSettings) -> float:
-    """CPU time of the compiled part of one call: two searches and the shortcuts [s]."""
-    checker = CollisionChecker(problem.robot, problem.scene)
-    assert isinstance(problem.goal, JointGoal)
-    ends = Ends(checker, problem.start, problem.goal.positions)
+def compiled_part(trial: Trial) -> Iterator[Fields]:
+    """Two searches and the shortcuts of one call, without set-up and judge."""
+    checker = CollisionChecker(PANDA, trial.problem.scene)
+    ends = Ends(checker, trial.problem.start, goal_of(trial.problem)[None])
     start, goals = ends.rows()
-    clearance = ends.kept_clearance(settings.clearance)
-    space, state = search_space(checker, settings.resolution, clearance), random_state(0)
-    began = time.process_time()
-    best = None
-    for _ in range(settings.searches):
-        trees = kernel.make_trees(start, goals, settings.capacity)
-        path = kernel.search(space, trees, np.float32(settings.reach), 1_000_000, state)
-        if best is None or path_length(path) < path_length(best):
-            best = path
-    shortcut(space, best, settings.shortcuts, state)
-    return time.process_time() - began
+    clearance = ends.kept_clearance(SETTINGS.clearance)
+    space, state = search_space(checker, SETTINGS.resolution, clearance), random_state(0)
+    paths = []
+    with Clock() as clock:
+        for _ in range(SETTINGS.searches):
+            trees = kernel.make_trees(start, goals, SETTINGS.capacity)
+            paths.append(kernel.search(space, trees, np.float32(SETTINGS.reach), 1_000_000, state))
+        shortcut(space, min(paths, key=path_length), SETTINGS.shortcuts, state)
+    yield {"status": "solved", **clock.fields}
 
 
-def motion_bench_maker(folder: Path, lengths: dict[str, dict[str, float]]) -> None:
-    rows, names = [], sorted(path.name for path in folder.iterdir() if path.is_dir())
-    total: dict[str, list] = {key: [] for key in ("once", "long", "search", "plan", "simplified", "best")}
-    loaded, free, spheres_free, solved, solved_long = 0, 0, 0, 0, 0
-    for name in names:
-        family: dict[str, list] = {key: [] for key in total}
-        count = 0
-        for entry in track(load_motion_bench_maker(folder / name), name, transient=True):
-            try:
-                problem = entry.load()
-            except InputError as error:
-                print(f"left out: {entry.name}: {str(error).partition(': ')[2]}")
-                continue
-            count += 1
-            assert isinstance(problem.goal, JointGoal)
-            ends = np.concatenate([problem.start[None], problem.goal.positions[:1]])
-            free += not ExactCollision(problem.robot, problem.scene).collides(ends).any()
-            spheres_free += CollisionChecker(problem.robot, problem.scene).free(ends).all()
-            once = RRTConnect().plan(problem, 5.0)
-            longer = RRTConnect(RRTConnectSettings(optimize_time=0.05)).plan(problem, 5.0)
-            solved += once.solved
-            solved_long += longer.solved
-            if not (once.solved and longer.solved):
-                print(f"not solved: {entry.name}: {once.reason}; {longer.reason}")
-                continue
-            family["search"].append(search_seconds(problem, RRTConnectSettings()))
-            family["plan"].append(once.planning_time)
-            known = lengths.get(f"{name.removesuffix('_panda')}/{entry.name[-4:]}")
-            if known is not None:
-                family["once"].append(once.path_length)
-                family["long"].append(longer.path_length)
-                family["simplified"].append(known["rrtc_simplified"])
-                family["best"].append(known["best_known"])
-        loaded += count
-        rows.append([f"{name} ({count})", *figures(family)])
-        for key, values in family.items():
-            total[key] += values
-    rows.append([f"all ({loaded})", *figures(total)])
-    columns = ["problems", "search ms*", "plan ms", "length", "VAMP", "ratio", "50 ms", "best known", "ratio"]
-    print_table("MotionBenchMaker", columns, rows)
-    print(f"start and goal free: {free} by mesh, {spheres_free} by covering spheres, of {loaded} loaded")
-    print(f"solved and verified: {solved} of {loaded}; with 50 ms of restarts {solved_long}")
+def motion_bench_maker(folder: Path, known: dict[str, dict[str, float]]) -> None:
+    with TemporaryDirectory() as kept:
+        cases = gather_cases([str(folder)], None, Path(kept), print)
+    longer = RRTConnect(RRTConnectSettings(optimize_time=0.05))
+    methods = {"once": planned(RRTConnect()), "longer": planned(longer), "search": compiled_part}
+    found = tried(cases, methods, limit=5.0, title="MotionBenchMaker")
+    by_name = {(name, record.name): record for name, records in found.items() for record in records}
+    solved = [case for case in cases if all(by_name[name, case.name].solved for name in ("once", "longer"))]
+    for case in cases:
+        if case not in solved:
+            print(f"not solved: {case.name}: {by_name['once', case.name].reason}")
+
+    def figures(of: list[Case]) -> list[float]:
+        def seconds(name: str, what: str) -> float:
+            return float(np.median([getattr(by_name[name, case.name], what) for case in of]))
+
+        named = [(case, known.get(f"{case.family.removesuffix('_panda')}/{case.name[-4:]}")) for case in of]
+        pairs = [(case, lengths) for case, lengths in named if lengths is not None]
+        once, long = (
+            float(np.mean([by_name[name, c.name].joint_length or np.nan for c, _ in pairs] or [np.nan]))
+            for name in ("once", "longer")
+        )
+        simplified, best = (
+            float(np.mean([lengths[name] for _, lengths in pairs] or [np.nan]))
+            for name in ("rrtc_simplified", "best_known")
+        )
+        times = seconds("search", "cpu"), seconds("once", "time")
+        return [*times, once, simplified, once / simplified, long, best, long / best]
+
+    families = sorted({case.family for case in solved})
+    by_family = [(family, [case for case in solved if case.family == family]) for family in families]
+    rows = [(f"{family} ({len(of)})", *figures(of)) for family, of in by_family]
+    rows.append((f"all ({len(solved)})", *figures(solved)))
+    ms = (Column(name, "ms", ".2f", scale=1e3) for name in ("search*", "plan"))
+    names = ("length", "VAMP", "ratio", "50 ms", "best known", "ratio")
+    print_table("MotionBenchMaker", ["problems", *ms, *(Column(name, "", ".3f") for name in names)], rows)
+    ends = [(case.problem, np.stack([case.problem.start, goal_of(case.problem)])) for case in cases]
+    free = sum(not ExactCollision(PANDA, problem.scene).collides(q).any() for problem, q in ends)
+    spheres = sum(CollisionChecker(PANDA, problem.scene).free(q).all() for problem, q in ends)
+    print(f"start and goal free: {free} by mesh, {spheres} by covering spheres, of {len(cases)} loaded")
+    once, longer = (sum(record.solved for record in found[name]) for name in ("once", "longer"))
+    print(f"solved and verified: {once} of {len(cases)}; with 50 ms of restarts {longer}")
     print("* compiled search and shortcuts, CPU time; plan: with set-up, ends and judge, wall time; medians")
 
 
-def figures(data: dict[str, list]) -> list[str]:
-    mean = {key: float(np.mean(values)) for key, values in data.items()}
-    times = [f"{1e3 * np.median(data[key]):.2f}" for key in ("search", "plan")]
-    once = [f"{mean['once']:.3f}", f"{mean['simplified']:.3f}", f"{mean['once'] / mean['simplified']:.3f}"]
-    return [*times, *once, f"{mean['long']:.3f}", f"{mean['best']:.3f}", f"{mean['long'] / mean['best']:.3f}"]
-
-
 def rop(count: int) -> None:
-    robot, rows = load_robot("panda"), []
     ten = Rop(obstacles=(10, 10), sphere_radius=ROP_DENSE.sphere_radius, cube_side=ROP_DENSE.cube_side)
-    for title, settings in (("ROP, 2 obstacles", ROP), ("ROP, 10 obstacles", ten)):
-        one, ten_seconds, times = [], [], []
-        for i in track(range(count), title, transient=True):
-            problem = settings.draw(robot, np.random.default_rng([SEED, i])).problem(robot)
-            result = RRTConnect().plan(problem, 1.0, seed=0)
-            one.append(result.solved)
-            times.append(result.planning_time)
-            # the reference searches with another seed, and only where the first call failed
-            ten_seconds.append(result.solved or RRTConnect().plan(problem, 10.0, seed=1).solved)
-        rows.append(
-            [
-                title,
-                f"{sum(one)} of {count}",
-                f"{sum(ten_seconds)} of {count}",
-                f"{1e3 * np.median(times):.2f} / {1e3 * np.percentile(times, 95):.2f}",
-            ]
-        )
+    rows = []
+    for title, family in (("ROP, 2 obstacles", ROP), ("ROP, 10 obstacles", ten)):
+        drawn = (family.draw(PANDA, np.random.default_rng([SEED, i])).problem(PANDA) for i in range(count))
+        cases = [Case(f"{title}/{i}", title, problem, False) for i, problem in enumerate(drawn)]
+
+        def solved(of: list[Case], limit: float, seed: int, title: str = title) -> list[Record]:
+            return tried(of, {title: planned(RRTConnect())}, (seed,), limit, title=title)[title]
+
+        first = solved(cases, 1.0, 0)
+        # the reference searches with another seed, and only where the first call failed
+        failed = [case for case, record in zip(cases, first, strict=True) if not record.solved]
+        later = sum(record.solved for record in solved(failed, 10.0, 1))
+        times = 1e3 * np.percentile([record.time for record in first], (50, 95))
+        in_one, plan = count - len(failed), f"{times[0]:.2f} / {times[1]:.2f}"
+        rows.append((title, f"{in_one} of {count}", f"{in_one + later} of {count}", plan))
     print_table("Fresh ROP problems", ["", "solved in 1 s", "solved in 10 s", "plan ms median / p95"], rows)
 
 

@@ -55,6 +55,7 @@ class JsonLines:
         line, for any other line that is no JSON object."""
         self.rows: list[dict[str, Any]] = []
         self._file = file
+        self._mended: bytes | None = None
         if file is None or not file.is_file():
             return
         content = file.read_bytes()
@@ -65,7 +66,7 @@ class JsonLines:
             except (ValueError, TypeError) as error:
                 raise InputError(f"{file}, line {number} is no JSON object: {error}") from None
         if whole != content:
-            write_atomically(file, whole)
+            self._mended = whole
 
     def replace(self, rows: list[dict[str, Any]]) -> None:
         """Write these in place of what is there, whole or not at all."""
@@ -77,6 +78,9 @@ class JsonLines:
         self.rows.append(row)
         if self._file is None:
             return
+        if self._mended is not None:  # only now: another process may be about to end that line
+            write_atomically(self._file, self._mended)
+            self._mended = None
         self._file.parent.mkdir(parents=True, exist_ok=True)
         with self._file.open("a") as stream:
             stream.write(json.dumps(row) + "\n")

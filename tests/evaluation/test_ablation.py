@@ -11,7 +11,6 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import ablation
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.statistics import bootstrap_interval
-from robotdiffuse.evaluation.trials import Tried
 from robotdiffuse.learning.denoisers import DENOISERS, Transformer
 from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.motion_model import MotionModel
@@ -74,15 +73,6 @@ def test_bootstrap_covers_the_mean() -> None:
         low, high = bootstrap_interval(rng.normal(1.0, 2.0, 80), seed=i)
         covered += low < 1.0 < high
     assert 50 <= covered <= 60
-
-
-def test_a_trial_is_kept_for_what_it_was_of(tmp_path: Path) -> None:
-    figures = Tried(*(np.random.default_rng(0).random((5, 4)).round(3)))
-    figures.save(tmp_path / "tried.json", {"weights": "a", "problems": 4})
-    found = Tried.load(tmp_path / "tried.json", {"problems": 4, "weights": "a"})
-    assert found is not None and np.array_equal(found.length, figures.length)
-    assert Tried.load(tmp_path / "tried.json", {"problems": 4, "weights": "b"}) is None
-    assert Tried.load(tmp_path / "other.json", {"problems": 4, "weights": "a"}) is None
 
 
 def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

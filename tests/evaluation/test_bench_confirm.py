@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from robotdiffuse.cli import main
-from robotdiffuse.evaluation.bench.records import Record, RecordFile
 from robotdiffuse.evaluation.problem_sets import gather_cases
+from robotdiffuse.evaluation.records import Record, RecordFile, record_path
 from robotdiffuse.planners.rrt_connect.planner import RRTConnect
 from robotdiffuse.problems.problem import JointGoal
 
@@ -28,9 +28,7 @@ def folder(tmp_path: Path) -> Path:
         replace(about, planner="bad", positions=tuple(map(tuple, line))),
         replace(about, planner="none", status="timeout"),
     ):
-        file = RecordFile(tmp_path / "records" / f"{record.planner}.jsonl")
-        file.append(record)
-        file.close()
+        RecordFile(record_path(tmp_path, record.planner)).append(record)
     return tmp_path
 
 
@@ -46,7 +44,7 @@ def test_motions_are_looked_at_again(folder: Path, capsys: pytest.CaptureFixture
 
 def test_folder_without_results_or_problems(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "confirm", str(folder / "nothing")]) == 2
-    assert "holds no results" in capsys.readouterr().err
+    assert "holds no records" in capsys.readouterr().err
     (folder / "problems" / "rop.jsonl").unlink()
     assert main(["bench", "confirm", str(folder), "--count", "1"]) == 2
     assert "of rop_nontrivial, which has results" in capsys.readouterr().err

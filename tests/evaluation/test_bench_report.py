@@ -11,10 +11,11 @@ import pytest
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench import figures, page, plots, report
-from robotdiffuse.evaluation.bench.figures import GAVE_UP, LATER, RAN_OUT, counting, outcome
-from robotdiffuse.evaluation.bench.records import Record, record_from_json
+from robotdiffuse.evaluation.bench.figures import GAVE_UP, LATER, RAN_OUT, Bench, counting, outcome
 from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
 from robotdiffuse.evaluation.problem_sets import case_file
+from robotdiffuse.evaluation.records import RESTARTED, Record, record_of_row, record_path
+from robotdiffuse.evaluation.tables import Table
 from robotdiffuse.problems.held_out import Case, held_out_problem
 from robotdiffuse.types import Path as Motion
 
@@ -88,8 +89,8 @@ def write(folder: Path, records: list[Record], counts: dict[float, int | None] |
     """A run for each time limit, of all its planners; `counts`: problems that it was given, if not all."""
     (folder / "records").mkdir(parents=True)
     for record in records:
-        with (folder / "records" / f"{record.planner}.jsonl").open("a") as stream:
-            stream.write(record.line())
+        with record_path(folder, record.planner).open("a") as stream:
+            stream.write(json.dumps(record.row()) + "\n")
     for limit in sorted({record.time_limit for record in records}):
         planners = sorted({record.planner for record in records if record.time_limit == limit})
         run = RUN | {"planners": planners, "time_limit": limit, "count": (counts or {}).get(limit)}
@@ -250,6 +251,111 @@ def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) 
     assert star.ratios[-1] == 1.5
 
 
+def cells(table: Table, heading: str) -> dict[str, str]:
+    column = [column.title.strip() for column in table.columns].index(heading)
+    return {row[0]: row[column] for row in table.texts}
+
+
+def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
+    """Planners that end early are restarted, in rows of their own; what used up its time needs none."""
+    records = []
+    for i in range(3):
+        name = f"rop/{i}"
+        records += [
+            solved("robotdiffuse", name, 1.0, [(0.05, 2.0)]),
+            solved("robotdiffuse" + RESTARTED, name, 1.0, [(0.05, 2.0), (0.6, 1.6)], 0.99, restarts=19),
+            solved("rrt_connect", name, 1.0, [(0.01, 2.4)]),
+            solved("rrt_connect" + RESTARTED, name, 1.0, [(0.01, 2.4), (0.3, 1.8)], 0.99, restarts=90),
+            solved("ompl_aorrtc", name, 1.0, [(0.01, 2.4), (0.3, 1.6)], 0.99),
+        ]
+    bench = figures.read_bench(write(tmp_path / "run", records))
+    assert list(bench.records)[:2] == ["robotdiffuse", "robotdiffuse+restarts"]
+    section = figures.sections(bench)[-1]
+    table = report.main_table(section, section.main, bench.reference)
+    assert cells(table, "ratio to robotdiffuse: hybrid, restarted") == {
+        "robotdiffuse: hybrid": "–",
+        "robotdiffuse: hybrid, restarted": "1",
+        "rrt_connect": "–",
+        "rrt_connect, restarted": "1.125",
+        "ompl_aorrtc": "1.000",
+    }
+    assert cells(table, "ComScore")["rrt_connect, restarted"] == "–"
+    tenth = report.main_table(section, section.comparisons[0], bench.reference)
+    assert cells(tenth, "ratio to robotdiffuse: hybrid, restarted")["rrt_connect, restarted"] == "1.200"
+    plain = figures.read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
+    assert len(plain.records) == 4
+    alone = Bench(plain.folder, plain.runs, {n: r for n, r in plain.records.items() if RESTARTED not in n})
+    section = figures.sections(alone)[-1]
+    table = report.main_table(section, section.main, alone.reference)
+    assert cells(table, "ratio to robotdiffuse: hybrid") == {
+        "robotdiffuse: hybrid": "1",
+        "rrt_connect": "1.200 †",
+    }
+    assert report.UNEQUAL_NOTE in table.notes
+
+
+def test_a_call_that_used_up_its_time_stands_for_its_restarts(tmp_path: Path) -> None:
+    records = [
+        solved("rrt_connect", "rop/0", 1.0, [(0.01, 2.4)]),
+        solved("rrt_connect" + RESTARTED, "rop/0", 1.0, [(0.01, 2.4), (0.3, 1.8)], 0.99, restarts=90),
+        failed("rrt_connect", "rop/1", 1.0, 1.0),
+    ]
+    bench = figures.read_bench(write(tmp_path / "run", records))
+    again = bench.records["rrt_connect" + RESTARTED]
+    assert [record.name for record in again] == ["rop/0", "rop/1"]
+    assert {record.planner for record in again} == {"rrt_connect+restarts"}
+
+
+def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: Path) -> None:
+    names = [f"rop/{i}" for i in range(3)]
+    first = [solved("robotdiffuse", n, 1.0, [(0.05, 2.0)], run="a", load=1.5) for n in names]
+    same = [solved("rrt_connect", n, 1.0, [(0.05, 2.0)], run="a", load=2.25) for n in names]
+    other = [solved("mpd", n, 1.0, [(0.05, 2.0)], run="b", load=0.5) for n in names]
+    folder = write(tmp_path / "run", [*first, *same, *other])
+    runs = [
+        RUN | {"planners": [], "time_limit": 1.0, "count": 3, "run": r, "workers": w}
+        for r, w in (("a", 2), ("b", 1))
+    ]
+    (folder / "runs.jsonl").write_text("".join(json.dumps(run) + "\n" for run in runs))
+    bench = figures.read_bench(folder)
+    (section,) = figures.sections(bench, [1.0])
+    table = report.main_table(section, section.main, bench.reference)
+    assert cells(table, "timed") == {
+        "robotdiffuse: hybrid": "run 1, 2 at once",
+        "rrt_connect": "run 1, 2 at once",
+        "mpd": "run 2, 1 at once",
+    }
+    assert "Not all rows were timed alike" in table.notes[0]
+    bench = figures.read_bench(folder, ["robotdiffuse", "rrt_connect"])
+    (section,) = figures.sections(bench, [1.0])
+    table = report.main_table(section, section.main, bench.reference)
+    assert table.columns[-1].heading == "ComScore"
+    assert table.notes[0] == "All rows were timed alike: run 1, 2 at once; load average 1.5 to 2.2."
+
+
+def test_runs_that_noted_nothing_with_their_calls_are_told_by_what_they_called(tmp_path: Path) -> None:
+    names = [f"rop/{i}" for i in range(3)]
+    records = [solved(p, n, 1.0, [(0.05, 2.0)]) for p in ("robotdiffuse", "mpd") for n in names]
+    folder = write(tmp_path / "run", records)
+    run = RUN | {"planners": ["robotdiffuse"], "time_limit": 1.0, "count": 3, "workers": 2}
+    with (folder / "runs.jsonl").open("a") as stream:
+        stream.write(json.dumps(run) + "\n")
+    (section,) = figures.sections(figures.read_bench(folder), [1.0])
+    table = report.main_table(section, section.main, "robotdiffuse")
+    assert cells(table, "timed") == {
+        "robotdiffuse: hybrid": "run 1 or 2, 1 or 2 at once",
+        "mpd": "run 1, 1 at once",
+    }
+
+
+def test_planners_are_called_what_they_are() -> None:
+    assert report.named("diffusion:guidance_steps=0:samples=4") == (
+        "diffusion: RobotDiffuse (paper's method), guidance_steps=0, samples=4"
+    )
+    assert report.named("rrt_connect:step=0.5+restarts") == "rrt_connect, step=0.5, restarted"
+    assert report.named("mpnet@mine") == "mpnet@mine"
+
+
 def test_a_metric_is_declared_in_one_place(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -261,8 +367,8 @@ def test_a_metric_is_declared_in_one_place(
     line = np.stack([problem.start, problem.start + 0.1, problem.start])
     measured = Measure(problem.robot)(Motion(problem.robot.joint_names, line))
     record = solved("robotdiffuse", "rop/9", 1.0, [(0.1, 0.5)], measures=measured)
-    assert json.loads(record.line())["waypoint_count"] == 3
-    assert record_from_json(json.loads(record.line())) == record
+    assert record.row()["waypoint_count"] == 3
+    assert record_of_row(json.loads(json.dumps(record.row()))) == record
     bench = figures.read_bench(write(tmp_path / "run", [record]))
     parts = figures.sections(bench, [1.0])
     assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown(bench, parts))
@@ -288,15 +394,23 @@ def test_latex_is_escaped_and_every_row_has_all_columns(small: Path) -> None:
 
 
 def test_the_paper_stands_beside_ours(small: Path) -> None:
+    with record_path(small, "diffusion").open("w") as stream:
+        for i in range(4):
+            record = solved("diffusion", f"rop/{i}", 1.0, [(0.3, 2.5)], trivial=i == 3)
+            stream.write(json.dumps(record.row()) + "\n")
     bench = figures.read_bench(small)
     whole, _ = figures.sections(bench)
     table = report.paper_table(whole, whole.main)
     assert table is not None
     headings = [column.heading for column in table.columns]
     of = {row[0]: dict(zip(headings, row, strict=True)) for row in table.texts}
-    assert of["ompl_rrt_star (RRT*)"]["paper: success"] == "73.3"
-    assert of["ompl_rrt_star (RRT*)"]["paper: returns"] == "600"
-    assert of["robotdiffuse (RobotDiffuse)"]["paper: ComScore"] == "0.765"
+    assert of["ompl_rrt_star: RRT*"]["paper: success"] == "73.3"
+    assert of["ompl_rrt_star: RRT*"]["paper: returns"] == "600"
+    assert of["diffusion: RobotDiffuse (paper's method)"]["paper: ComScore"] == "0.765"
+    assert of["robotdiffuse: hybrid"]["paper: ComScore"] == "–"
+    assert list(of)[-1] == "robotdiffuse: hybrid"
+    alike = {name: cells["ComScore"] for name, cells in of.items()}
+    assert alike["diffusion: RobotDiffuse (paper's method)"] < alike["robotdiffuse: hybrid"]
     text = report.markdown(bench, [whole])
     widths = [line.count("|") - line.count("\\|") for line in text.splitlines() if line.startswith("| robot")]
     assert max(widths) == 12
@@ -313,7 +427,7 @@ def test_the_command_writes_everything(
     assert "rop, non-trivial, 10 s: 3 problems" in said
     assert "ompl_rrt_star" in said
     page = (out / "index.html").read_text()
-    for name in ("robotdiffuse", "mpnet", "ompl_rrt_star"):
+    for name in ("robotdiffuse: hybrid", "mpnet", "ompl_rrt_star"):
         assert page.count(f">{name}<") >= 4
     assert "http" not in re.sub(r'xmlns(:\w+)?="[^"]*"|<metadata>.*?</metadata>', "", page, flags=re.DOTALL)
     names = re.findall(r'\bid="([^"]*)"', page)
@@ -356,7 +470,7 @@ def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[
     with (small / "records" / "mpnet.jsonl").open("a") as stream:
         stream.write("{broken\n")
     assert main(["bench", "report", str(small)]) == 2
-    assert re.search(r"mpnet\.jsonl, line 5 is no record of a bench", capsys.readouterr().err)
+    assert re.search(r"mpnet\.jsonl, line 5 is no JSON object", capsys.readouterr().err)
 
 
 def test_an_empty_folder_says_how_to_go_on(tmp_path: Path) -> None:

@@ -17,10 +17,14 @@ from helpers import faulty_planner
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench import planner_process
-from robotdiffuse.evaluation.bench.records import Record, RecordFile, read_records
-from robotdiffuse.evaluation.bench.runner import BenchSettings, open_tasks, run_bench
+from robotdiffuse.evaluation.bench.contestants import Contestant
+from robotdiffuse.evaluation.bench.runner import BenchSettings, open_trials, run_bench
 from robotdiffuse.evaluation.problem_sets import gather_cases, judge
+from robotdiffuse.evaluation.records import Record, RecordFile, read_records
+from robotdiffuse.evaluation.trial import Trial
 from robotdiffuse.planners import PLANNERS
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse
+from robotdiffuse.planners.rrt_connect.planner import RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length
 from robotdiffuse.types import Path as Motion
@@ -50,10 +54,11 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
     asked = replace(settings(tmp_path), seeds=2)
     assert run_bench(asked, quiet, quiet) == 6
     assert run_bench(asked, quiet, quiet) == 0
-    records = read_records(tmp_path / "records" / "rrt_connect.jsonl")
+    records = read_records(tmp_path)["rrt_connect"]
     assert keys(records) == {("rop", f"rop/{i}", seed, 2.0): 1 for i in range(3) for seed in range(2)}
     solved = [record for record in records if record.solved]
-    assert solved
+    runs = [json.loads(line) for line in (tmp_path / "runs.jsonl").read_text().splitlines()]
+    assert solved and len(runs) == 2
     for record in solved:
         problem = held_out_problem("rop", int(record.name.partition("/")[2]))
         path = Motion(problem.robot.joint_names, record.waypoints)
@@ -61,9 +66,11 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
         assert record.joint_length == pytest.approx(path.length, rel=1e-6)
         assert record.progress[-1][1] == pytest.approx(path.length, rel=1e-5)
         assert record.memory is not None and record.memory > 50
+        assert (record.workers, record.run) == (1, runs[0]["run"])
+        assert record.load is not None and record.cpu is not None
         assert record.trivial == (line_length(problem, judge) is not None)
     assert run_bench(replace(asked, count=4), quiet, quiet) == 2
-    assert len(json.loads((tmp_path / "runs.jsonl").read_text().splitlines()[0])["versions"]) > 3
+    assert len(runs[0]["versions"]) > 3
 
 
 @pytest.fixture
@@ -78,7 +85,7 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) -> None:
     asked = replace(settings(tmp_path, "faulty", count=1), seeds=5, time_limit=0.5)
     assert run_bench(asked, quiet, quiet) == 5
-    found = {record.seed: record for record in read_records(tmp_path / "records" / "faulty.jsonl")}
+    found = {record.seed: record for record in read_records(tmp_path)["faulty"]}
     assert found[faulty_planner.SOLVES].solved and found[faulty_planner.TALKS].solved
     assert found[faulty_planner.RAISES].status == "exception"
     assert found[faulty_planner.RAISES].reason == "ValueError: no such thing"
@@ -91,11 +98,15 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) 
 
 def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An answer right behind the warm-up's line was taken for it, and then waited for in vain."""
-    answers = "import sys\nprint(flush=True)\nfor _ in sys.stdin: print('\\n{\"time\": 0.1}', flush=True)"
-    monkeypatch.setattr(planner_process, "FAR_SIDE", (sys.executable, "-c", answers))
+    far_side = (
+        'import sys\nprint(flush=True)\nfor _ in sys.stdin: print(\'\\n{"time": 0.1}\\n"end"\', flush=True)'
+    )
+    monkeypatch.setattr(planner_process, "FAR_SIDE", (sys.executable, "-c", far_side))
     monkeypatch.setattr(planner_process, "PATIENCE", 5.0)
-    process = planner_process.PlannerProcess(planner_process.Contestant.of("rrt_connect"), tmp_path / "log")
-    assert [process.plan({}, seed=0, time_limit=1.0) for _ in range(2)] == [{"time": 0.1}] * 2
+    process = planner_process.PlannerProcess(Contestant.of("rrt_connect"), tmp_path / "log")
+    (case,) = gather_cases(["rop"], 1, tmp_path, quiet)
+    trial = Trial(case, 0, "rrt_connect", 0, 1.0)
+    assert [process.plan(trial) for _ in range(2)] == [[{"time": 0.1}]] * 2
     process.close()
 
 
@@ -115,7 +126,7 @@ def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Pat
     assert main(arguments) == 0
     for file in (tmp_path / "records").iterdir():
         assert file.read_text().startswith(before[file].rpartition("\n")[0])
-        assert keys(read_records(file)) == {("rop", f"rop/{i}", 0, 2.0): 1 for i in range(4)}
+        assert keys(RecordFile(file).records) == {("rop", f"rop/{i}", 0, 2.0): 1 for i in range(4)}
 
 
 def test_what_ended_by_itself_is_not_asked_again_with_more_time(tmp_path: Path) -> None:
@@ -126,7 +137,7 @@ def test_what_ended_by_itself_is_not_asked_again_with_more_time(tmp_path: Path) 
 
     def left(time_limit: float, seeds: int = 1) -> list[tuple[str, int]]:
         asked = replace(settings(tmp_path), time_limit=time_limit, seeds=seeds)
-        return [(task.case.name, task.seed) for task in open_tasks(records, cases, asked)]
+        return [(t.case.name, t.seed) for t in open_trials({"rrt_connect": records}, cases, asked)]
 
     assert left(1.0) == []
     assert left(10.0) == [("rop/1", 0), ("rop/2", 0)]
@@ -134,23 +145,105 @@ def test_what_ended_by_itself_is_not_asked_again_with_more_time(tmp_path: Path) 
     assert left(1.0, seeds=2) == [("rop/0", 1), ("rop/1", 1), ("rop/2", 1)]
 
 
+def test_restarts_are_asked_for_where_time_is_left(tmp_path: Path) -> None:
+    cases = gather_cases(["rop"], 3, tmp_path, quiet)
+    ran_out = replace(RECORD, name="rop/1", status="timeout", time=1.0, progress=())
+    refused = replace(RECORD, name="rop/2", status="invalid_goal", time=0.0, progress=())
+    plain = [RECORD, ran_out, refused]
+    asked = replace(settings(tmp_path), equal_time=True)
+    again = [replace(RECORD, planner="rrt_connect+restarts", time=0.99, restarts=80)]
+
+    def left(time_limit: float, restarted: list[Record]) -> list[str]:
+        records = {"rrt_connect": plain, "rrt_connect+restarts": restarted}
+        trials = open_trials(records, cases, replace(asked, time_limit=time_limit))
+        return [trial.case.name for trial in trials]
+
+    assert left(1.0, []) == ["rop/0"]
+    assert left(1.0, again) == []
+    assert left(10.0, again) == ["rop/0", "rop/1"]
+
+
+def test_a_planner_is_restarted_until_its_time_is_used_up(tmp_path: Path) -> None:
+    asked = replace(settings(tmp_path, "rrt_connect", "rop_nontrivial", count=2), time_limit=0.3)
+    assert run_bench(asked, quiet, quiet) == 2
+    before = read_records(tmp_path)["rrt_connect"]
+    assert run_bench(replace(asked, equal_time=True), quiet, quiet) == 2
+    assert run_bench(replace(asked, equal_time=True), quiet, quiet) == 0
+    found = read_records(tmp_path)
+    assert found["rrt_connect"] == before
+    for once, again in zip(before, found["rrt_connect+restarts"], strict=True):
+        assert again.name == once.name and again.restarts is not None and again.restarts > 0
+        assert once.joint_length is not None and again.joint_length is not None
+        assert again.joint_length <= once.joint_length
+        assert again.progress[-1][1] == pytest.approx(again.joint_length, rel=1e-5)
+        assert list(again.progress) == sorted(again.progress) and again.progress[-1][0] <= 0.3 * 1.1
+        problem = held_out_problem("rop", int(again.name.partition("/")[2]))
+        assert verify(problem, Motion(problem.robot.joint_names, again.waypoints)).valid
+        assert not again.ended_by_itself
+
+
+def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever else the machine does then hits them alike; so many calls are made at once all the time."""
+    calls, at_once, most = [], [0], [0]
+
+    def plan(self: planner_process.PlannerProcess, trial: Trial, restarts: bool) -> list[dict]:
+        at_once[0] += 1
+        most[0] = max(most[0], at_once[0])
+        calls.append((trial.case.name, trial.method))
+        time.sleep(0.02)
+        at_once[0] -= 1
+        return [{"status": "timeout", "time": 2.0}]
+
+    monkeypatch.setattr(planner_process.PlannerProcess, "plan", plan)
+    monkeypatch.setattr(planner_process.PlannerProcess, "warm", quiet)
+    planners = "rrt_connect,mpnet,a_star"
+    assert run_bench(settings(tmp_path / "a", planners), quiet, quiet) == 9
+    assert calls == [(f"rop/{i}", name) for i in range(3) for name in planners.split(",")]
+    assert most == [1]
+    assert run_bench(replace(settings(tmp_path / "b", planners), workers=2), quiet, quiet) == 9
+    assert most == [2]
+    for name in planners.split(","):
+        assert [name for name, _ in keys_in_order(tmp_path / "b", name)] == [f"rop/{i}" for i in range(3)]
+
+
+def keys_in_order(folder: Path, planner: str) -> list[tuple[str, int]]:
+    return [(record.name, record.seed) for record in read_records(folder)[planner]]
+
+
+def test_a_planner_with_settings_is_a_row_of_its_own(tmp_path: Path) -> None:
+    texts = "rrt_connect", "rrt_connect:optimize_time=0.05:shortcuts=0"
+    asked = replace(settings(tmp_path, count=1), planners=texts)
+    assert run_bench(asked, quiet, quiet) == 2
+    assert list(read_records(tmp_path)) == sorted(texts)
+    planner = Contestant.of(texts[1]).load()
+    assert isinstance(planner, RRTConnect)
+    assert (planner.settings.optimize_time, planner.settings.shortcuts) == (0.05, 0)
+    nested = Contestant.of("robotdiffuse:search.reach=0.5:samples=4").load()
+    assert isinstance(nested, RobotDiffuse)
+    assert (nested.settings.search.reach, nested.settings.samples) == (0.5, 4)
+
+
 @pytest.mark.parametrize("cut", [1, 20, 100])
 def test_line_that_was_cut_off_is_made_again(tmp_path: Path, cut: int) -> None:
     file = tmp_path / "a.jsonl"
-    file.write_text((RECORD.line() + replace(RECORD, seed=1).line())[:-cut])
-    expected = [RECORD, replace(RECORD, seed=1)][: 2 if cut == 1 else 1]  # 1: only the line's end is missing
-    assert read_records(file) == expected
+    whole = RecordFile(file)
+    whole.append(RECORD)
+    whole.append(replace(RECORD, seed=1))
+    cut_off = file.read_bytes()[:-cut]
+    file.write_bytes(cut_off)
     appended = RecordFile(file)
+    assert appended.records == [RECORD]
+    assert file.read_bytes() == cut_off  # another process may be about to end the line
     appended.append(replace(RECORD, seed=2))
-    appended.close()
-    assert read_records(file) == [*expected, replace(RECORD, seed=2)]
+    assert RecordFile(file).records == [RECORD, replace(RECORD, seed=2)]
 
 
 def test_damaged_line_is_named(tmp_path: Path) -> None:
     file = tmp_path / "a.jsonl"
-    file.write_text(RECORD.line() + '{"planner": 1}\n' + RECORD.line())
+    line = json.dumps(RECORD.row())
+    file.write_text(line + '\n{"planner": 1}\n' + line + "\n")
     with pytest.raises(InputError, match="line 2 is no record"):
-        read_records(file)
+        RecordFile(file)
 
 
 def test_nontrivial_problems_are_not_solved_by_the_line(tmp_path: Path) -> None:
@@ -190,6 +283,9 @@ def test_problems_of_files_and_folders(tmp_path: Path) -> None:
         ({"planners": ("rrt",)}, "unknown planner 'rrt'; known:"),
         ({"planners": ("rrt_connect", "rrt_connect")}, "called the same"),
         ({"planners": ("rrt_connect@.",)}, "rrt_connect has no weights"),
+        ({"planners": ("rrt_connect:stp=1",)}, "rrt_connect has no setting 'stp'; it has .*shortcuts"),
+        ({"planners": ("rrt_connect:reach=-1",)}, "rrt_connect.reach is -1.0; it must be positive"),
+        ({"planners": ("rrt_connect:reach",)}, "'reach' is not NAME=VALUE"),
         ({"planners": ("robotdiffuse@nowhere",)}, "model.json is missing"),
         ({"planners": ("mpnet@nowhere",)}, "nowhere holds no mpnet"),
         ({"problems": ("rop", "rop")}, "none twice"),

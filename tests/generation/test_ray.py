@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from robotdiffuse.evaluation.bench.records import read_records
 
 from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.bench.records import read_records
 from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
 from robotdiffuse.generation import GenerationSettings, factory, generate, workers
 

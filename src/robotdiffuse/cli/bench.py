@@ -19,15 +19,16 @@ def add(commands: argparse._SubParsersAction) -> None:
     run = actions.add_parser(
         "run",
         help="planners on problems, every call a record that is kept",
-        description="Call planners on the same problems, each planner in a process of its own. Results are "
-        "lines of JSON in the folder; Ctrl-C or a crash loses at most the calls in hand, the same command "
-        "goes on. A call that a shorter time limit has answered for good is not made again.",
+        description="Call planners on the same problems, each planner in a process of its own; they take "
+        "turns. Results are lines of JSON in the folder; Ctrl-C or a crash loses at most the calls in hand, "
+        "the same command goes on. A call that a shorter time limit has answered for good is not made again.",
     )
     run.add_argument(
         "--planners",
         required=True,
         metavar="NAME,...",
-        help="see `robotdiffuse planners`, or all; a learned one with weights of its own: NAME@FOLDER",
+        help="see `robotdiffuse planners`, or all; with settings, NAME:SETTING=VALUE:SETTING=VALUE, or with "
+        "weights of its own, NAME@FOLDER",
     )
     run.add_argument(
         "--problems",
@@ -39,6 +40,11 @@ def add(commands: argparse._SubParsersAction) -> None:
     run.add_argument("--time-limit", type=positive, default=1.0, metavar="S", help="of a call [s] (1)")
     run.add_argument("--seeds", type=count, default=1, metavar="N", help="calls on each problem (1)")
     run.add_argument("--count", type=count, metavar="N", help="problems of each set (100; all of a folder)")
+    run.add_argument(
+        "--equal-time",
+        action="store_true",
+        help="call planners that end early again until the limit, in rows of their own, to compare lengths",
+    )
     run.add_argument(
         "--workers", type=count, metavar="N", help="planners that run at once (default: half of the cores)"
     )
@@ -107,6 +113,7 @@ def run_run(arguments: argparse.Namespace) -> int:
         count=arguments.count,
         workers=arguments.workers or max(1, (os.cpu_count() or 1) // 2),
         cluster=arguments.cluster,
+        equal_time=arguments.equal_time,
     )
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()

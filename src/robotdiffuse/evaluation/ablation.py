@@ -4,9 +4,9 @@ Collision guidance alone, without a network, solves many problems. So what a row
 by trying it without guidance, and by a control: guidance of trajectories that no network made.
 """
 
+import hashlib
 import json
 import multiprocessing
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
@@ -17,20 +17,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.data.manifest import read_manifest
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, without_network
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.problem_sets import hard_cases
+from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.tables import Column, Table
-from robotdiffuse.evaluation.trials import (
-    NETWORK_ALONE,
-    Tried,
-    from_network,
-    judged,
-    without_network,
-)
+from robotdiffuse.evaluation.trial import tried
 from robotdiffuse.files import alone_in
 from robotdiffuse.generation.workers import prepare_worker, stop_pool
 from robotdiffuse.learning.checkpoint import load_model
@@ -38,9 +33,8 @@ from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.planners.robotdiffuse import RobotDiffuseSettings
-from robotdiffuse.problems.held_out import SEED
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.problems.held_out import Case
 from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"
@@ -96,6 +90,28 @@ class AblationSettings:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1")
 
 
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """Figures of a network, one value for each problem."""
+
+    single: Float[ndarray, "n"]
+    """Share of the sampled trajectories that passed the judge."""
+    best: Float[ndarray, "n"]
+    """1 where any of them did."""
+    collided: Float[ndarray, "n"]
+    """Share of the sampled trajectories in collision."""
+    length: Float[ndarray, "n"]
+    """Link path length of the shortest that passed [m]; nan where none did."""
+    seconds: Float[ndarray, "n"]
+    """CPU time of encoding and sampling, on one thread."""
+
+    @classmethod
+    def of(cls, records: list[Record]) -> "Tried":
+        single, collided = (np.array([getattr(r, name) for r in records]) for name in ("passed", "collided"))
+        length = np.array([record.measures.get("link_length", np.nan) for record in records])
+        return cls(single, (single > 0) * 1.0, collided, length, np.array([record.cpu for record in records]))
+
+
 class RowResult(NamedTuple):
     name: str
     alone: Tried
@@ -139,7 +155,7 @@ def _run(
         )
     _check_budget(encoder / "encoder.json", "encoder_samples", settings.encoder_samples)
     configs = list(dict.fromkeys(ROWS[name].config for name in rows))
-    tried: dict[tuple[str | None, bool], Tried] = {}
+    found: dict[tuple[str | None, bool], Tried] = {}
     # fresh interpreters: forked ones could inherit locks of running threads
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(workers, context, initializer=prepare_worker)
@@ -149,20 +165,17 @@ def _run(
             report(f"trained {config}")
         _check_same_data(settings, configs)
         cases = hard_cases("rop", settings.problems, FilePath(settings.out) / "problems", report)
-        problems = [case.problem for case in cases]
-        trials = [
-            (settings, config, guided, problems) for config in (*configs, None) for guided in (False, True)
-        ]
-        for config, guided, result in _done(pool, _try, trials):
-            tried[config, guided] = result
+        todo = [(settings, config, guided, cases) for config in (*configs, None) for guided in (False, True)]
+        for config, guided, result in _done(pool, _try, todo):
+            found[config, guided] = result
             how = "with" if guided else "without"
             report(f"tried {config or CONTROL} {how} guidance: {100 * result.single.mean():.1f} % of samples")
     finally:
         stop_pool(pool, PATIENCE)
     results = [
-        RowResult(name, *(tried[ROWS[name].config, guided] for guided in (False, True))) for name in rows
+        RowResult(name, *(found[ROWS[name].config, guided] for guided in (False, True))) for name in rows
     ]
-    return [*results, RowResult(CONTROL, tried[None, False], tried[None, True])]
+    return [*results, RowResult(CONTROL, found[None, False], found[None, True])]
 
 
 def _training(file: FilePath) -> dict[str, Any]:
@@ -203,35 +216,18 @@ def _train(settings: AblationSettings, config: str) -> str:
 
 
 def _try(
-    settings: AblationSettings, config: str | None, guided: bool, problems: list[Problem]
+    settings: AblationSettings, config: str | None, guided: bool, cases: list[Case]
 ) -> tuple[str | None, bool, Tried]:
     robot = load_robot("panda")
     folder = FilePath(settings.out) / (config or CONTROL.replace(" ", "_"))
-    file = folder / ("tried_guided.json" if guided else "tried.json")
     weights = None if config is None else json.loads((folder / "model.json").read_text())["weights_sha256"]
     planner = _planner_settings(settings, config, guided)
-    sampling = json.loads(json.dumps(asdict(planner) | {"weights": weights}))
-    key = {"problems": len(problems), "planner": sampling}
-    known = Tried.load(file, key)
-    if known is not None:
-        return config, guided, known
-    measure = Kinematics(robot).link_length
-    draw = without_network(planner, CONTROL_FRAMES) if config is None else from_network(planner)
-    single, collided, lengths, seconds = [], [], [], []
-    for i, problem in enumerate(problems):
-        rng, checker = np.random.default_rng([SEED, 1, i]), CollisionChecker(robot, problem.scene)
-        began = time.process_time()
-        q = draw(checker, problem, rng)
-        seconds.append(time.process_time() - began)
-        passed, hit = judged(problem, q)
-        single.append(passed.mean())
-        collided.append(hit.mean())
-        lengths.append(measure(q[passed]).min() if passed.any() else np.nan)
-    shares = np.array(single)
-    arrays = (shares, (shares > 0) * 1.0, np.array(collided), np.array(lengths), np.array(seconds))
-    result = Tried(*arrays)
-    result.save(file, key)
-    return config, guided, result
+    about = json.dumps(asdict(planner) | {"weights": weights}, sort_keys=True)
+    name = f"{'guided' if guided else 'unguided'} {hashlib.sha256(about.encode()).hexdigest()[:12]}"
+    alone = config is None
+    draw = without_network(planner, CONTROL_FRAMES) if alone else from_network(RobotDiffuse(planner))
+    method = sampled(draw, Kinematics(robot).link_length)
+    return config, guided, Tried.of(tried(cases, {name: method}, seeds=(1,), folder=folder, bar=False)[name])
 
 
 def _planner_settings(settings: AblationSettings, config: str | None, guided: bool) -> RobotDiffuseSettings:

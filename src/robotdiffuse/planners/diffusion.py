@@ -23,7 +23,7 @@ from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.learning.checkpoint import BUNDLED, load_model
 from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call
@@ -137,14 +137,18 @@ class ModelSampler(Planner[Own]):
         start: Float[ndarray, "dof"],
         goals: Float[ndarray, "k dof"],
         rng: np.random.Generator,
+        clearances: ClearanceFn | None = None,
     ) -> Float[ndarray, "count frames dof"]:
-        """A batch of samples under guidance, shared out among the nearest goals; `code` as by `encode`."""
+        """A batch of samples under guidance, shared out among the nearest goals; `code` as by `encode`.
+
+        clearances: what the model is told of the obstacles; None: what is true.
+        """
         settings = self.settings
         guidance = CollisionGuidance(checker, settings.guidance)
         order = np.argsort(np.linalg.norm(goals - start, axis=1))
         order = order[: max(settings.samples // SAMPLES_PER_GOAL, 1)]
         counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(order))]
-        clearances = link_clearances(checker, model.config)
+        clearances = clearances or link_clearances(checker, model.config)
 
         def guide(q: ndarray, _level: float) -> ndarray:
             return guidance(q, settings.guidance_steps)[0]

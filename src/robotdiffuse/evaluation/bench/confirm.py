@@ -6,8 +6,8 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.bench.records import Record, read_records
 from robotdiffuse.evaluation.problem_sets import read_cases
+from robotdiffuse.evaluation.records import Record, read_records
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.simulation.oracle import OracleContact, PyBulletOracle
 from robotdiffuse.types import Path
@@ -38,9 +38,7 @@ def confirm(
     Those of the first `count` problems of each set; None: of all. `progress` is told how many problems are
     done, of how many. Raises InputError if the folder holds no records, or is damaged.
     """
-    records = [record for file in sorted((out / "records").glob("*.jsonl")) for record in read_records(file)]
-    if not records:
-        raise InputError(f"{out} holds no results; make some with: robotdiffuse bench run")
+    records = [record for of in read_records(out).values() for record in of]
     by_case: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         if record.solved:

@@ -5,9 +5,10 @@ call that ended by itself says what a longer limit would have given.
 """
 
 import json
+import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
 
@@ -16,10 +17,19 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED, Record, read_records
 from robotdiffuse.evaluation.comscore import Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases
+from robotdiffuse.evaluation.records import (
+    CRASHED,
+    ENDED,
+    OVERRAN,
+    RAISED,
+    RESTARTED,
+    Record,
+    read_records,
+    recorded,
+)
 from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
 from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.problems.families import FAMILIES
@@ -33,6 +43,8 @@ the judge takes its own."""
 ROP = ("rop", "rop_dense")
 """Sets that stand beside the paper's figures."""
 NONTRIVIAL = ", non-trivial"
+SHORTEST = 1 + 1e-6
+"""A path so many times as long as the shortest known one is as short."""
 RAN_OUT, GAVE_UP, LATER = "time ran out", "gave up before", "found one later"
 FAILURES = {
     RAN_OUT: "no path by the end of the limit",
@@ -63,12 +75,27 @@ class Bench:
     runs: tuple[dict[str, Any], ...]
     """What each run noted of itself."""
     records: dict[str, list[Record]]
-    """By planner, in the order of PLANNERS."""
+    """By planner, in the order of PLANNERS; those that were restarted behind their plain ones."""
 
     @property
     def reference(self) -> str:
-        """The planner that the others are compared with."""
-        return DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
+        """The planner that the others are compared with: at equal time, where it was restarted."""
+        plain = DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
+        return plain + RESTARTED if plain + RESTARTED in self.records else plain
+
+    def run_of(self, record: Record) -> frozenset[str]:
+        """The numbers of the runs, from 1, that a call may be of: one, where the call was noted with it."""
+        return frozenset(
+            str(i)
+            for i, run in enumerate(self.runs, start=1)
+            if (
+                run.get("run") == record.run
+                if record.run
+                else plain_name(record.planner) in run["planners"]
+                and record.problem_set in run["problems"]
+                and record.time_limit == run["time_limit"]
+            )
+        )
 
     @property
     def problem_sets(self) -> list[str]:
@@ -93,6 +120,11 @@ class Outcome:
     def solved(self) -> bool:
         return self.found < np.inf
 
+    def full(self, limit: float, shortest: float) -> bool:
+        """Whether more calls within the limit could not have given a shorter path than this."""
+        nothing_shorter = self.record.trivial and self.joint_length <= SHORTEST * shortest
+        return self.record.restarts is not None or self.returned >= ENDED * limit or nothing_shorter
+
     @property
     def failure(self) -> str:
         """One of FAILURES."""
@@ -106,6 +138,21 @@ class Outcome:
         if record.refused:
             return REFUSED.get(record.refused, "other refusal")
         return GAVE_UP if record.ended_by_itself and record.time < self.returned else RAN_OUT
+
+
+class Timed(NamedTuple):
+    """Beside what the calls of a row were timed."""
+
+    runs: frozenset[str]
+    """Numbers of the runs in which they may have been made."""
+    workers: frozenset[str]
+    """Calls at once, in these runs."""
+
+    @property
+    def text(self) -> str:
+        return (
+            f"run {' or '.join(sorted(self.runs)) or '?'}, {' or '.join(sorted(self.workers)) or '?'} at once"
+        )
 
 
 class Mean(NamedTuple):
@@ -144,6 +191,9 @@ class Row:
     """Among the rows of this table."""
     paired: Paired | None
     """Against the reference, by joint-space lengths; None for itself and where it has no row."""
+    full: bool
+    """Whether all solved calls used up the time, if need be by restarts."""
+    timed: Timed
     measures: dict[str, Mean]
     """Of the returned motions, by the names of METRICS."""
     memory: float
@@ -166,6 +216,16 @@ class Comparison:
     families: dict[str, dict[str, tuple[int, int]]]
     """Solved calls and all calls, by family and planner."""
     keys: tuple[Key, ...]
+    load: tuple[float, float] | None
+    """Least and highest load average at the ends of the calls; None where it was not noted."""
+
+    @property
+    def alike(self) -> bool:
+        """Whether all rows were timed in the same runs, with as many calls at once."""
+        return len({row.timed for row in self.rows}) < 2
+
+    def row(self, planner: str) -> Row | None:
+        return next((row for row in self.rows if row.planner == planner), None)
 
     @property
     def metrics(self) -> list[Metric]:
@@ -208,21 +268,36 @@ class Section:
         return max(self.comparisons, key=lambda c: (len(c.rows) * c.problems, c.limit))
 
 
+def plain_name(planner: str) -> str:
+    """Without restarts."""
+    return planner.removesuffix(RESTARTED)
+
+
+def base_name(planner: str) -> str:
+    """In PLANNERS: without weights, settings and restarts."""
+    return re.split("[@:+]", planner, maxsplit=1)[0]
+
+
 def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench:
-    """The records of all planners of a run, or of some.
+    """The records of all planners of a run, or of some, those with restarts among them.
 
     Raises InputError for a folder that `bench run` did not fill, damaged files and planners without records.
     """
-    files = {file.stem: file for file in sorted((folder / "records").glob("*.jsonl"))}
-    if not files:
-        raise InputError(f"{folder} holds no records of a bench; `robotdiffuse bench run` makes them")
+    if planners is not None:
+        again = [name + RESTARTED for name in planners]
+        planners = [*planners, *(name for name in again if name in recorded(folder))]
+    found = read_records(folder, planners)
     order = {name: i for i, name in enumerate(PLANNERS)}
-    names = sorted(files, key=lambda name: (order.get(name.partition("@")[0], len(order)), name))
-    for name in planners or ():
-        if name not in files:
-            raise InputError(f"planners names {name!r}, of which {folder} has no records; {', '.join(names)}")
-    chosen = [name for name in names if planners is None or name in planners]
-    records = {name: read_records(files[name]) for name in chosen}
+    names = sorted(
+        found, key=lambda n: (order.get(base_name(n), len(order)), plain_name(n), n.endswith(RESTARTED))
+    )
+    records = {name: found[name] for name in names}
+    for name in names:
+        if name.endswith(RESTARTED):
+            # the calls that had no time left for another are those of the plain planner
+            known = {record.key for record in records[name]}
+            there = [record for record in records.get(plain_name(name), ()) if record.key not in known]
+            records[name] = records[name] + [replace(record, planner=name) for record in there]
     if not any(records.values()):
         raise InputError(f"{folder} holds no records yet; go on with `robotdiffuse bench run`")
     return Bench(folder, _read_runs(folder / "runs.jsonl"), records)
@@ -325,7 +400,9 @@ def _counted(
     given = [
         (run["seeds"], run["count"] or len(places))
         for run in bench.runs
-        if planner in run["planners"] and problem_set in run["problems"] and run["time_limit"] >= limit
+        if plain_name(planner) in run["planners"]
+        and problem_set in run["problems"]
+        and run["time_limit"] >= limit
     ]
     return {
         key: record
@@ -347,15 +424,30 @@ def _comparison(
     shared = set.intersection(*(set(counted[name]) for name in present)) if present else set()
     keys = tuple(sorted(shared, key=lambda key: (places[key[0]], key[1])))
     if not keys:
-        return Comparison(limit, 0, problems, 0, (), tuple(calls), {}, ())
+        return Comparison(limit, 0, problems, 0, (), tuple(calls), {}, (), None)
     outcomes = {name: [outcome(counted[name][key], limit) for key in keys] for name in present}
     names = tuple(dict.fromkeys(name for name, _ in keys))
-    scores = comscores([_indicators(of) for of in outcomes.values()])
-    lengths = {name: _problem_lengths(keys, of) for name, of in outcomes.items()}
-    rows = tuple(
-        _row(name, outcomes[name], len(names), score, _paired(lengths, name, bench.reference))
-        for name, score in zip(present, scores.tolist(), strict=True)
+    plain = [name for name in present if not name.endswith(RESTARTED)]
+    scores = dict(
+        zip(plain, comscores([_indicators(outcomes[name]) for name in plain]).tolist(), strict=True)
     )
+    lengths = {name: _problem_lengths(keys, of) for name, of in outcomes.items()}
+    shortest = [
+        np.nanmin([of[i].joint_length for of in outcomes.values()] + [np.inf]) for i in range(len(keys))
+    ]
+    rows = tuple(
+        _row(
+            name,
+            of,
+            len(names),
+            scores.get(name, np.nan),
+            _paired(lengths, name, bench.reference),
+            all(o.full(limit, least) for o, least in zip(of, shortest, strict=True) if o.solved),
+            _timed(bench, of),
+        )
+        for name, of in outcomes.items()
+    )
+    loads = [o.record.load for of in outcomes.values() for o in of if o.record.load is not None]
     families: dict[str, dict[str, tuple[int, int]]] = {}
     for name, of in outcomes.items():
         calls_of = Counter(o.record.family for o in of)
@@ -364,7 +456,14 @@ def _comparison(
             families.setdefault(family, {})[name] = solved[family], calls_of[family]
     seeds = len({seed for _, seed in keys})
     missing = tuple(name for name in calls if name not in present)
-    return Comparison(limit, len(names), problems, seeds, rows, missing, families, keys)
+    load = (min(loads), max(loads)) if loads else None
+    return Comparison(limit, len(names), problems, seeds, rows, missing, families, keys, load)
+
+
+def _timed(bench: Bench, outcomes: Sequence[Outcome]) -> Timed:
+    runs = frozenset[str]().union(*(bench.run_of(o.record) for o in outcomes))
+    workers = {str(bench.runs[int(number) - 1].get("workers", "?")) for number in runs}
+    return Timed(runs, frozenset(workers))
 
 
 def _mean(values: Iterable[float | None]) -> float:
@@ -398,7 +497,13 @@ def _paired(lengths: dict[str, Float[ndarray, "n"]], name: str, reference: str) 
 
 
 def _row(
-    planner: str, outcomes: Sequence[Outcome], problems: int, comscore: float, paired: Paired | None
+    planner: str,
+    outcomes: Sequence[Outcome],
+    problems: int,
+    comscore: float,
+    paired: Paired | None,
+    full: bool,
+    timed: Timed,
 ) -> Row:
     solved = [o for o in outcomes if o.solved]
     success = len(solved) / len(outcomes)
@@ -415,6 +520,8 @@ def _row(
         returned=indicators.time,
         comscore=comscore,
         paired=paired,
+        full=full,
+        timed=timed,
         measures={name: Mean.of(x[name] for x in found if name in x) for name in METRICS},
         memory=max((o.record.memory for o in outcomes if o.record.memory is not None), default=np.nan),
         failures=dict(Counter(o.failure for o in outcomes if not o.solved)),

@@ -22,10 +22,9 @@ from robotdiffuse.evaluation.bench.figures import (
     counting,
     outcome,
 )
-from robotdiffuse.evaluation.bench.records import Record
 from robotdiffuse.evaluation.look import STYLE
 from robotdiffuse.evaluation.problem_sets import read_cases
-from robotdiffuse.evaluation.tables import Table
+from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.tables import html as html_table
 from robotdiffuse.files import check_output, write_atomically
 from robotdiffuse.problems.held_out import Case
@@ -223,19 +222,19 @@ def _comparison(bench: Bench, section: Section, comparison: Comparison) -> str:
     main, *others = report.tables(section, comparison, bench.reference)
     text, planners = html.escape(report.missing_line(comparison)), list(bench.records)
 
-    def drawn(table: Table, ours: str = "") -> str:
-        names = {str(row[0]): str(row[0]).partition(" ")[0] for row in table.rows}
-        colors = {text: plots.color_of(name, planners) for text, name in names.items()}
-        return html_table(table, colors, ours)
-
-    cards = [_card(html.escape(main.title), 12, text, drawn(main, bench.reference))]
+    colors = {report.named(name): plots.color_of(name, planners) for name in planners}
+    cards = [
+        _card(html.escape(main.title), 12, text, html_table(main, colors, report.named(bench.reference)))
+    ]
     for table in others:
         heading, _, rest = table.title.partition("; ")
         wide = len(table.columns) >= 8 and not heading.startswith("Failures")
         if heading.startswith("Failures"):
             plot = plots.failures(section, comparison, planners)
             cards.append(_card("Failures", 6, html.escape(rest), f'<div class="wide">{plot}</div>'))
-        cards.append(_card(html.escape(heading), 12 if wide else 6, html.escape(rest), drawn(table)))
+        cards.append(
+            _card(html.escape(heading), 12 if wide else 6, html.escape(rest), html_table(table, colors))
+        )
         if heading.startswith("Quality"):
             plot = plots.metrics(section, comparison, planners)
             text = "Means of the solved problems with their 95 % intervals; nothing, where nothing was solved"

@@ -1,7 +1,7 @@
 """A process of its own for each planner: a crash, an endless loop or a leak there hurts nobody else.
 
-The far side is `python -m robotdiffuse.evaluation.bench.planner_process NAME [WEIGHTS]`: it reads a task per
-line and writes an answer per line, both JSON. Warming up, for compiled code and imports, is apart from
+The far side is `python -m robotdiffuse.evaluation.bench.planner_process CONTESTANT`: it reads a task per
+line and writes its answers, a line each, all JSON. Warming up, for compiled code and imports, is apart from
 timing.
 """
 
@@ -16,18 +16,17 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Iterator
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple, TextIO
+from typing import TextIO
 
-import numpy as np
-
-from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
-from robotdiffuse.evaluation.metrics import Measure
-from robotdiffuse.planners import PLANNERS, load_planner
+from robotdiffuse.evaluation.bench.contestants import Contestant
+from robotdiffuse.evaluation.methods import measure_of, planner_calls
+from robotdiffuse.evaluation.records import CRASHED, OVERRAN
+from robotdiffuse.evaluation.trial import Fields, Trial
 from robotdiffuse.planners.base import Planner
-from robotdiffuse.problems.files import problem_from_record
+from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -41,45 +40,51 @@ START_SECONDS = 300.0
 """Most time to start and to warm up; the first time ever, kernels are compiled."""
 PATIENCE = 20.0
 """Beyond the time limit [s], for judging and timing, until a process that does not answer is killed."""
-
-
-class Contestant(NamedTuple):
-    """A planner of a bench, maybe with weights that do not come with the package."""
-
-    name: str
-    """In `planners.PLANNERS`."""
-    weights: str | None
-
-    @classmethod
-    def of(cls, text: str) -> "Contestant":
-        """From NAME or NAME@FOLDER. Raises InputError for an unknown name."""
-        name, at, folder = text.partition("@")
-        PLANNERS.entry(name)
-        return cls(name, str(FilePath(folder).resolve()) if at else None)
-
-    @property
-    def label(self) -> str:
-        """What it is called in results."""
-        return self.name if self.weights is None else f"{self.name}@{FilePath(self.weights).name}"
-
-    def load(self) -> Planner:
-        """Raises InputError as `load_planner`."""
-        return load_planner(self.name, weights=self.weights)
+PATIENCE_WITH_RESTARTS = 20.0
+"""Time limits until then where a planner is restarted, as the timing of each of its paths is not counted."""
+END = "end"
+"""Of the answers to a task."""
 
 
 class PlannerProcess:
     """The near side: starts the process when it is first asked, and again after it died."""
 
-    def __init__(self, planner: Contestant, log: FilePath) -> None:
+    def __init__(self, contestant: Contestant, log: FilePath) -> None:
         """`log`: what the process prints is added to this file."""
-        self._planner, self._log = planner, log
+        self._contestant, self._log = contestant, log
         self._process: subprocess.Popen[bytes] | None = None
         self._unread = b""
         self._closed = False
 
-    def plan(self, problem: dict[str, Any], seed: int, time_limit: float) -> dict[str, Any]:
-        """The answer to a task, as fields of a record; a death or an overrun is an answer too."""
-        task = {"problem": problem, "seed": seed, "time_limit": time_limit}
+    def warm(self, trial: Trial) -> None:
+        """Be ready for a trial's robot. A process that dies of it will say so when it is to plan."""
+        self._tell({"problem": problem_record(trial.problem)})
+
+    def plan(self, trial: Trial, restarts: bool = False) -> list[Fields]:
+        """The answers to a trial, as fields of records; a death or an overrun is an answer too."""
+        asked = {"seed": trial.seed, "time_limit": trial.limit, "restarts": restarts}
+        process = self._tell({"problem": problem_record(trial.problem), **asked})
+        if not isinstance(process, subprocess.Popen):
+            return [process]
+        answers: list[Fields] = []
+        patience = trial.limit + PATIENCE
+        while (line := self._answer(process, patience)) is not None:
+            answer = json.loads(line)
+            if answer == END:
+                return answers
+            answers.append(answer)
+            patience = PATIENCE_WITH_RESTARTS * trial.limit + PATIENCE
+        return [*answers, self._ended(process, patience)]
+
+    def close(self) -> None:
+        """End the process, whatever another thread waits for."""
+        self._closed = True
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+
+    def _tell(self, task: Fields) -> "subprocess.Popen[bytes] | Fields":
+        """The process, when it is warm and begins with the task, or what became of it."""
         process = self._process
         if process is None or process.poll() is not None:
             process = self._process = self._start()
@@ -94,18 +99,11 @@ class PlannerProcess:
         except BrokenPipeError:
             return self._ended(process, 0.0)
         # a robot that is new to the process is warmed up first
-        if self._answer(process, START_SECONDS) is None:
-            return self._ended(process, START_SECONDS)
-        patience = time_limit + PATIENCE
-        answer = self._answer(process, patience)
-        return self._ended(process, patience) if answer is None else json.loads(answer)
-
-    def close(self) -> None:
-        """End the process, whatever another thread waits for."""
-        self._closed = True
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+        return (
+            process
+            if self._answer(process, START_SECONDS) is not None
+            else self._ended(process, START_SECONDS)
+        )
 
     def _start(self) -> "subprocess.Popen[bytes]":
         self._unread = b""
@@ -113,7 +111,7 @@ class PlannerProcess:
         self._log.parent.mkdir(parents=True, exist_ok=True)
         with self._log.open("ab") as log:
             return subprocess.Popen(
-                [*FAR_SIDE, *filter(None, self._planner)],
+                [*FAR_SIDE, self._contestant.text],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
@@ -134,7 +132,7 @@ class PlannerProcess:
         line, _, self._unread = self._unread.partition(b"\n")  # more than one line may be there
         return line
 
-    def _ended(self, process: "subprocess.Popen[bytes]", patience: float) -> dict[str, Any]:
+    def _ended(self, process: "subprocess.Popen[bytes]", patience: float) -> Fields:
         """What became of a process that gave no answer."""
         try:
             code = process.wait(timeout=1.0)
@@ -150,7 +148,8 @@ class PlannerProcess:
 
 
 def serve(planner: Planner, tasks: TextIO, answers: TextIO) -> None:
-    """Answer tasks, one a line: first an empty line when the robot is warmed up, then the fields of a record.
+    """Answer tasks, one a line: an empty line when the robot is warmed up, then, unless that was all, the
+    fields of each record, and END.
 
     An empty line comes at the start too, when the planner is ready.
     """
@@ -161,16 +160,19 @@ def serve(planner: Planner, tasks: TextIO, answers: TextIO) -> None:
 
     lines: queue.Queue[str] = queue.Queue()
     threading.Thread(target=_read, args=(tasks, lines), daemon=True).start()
-    measures: dict[Robot, Measure] = {}
+    warm: set[Robot] = set()
     answer("")
     while True:
         task = json.loads(lines.get())
         problem = problem_from_record(task["problem"])
-        if problem.robot not in measures:
-            measures[problem.robot] = Measure(problem.robot)
-            _warm_up(planner, problem, measures[problem.robot])
+        if problem.robot not in warm:
+            warm.add(problem.robot)
+            _warm_up(planner, problem)
         answer("")
-        answer(json.dumps(_call(planner, problem, task, measures[problem.robot])))
+        if "seed" in task:
+            for fields in _calls(planner, problem, task):
+                answer(json.dumps(fields))
+            answer(json.dumps(END))
 
 
 def _read(tasks: TextIO, lines: "queue.Queue[str]") -> None:
@@ -180,7 +182,7 @@ def _read(tasks: TextIO, lines: "queue.Queue[str]") -> None:
     os._exit(0)
 
 
-def _warm_up(planner: Planner, problem: Problem, measure: Measure) -> None:
+def _warm_up(planner: Planner, problem: Problem) -> None:
     """Calls that compile, load and fill caches: nothing in the way, and balls where the straight line is."""
     robot, ways = problem.robot, []
     if isinstance(problem.goal, JointGoal):
@@ -191,37 +193,16 @@ def _warm_up(planner: Planner, problem: Problem, measure: Measure) -> None:
             warm = Problem(robot, Scene(shapes), problem.start, problem.goal)
             result = planner.plan(warm, time_limit=WARM_UP_SECONDS)
             if result.path is not None and result.trajectory is not None:
-                measure(result.path, result.trajectory)
+                measure_of(robot)(result.path, result.trajectory, result)
         except Exception:  # the timed call will show it
             traceback.print_exc()
 
 
-def _call(planner: Planner, problem: Problem, task: dict[str, Any], measure: Measure) -> dict[str, Any]:
-    began = time.perf_counter()
-    try:
-        result = planner.plan(problem, time_limit=task["time_limit"], seed=task["seed"])
-    except Exception as error:
-        traceback.print_exc()
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
-        return {"status": RAISED, "reason": reason, "time": time.perf_counter() - began}
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    return fields_of(result, measure) | {"memory": round(memory, 1)}
-
-
-def fields_of(result: PlanResult, measure: Measure) -> dict[str, Any]:
-    """What a record keeps of a result."""
-    found: dict[str, Any] = {
-        "status": result.status.value,
-        "reason": result.reason,
-        "time": round(result.planning_time, 6),
-        "refused": result.refused,
-        "stage": result.stage,
-        "progress": [[round(at, 6), round(length, 6)] for at, length in result.progress],
-    }
-    if result.path is not None and result.trajectory is not None:
-        found |= measure(result.path, result.trajectory, result)
-        found["positions"] = np.round(result.path.positions, 9).tolist()
-    return found
+def _calls(planner: Planner, problem: Problem, task: Fields) -> Iterator[Fields]:
+    """With what the process and the machine had to bear meanwhile."""
+    for fields in planner_calls(planner, problem, task["seed"], task["time_limit"], task["restarts"]):
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        yield fields | {"memory": round(memory, 1), "load": round(os.getloadavg()[0], 2)}
 
 
 def main() -> None:
@@ -231,8 +212,7 @@ def main() -> None:
     import torch
 
     torch.set_num_threads(1)
-    name, *weights = sys.argv[1:]
-    serve(Contestant(name, weights[0] if weights else None).load(), sys.stdin, answers)
+    serve(Contestant.of(sys.argv[1]).load(), sys.stdin, answers)
 
 
 if __name__ == "__main__":

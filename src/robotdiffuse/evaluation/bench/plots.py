@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from robotdiffuse.evaluation.bench.figures import FAILURES, Comparison, Section
-from robotdiffuse.evaluation.bench.records import CRASHED, OVERRAN, RAISED
+from robotdiffuse.evaluation.bench.figures import FAILURES, Comparison, Section, base_name, plain_name
 from robotdiffuse.evaluation.look import FAINT, INK, LINE, SOFT, as_svg, make_figure
+from robotdiffuse.evaluation.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.statistics import wilson_interval
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 LEARNED = {
     "robotdiffuse": "#0c9b74",
+    "diffusion": "#7a9e1c",
     "mpnet": "#d9622b",
     "mpinets": "#c23f78",
     "mpd": "#d99a17",
@@ -47,17 +48,17 @@ LABEL = 7.2
 
 
 def color_of(planner: str, planners: Sequence[str]) -> str:
-    """The same in all plots of a report on these planners."""
-    if planner in LEARNED or planner in SEARCH:
-        return (LEARNED | SEARCH)[planner]
-    others = [name for name in planners if name not in LEARNED and name not in SEARCH]
-    return BLUES[others.index(planner) % len(BLUES)]
+    """The same in all plots of a report on these planners; with restarts, that of the planner without."""
+    planner, own = plain_name(planner), LEARNED | SEARCH
+    others = list(dict.fromkeys(name for name in map(plain_name, planners) if name not in own))
+    return own[planner] if planner in own else BLUES[others.index(planner) % len(BLUES)]
 
 
 def line_of(planner: str) -> str | tuple[int, tuple[float, float]]:
-    """Learned planners solid, with other weights than the package's too, sampling-based ones dashed, search
+    """Learned planners solid, with other weights and settings too, sampling-based ones dashed, search
     dotted."""
-    return SOLID if planner.partition("@")[0] in LEARNED else DOTTED if planner in SEARCH else DASHED
+    base = base_name(planner)
+    return SOLID if base in LEARNED else DOTTED if base in SEARCH else DASHED
 
 
 def success_over_time(section: Section, planners: Sequence[str]) -> str:
@@ -68,7 +69,7 @@ def success_over_time(section: Section, planners: Sequence[str]) -> str:
     ends = {}
     first = min((c.found[0] for c in section.curves if len(c.found)), default=0.1)
     low, high = _decade_below(first), max(c.end for c in section.curves)
-    for curve in section.curves:
+    for curve in (curve for curve in section.curves if curve.planner == plain_name(curve.planner)):
         shares = 100 * np.arange(len(curve.found) + 1) / curve.calls
         times = np.concatenate([[low], curve.found, [curve.end]])
         shares = np.append(shares, shares[-1])

@@ -12,8 +12,11 @@ from robotdiffuse.evaluation.bench.figures import (
     Comparison,
     Row,
     Section,
+    base_name,
+    plain_name,
 )
 from robotdiffuse.evaluation.comscore import PAPER_TABLE_1, Indicators, comscores
+from robotdiffuse.evaluation.records import RESTARTED
 from robotdiffuse.evaluation.statistics import Paired
 from robotdiffuse.evaluation.tables import Cell, Column, Figure, Table, plain, tex
 from robotdiffuse.evaluation.tables import latex as latex_table
@@ -24,9 +27,20 @@ IN_PAPER = {
     "mpnet": "MPNet",
     "mpinets": "MPiNets",
     "mpd": "MPD",
-    "robotdiffuse": "RobotDiffuse",
+    "diffusion": "RobotDiffuse",
 }
 """Our planners that are rows of the paper's Table 1."""
+HYBRID = "robotdiffuse"
+"""The planner around the paper's method that is none of its rows."""
+PAPERS = "diffusion"
+"""The paper's method."""
+TITLES = {HYBRID: "hybrid", PAPERS: "RobotDiffuse (paper's method)"}
+"""What planners are whose names do not say it."""
+UNEQUAL = " †"
+UNEQUAL_NOTE = (
+    "† not at equal time: this planner or the reference ended before the limit. `bench run --equal-time` "
+    "calls those that end early again until the limit."
+)
 NOTES = (
     "A call counts for a limit if its own was at least as long, or if it ended by itself before: more time "
     "changes nothing then. Compared are the problems on which all planners of a table have such a call.",
@@ -39,11 +53,15 @@ NOTES = (
     "solved; planners that solve easy problems only look short. Where a call ran on and returned a shorter "
     "path, its length by the limit is the returned one's, scaled by the joint-space lengths.",
     "ratio: median of joint-space length over that of the reference, on problems that both solve, with its "
-    "95 % interval (bootstrap over problems).",
+    "95 % interval (bootstrap over problems), at equal time: of planners that use up the limit. restarted: "
+    "one that ends earlier is called again with other seeds until its calls have used up the limit together, "
+    "and the shortest path counts; the time to time the motions that do not count is not in it.",
     "first: median time to the first path, of the solved. returns: mean time until the planner returns; "
     "anytime planners use up the limit, and an unsolved problem counts it.",
     "ComScore: as in the paper, from success, collision, length and time until it returns; each from 0 for "
-    "the worst row of the table to 1 for the best. It depends on which rows there are.",
+    "the worst row of the table to 1 for the best. It depends on which rows there are; those with restarts "
+    "are left out. Beside the paper's Table 1 it is among the paper's rows alone; the hybrid's is what it "
+    "would have in place of the paper's method.",
     "Quality: means over the solved problems, of the motions that the calls returned at their end. "
     "clearance: a lower bound, to obstacles (scene), of the arm to itself (self), and the lesser of the two. "
     "bending: the integral of the squared second derivative of the path, over its squared length. jerk: "
@@ -58,11 +76,21 @@ Spec = Sequence[tuple[Column, Callable[[Row], Cell]]]
 """Columns of a table on planners, and what stands there."""
 
 
-def _table(heading: str, section: Section, comparison: Comparison, spec: Spec) -> Table:
-    whole = (Column("planner"), lambda row: row.planner), *spec
+def named(planner: str) -> str:
+    """As tables call a planner: with what it is, its settings and whether it was restarted."""
+    name, *settings = plain_name(planner).split(":")
+    title = TITLES.get(base_name(planner))
+    again = ["restarted"] if planner.endswith(RESTARTED) else []
+    return ", ".join([name if title is None else f"{name}: {title}", *settings, *again])
+
+
+def _table(
+    heading: str, section: Section, comparison: Comparison, spec: Spec, notes: Sequence[str] = ()
+) -> Table:
+    whole = (Column("planner"), lambda row: named(row.planner)), *spec
     rows = [[of(row) for _, of in whole] for row in comparison.rows]
     name = title(section, comparison)
-    return Table.of(f"{heading}; {name}" if heading else name, [column for column, _ in whole], rows)
+    return Table.of(f"{heading}; {name}" if heading else name, [column for column, _ in whole], rows, notes)
 
 
 def seconds(value: float) -> Cell:
@@ -95,22 +123,53 @@ def main_table(section: Section, comparison: Comparison, reference: str) -> Tabl
         (Column("95 %", dim=True), lambda row: percents(row.success_interval)),
         (Column("collision", "%", ".1f", "less", scale=100.0), lambda row: row.collision),
         (Column("length", "m", ".2f"), lambda row: row.link_length),
-        *_ratio(reference),
+        *_ratio(comparison, reference),
         (Column("first", "s", better="less"), lambda row: seconds(row.first)),
         (Column("returns", "s", better="less"), lambda row: seconds(row.returned)),
         (Column("ComScore", "", ".3f", "more"), lambda row: row.comscore),
+        *(() if comparison.alike else ((Column("timed", left=True, dim=True), lambda row: row.timed.text),)),
     )
-    return _table("", section, comparison, spec)
+    found = _table("", section, comparison, spec, [timed_line(comparison)])
+    unequal = any(UNEQUAL in text for row in found.texts for text in row)
+    return replace(found, notes=(*found.notes, UNEQUAL_NOTE)) if unequal else found
 
 
-def _ratio(reference: str) -> Spec:
+def timed_line(comparison: Comparison) -> str:
+    """Whether all rows were timed alike."""
+    load = ""
+    if comparison.load is not None:
+        least, most = comparison.load
+        load = f"; load average {least:.1f} to {most:.1f}"
+    if comparison.alike:
+        return f"All rows were timed alike: {comparison.rows[0].timed.text}{load}."
+    return (
+        f"Not all rows were timed alike, see the last column{load}; their times cannot be compared as such."
+    )
+
+
+def _ratio(comparison: Comparison, reference: str) -> Spec:
+    known = comparison.row(reference)
+    restarted = {plain_name(row.planner) for row in comparison.rows if row.planner.endswith(RESTARTED)}
+
+    def mark(row: Row) -> str | None:
+        """What stands behind a figure; None if there should be none."""
+        if row.full and (known is None or known.full):
+            return ""
+        return None if row.planner in restarted else UNEQUAL
+
     def ratio(row: Row) -> Cell:
-        return "1" if row.planner == reference else row.paired and row.paired.ratio
+        if row.planner == reference:
+            return "1"
+        sign = mark(row)
+        if row.paired is None or row.paired.ratio is None or sign is None:
+            return None
+        return Figure(f"{row.paired.ratio:.3f}{sign}", row.paired.ratio)
 
     def of_ratio(row: Row) -> Cell:
-        return row.paired and row.paired.ratio_interval and interval(*row.paired.ratio_interval, 3)
+        pair = None if mark(row) is None else row.paired
+        return pair and pair.ratio_interval and interval(*pair.ratio_interval, 3)
 
-    return (Column(f"ratio to {reference}", "", ".3f"), ratio), (Column("95 % ", dim=True), of_ratio)
+    return (Column(f"ratio to {named(reference)}"), ratio), (Column("95 % ", dim=True), of_ratio)
 
 
 def quality_table(section: Section, comparison: Comparison) -> Table:
@@ -137,14 +196,14 @@ def paired_table(section: Section, comparison: Comparison, reference: str) -> Ta
     others = replace(comparison, rows=tuple(row for row in comparison.rows if row.paired is not None))
     spec: Spec = (
         (Column("alone solves"), lambda row: row.paired and row.paired.a_only),
-        (Column(f"{reference} alone"), lambda row: row.paired and row.paired.b_only),
+        (Column("reference alone"), lambda row: row.paired and row.paired.b_only),
         (Column("both"), lambda row: row.paired and row.paired.both),
         (Column("neither"), lambda row: row.paired and row.paired.neither),
         (Column("p of success"), lambda row: row.paired and probability(row.paired.p_success)),
-        *_ratio(reference),
+        *_ratio(comparison, reference),
         (Column("p of length"), lambda row: row.paired and p_of_length(row.paired)),
     )
-    return _table(f"Against {reference}, in pairs", section, others, spec)
+    return _table(f"Against {named(reference)}, in pairs", section, others, spec)
 
 
 def probability(p: float) -> str:
@@ -162,24 +221,31 @@ def failure_table(section: Section, comparison: Comparison) -> Table:
 
 
 def paper_table(section: Section, comparison: Comparison) -> Table | None:
-    """The rows of the paper's Table 1, ours beside the printed ones; None if there are none of them.
+    """The rows of the paper's Table 1, ours beside the printed ones, and the hybrid; None if there are none.
 
-    ComScore is that among these rows alone.
+    ComScore is that among the paper's rows alone; the hybrid's is what it would have in place of the paper's
+    method.
     """
-    rows = [row for row in comparison.rows if row.planner in IN_PAPER]
+    rows = {row.planner: row for row in comparison.rows if row.planner in (*IN_PAPER, HYBRID)}
     if section.problem_set not in ROP or not rows:
         return None
-    indicators = [Indicators(100 * r.success, 100 * r.collision, r.link_length, r.returned) for r in rows]
-    paper = {row.name: row for row in PAPER_TABLE_1}
+    ours = {
+        p: Indicators(100 * r.success, 100 * r.collision, r.link_length, r.returned) for p, r in rows.items()
+    }
+    scores = _scores({planner: ours[planner] for planner in IN_PAPER if planner in ours})
+    if HYBRID in ours:
+        scores[HYBRID] = _scores({p: of for p, of in ours.items() if p != PAPERS})[HYBRID]
+    printed = {row.name: row for row in PAPER_TABLE_1}
     cells: list[tuple[Cell, ...]] = []
-    for row, ours, score in zip(rows, indicators, comscores(indicators).tolist(), strict=True):
-        printed = paper[IN_PAPER[row.planner]]
-        theirs = printed.indicators
+    for planner in sorted(ours, key=lambda p: p == HYBRID):
+        of, paper = ours[planner], printed.get(IN_PAPER.get(planner, ""))
+        theirs = None if paper is None else paper.indicators
         cells.append(
             (
-                f"{row.planner} ({printed.name})",
-                *(ours.success, theirs.success, ours.collision, theirs.collision, ours.length, theirs.length),
-                *(seconds(ours.time), theirs.time, score, printed.comscore),
+                named(planner) if planner in TITLES else f"{planner}: {IN_PAPER[planner]}",
+                *(of.success, theirs and theirs.success, of.collision, theirs and theirs.collision),
+                *(of.length, theirs and theirs.length, seconds(of.time), theirs and theirs.time),
+                *(scores[planner], paper and paper.comscore),
             )
         )
     names = (("success", "%", ".1f"), ("collision", "%", ".1f"), ("length", "m", ".2f"), ("returns", "s", ""))
@@ -193,6 +259,10 @@ def paper_table(section: Section, comparison: Comparison) -> Table | None:
     ]
     heading = f"Beside the paper's Table 1; {title(section, comparison)}"
     return Table.of(heading, [Column("planner"), *columns], cells)
+
+
+def _scores(rows: dict[str, Indicators]) -> dict[str, float]:
+    return dict(zip(rows, comscores(list(rows.values())).tolist(), strict=True))
 
 
 def tables(section: Section, comparison: Comparison, reference: str) -> list[Table]:
@@ -213,7 +283,9 @@ def missing_line(comparison: Comparison) -> str:
     """Which planners are not in the table; empty if all are."""
     if not comparison.missing:
         return ""
-    return f"Not run for {comparison.limit:g} s on these problems: {', '.join(comparison.missing)}."
+    return (
+        f"Not run for {comparison.limit:g} s on these problems: {', '.join(map(named, comparison.missing))}."
+    )
 
 
 def about(bench: Bench) -> list[str]:

@@ -3,19 +3,19 @@
 import json
 import os
 import platform
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path as FilePath
 
 from robotdiffuse import __version__
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.bench.planner_process import Contestant
-from robotdiffuse.evaluation.bench.records import Record, RecordFile
-from robotdiffuse.evaluation.bench.workers import Task, on_ray, on_this_machine
+from robotdiffuse.evaluation.bench.contestants import Contestant
+from robotdiffuse.evaluation.bench.workers import on_ray, on_this_machine
+from robotdiffuse.evaluation.machine import processor, versions
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
+from robotdiffuse.evaluation.records import RESTARTED, Record, RecordFile, record_path
+from robotdiffuse.evaluation.trial import Trial, run_trials, trials_of
 from robotdiffuse.files import alone_in
 from robotdiffuse.planners import PLANNERS
 from robotdiffuse.problems.held_out import Case
@@ -27,7 +27,7 @@ PACKAGES = ("numpy", "numba", "torch", "ompl")
 @dataclass(frozen=True)
 class BenchSettings:
     planners: tuple[str, ...]
-    """Names, each maybe with weights of its own as NAME@FOLDER; or `all` alone."""
+    """Names, each maybe with weights and settings of its own, see `Contestant.of`; or `all` alone."""
     problems: tuple[str, ...]
     """Families (rop, rop_dense, ..., each also with _nontrivial), files or folders."""
     out: FilePath
@@ -42,6 +42,9 @@ class BenchSettings:
     """Planners that run at once, each in a process of its own."""
     cluster: str | None = None
     """ray: on the cluster that RAY_ADDRESS names; None: this machine."""
+    equal_time: bool = False
+    """Whether a planner that ends early is called again with other seeds until the limit, in rows of its own,
+    so that lengths can be compared at equal time."""
 
     def __post_init__(self) -> None:
         if self.planners == ("all",):
@@ -88,76 +91,59 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
         for contestant in contestants.values():
             contestant.load()
         cases = gather_cases(list(settings.problems), settings.count, settings.out, report)
-        _note_run(settings)
-        local, logs = settings.cluster is None, settings.out / "logs"
-        files = {name: RecordFile(settings.out / "records" / f"{name}.jsonl") for name in contestants}
-        try:
-            tasks = {name: open_tasks(file.records, cases, settings) for name, file in files.items()}
-            wanted = len(cases) * settings.seeds
-            left = {name: len(found) for name, found in tasks.items()}
-            for name in tasks:
-                done(name, wanted - left[name], wanted)
-            calls = 0
-            wanting = {contestants[name]: found for name, found in tasks.items() if found}
-            made = on_this_machine(wanting, settings.workers, logs) if local else on_ray(wanting, logs)
-            with closing(made):  # a Ctrl-C here ends the planners too
-                for record in made:
-                    files[record.planner].append(record)
-                    calls += 1
-                    left[record.planner] -= 1
-                    done(record.planner, wanted - left[record.planner], wanted)
-            return calls
-        finally:
-            for file in files.values():
-                file.close()
+        run = _note_run(settings)
+        labels = [label + of for label in contestants for of in ("", RESTARTED)[: 1 + settings.equal_time]]
+        files = {label: RecordFile(record_path(settings.out, label)) for label in labels}
+        todo = open_trials({label: file.records for label, file in files.items()}, cases, settings)
+        wanted = len(cases) * settings.seeds
+        for label in contestants:
+            done(label, wanted - sum(trial.method == label for trial in todo), wanted)
+        about = {"restarts": settings.equal_time, "run": run, "logs": settings.out / "logs"}
+        if settings.cluster is None:
+            execute = on_this_machine(contestants, workers=settings.workers, **about)
+        else:
+            execute = on_ray(contestants, **about)
+        return run_trials(todo, execute, files, lambda label, left: done(label, wanted - left, wanted))
 
 
-def open_tasks(records: Sequence[Record], cases: Sequence[Case], settings: BenchSettings) -> list[Task]:
-    """The calls that the records do not answer."""
-    answered: set[tuple[str, str, int]] = set()
-    for record in records:
-        enough = record.time_limit <= settings.time_limit and record.ended_by_itself
-        if record.time_limit == settings.time_limit or enough:
-            answered.add((record.problem_set, record.name, record.seed))
-    return [
-        Task(case, seed, settings.time_limit)
-        for seed in range(settings.seeds)
-        for case in cases
-        if (*case.key, seed) not in answered
-    ]
+def open_trials(
+    records: Mapping[str, Sequence[Record]], cases: Sequence[Case], settings: BenchSettings
+) -> list[Trial]:
+    """The calls that the records, by planner, do not answer."""
+    answered: set[tuple[str, str, str, int]] = set()
+    for label in settings.contestants:
+        again = {record.key for record in records.get(label + RESTARTED, ())}
+        for record in records.get(label, ()):
+            same = record.time_limit == settings.time_limit
+            enough = same or (record.time_limit < settings.time_limit and record.ended_by_itself)
+            if settings.equal_time and record.restartable:
+                enough = same and record.key in again
+            if enough:
+                answered.add((label, *record.case))
+    trials = trials_of(cases, settings.contestants, range(settings.seeds), settings.time_limit)
+    return [t for t in trials if (t.method, t.case.problem_set, t.case.name, t.seed) not in answered]
 
 
-def _note_run(settings: BenchSettings) -> None:
-    """Append where and with what this run is made, for the report."""
+def _note_run(settings: BenchSettings) -> str:
+    """Append where and with what this run is made, for the report; returns what records call it."""
+    now = datetime.now(UTC)
+    run = now.strftime("%Y-%m-%d %H:%M:%S")
     note = {
-        "date": datetime.now(UTC).strftime("%Y-%m-%d %H:%M"),
-        "processor": _processor(),
+        "run": run,
+        "date": now.strftime("%Y-%m-%d %H:%M"),
+        "processor": processor(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "versions": _versions(),
+        "versions": {"robotdiffuse": __version__, **versions(PACKAGES)},
         "planners": list(settings.contestants),
         "problems": [problem_set_name(text) for text in settings.problems],
         "time_limit": settings.time_limit,
         "seeds": settings.seeds,
         "count": settings.count,
         "workers": settings.cluster or settings.workers,
+        "load": round(os.getloadavg()[0], 2),
+        "equal_time": settings.equal_time,
     }
     with (settings.out / "runs.jsonl").open("a") as stream:
         stream.write(json.dumps(note) + "\n")
-
-
-def _processor() -> str:
-    info = FilePath("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    names = (line.split(": ")[1] for line in lines if line.startswith("model name"))
-    return next(names, platform.processor())
-
-
-def _versions() -> dict[str, str]:
-    found = {"robotdiffuse": __version__}
-    for name in PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "none"
-    return found
+    return run

@@ -1,114 +1,136 @@
-"""Who makes a bench's calls: processes of this machine, or a Ray cluster. Either yields records."""
+"""Who makes a bench's calls: processes of this machine, or a Ray cluster."""
 
 import threading
-from collections.abc import Generator
+from collections import deque
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
-from typing import Any
 
-from robotdiffuse.evaluation.bench.planner_process import Contestant, PlannerProcess
-from robotdiffuse.evaluation.bench.records import Record, record_from_json
+from robotdiffuse.evaluation.bench.contestants import Contestant
+from robotdiffuse.evaluation.bench.planner_process import PlannerProcess
+from robotdiffuse.evaluation.records import RESTARTED, Record
+from robotdiffuse.evaluation.trial import Execute, Fields, Made, Trial
 from robotdiffuse.generation.workers import ray_cluster
-from robotdiffuse.problems.files import problem_record
-from robotdiffuse.problems.held_out import Case
 
-Made = Generator[Record, None, None]
 CHUNK = 20
 """Calls of one planner that a node of a cluster makes in one go, with one start of the process."""
+Contestants = Mapping[str, Contestant]
+"""By their labels, which are the methods of trials."""
 
 
-@dataclass(frozen=True)
-class Task:
-    """A call that is still to be made."""
+def on_this_machine(
+    contestants: Contestants, workers: int, restarts: bool, run: str, logs: FilePath
+) -> Execute:
+    """A process for each contestant, so many calls at a time; what they print goes to `logs`.
 
-    case: Case
-    seed: int
-    time_limit: float
+    All processes are warmed up before the first call is timed, and take turns: all planners are timed while
+    as much else goes on.
+    """
+    about = {"run": run, "workers": workers}
 
+    def execute(trials: Sequence[Trial]) -> Made:
+        stop, news, ready = threading.Event(), threading.Condition(), deque[tuple[Trial, list[Record]]]()
+        todo: deque[Trial] = deque(trials)
+        first = {trial.method: trial for trial in reversed(trials)}
+        processes = {
+            label: PlannerProcess(contestants[label], logs / f"{label.replace('/', '_')}.log")
+            for label in first
+        }
+        idle = set(processes)
 
-def record_of(planner: Contestant, task: Task, answer: dict[str, Any]) -> Record:
-    """The record of a task and of the answer of a planner's process."""
-    case = task.case
-    about = {
-        "planner": planner.label,
-        "problem_set": case.problem_set,
-        "name": case.name,
-        "family": case.family,
-        "trivial": case.trivial,
-        "seed": task.seed,
-        "time_limit": task.time_limit,
-    }
-    return record_from_json(about | answer)
-
-
-def on_this_machine(tasks: dict[Contestant, list[Task]], workers: int, logs: FilePath) -> Made:
-    """Calls by a process for each planner, `workers` of them at a time; what they print goes to `logs`."""
-    stop, news, ready = threading.Event(), threading.Condition(), list[Record]()
-    processes: list[PlannerProcess] = []
-
-    def work(planner: Contestant) -> None:
-        process = PlannerProcess(planner, logs / f"{planner.label}.log")
-        processes.append(process)
-        for task in tasks[planner]:
-            if stop.is_set():
-                return
-            answer = process.plan(problem_record(task.case.problem), task.seed, task.time_limit)
+        def next_trial() -> Trial | None:
+            """The first one whose planner is idle; None when there is nothing left to do."""
             with news:
-                if not stop.is_set():  # else it is the stop that ended the call
-                    ready.append(record_of(planner, task, answer))
-                news.notify()
-        process.close()
+                while todo and not stop.is_set():
+                    for i, trial in enumerate(todo):
+                        if trial.method in idle:
+                            del todo[i]
+                            idle.remove(trial.method)
+                            return trial
+                    news.wait()
+            return None
 
-    pool = ThreadPoolExecutor(workers)
-    jobs = {pool.submit(work, planner) for planner in tasks}
-    try:
-        while jobs or ready:
+        def work() -> None:
+            while (trial := next_trial()) is not None:
+                answers = processes[trial.method].plan(trial, restarts)
+                with news:
+                    if not stop.is_set():  # else it is the stop that ended the call
+                        ready.append((trial, records_of(trial, answers, about)))
+                    idle.add(trial.method)
+                    news.notify_all()
+
+        pool = ThreadPoolExecutor(workers)
+        try:
+            jobs = {pool.submit(processes[label].warm, trial) for label, trial in first.items()}
+            while jobs:
+                jobs = wait(jobs, timeout=0.2).not_done
+            jobs = {pool.submit(work) for _ in range(workers)}
+            while jobs or ready:
+                with news:
+                    news.wait_for(lambda: bool(ready), timeout=0.2)
+                    made = list(ready)
+                    ready.clear()
+                yield from made
+                finished, jobs = wait(jobs, timeout=0)
+                for job in finished:
+                    job.result()
+        finally:
+            stop.set()
             with news:
-                news.wait_for(lambda: bool(ready), timeout=0.2)
-                records, ready[:] = list(ready), []
-            yield from records
-            finished, jobs = wait(jobs, timeout=0)
-            for job in finished:
-                job.result()
-    finally:
-        stop.set()
-        for process in processes:
-            process.close()
-        pool.shutdown(cancel_futures=True)
+                news.notify_all()
+            for process in processes.values():
+                process.close()
+            pool.shutdown(cancel_futures=True)
+
+    return execute
 
 
-def on_ray(tasks: dict[Contestant, list[Task]], logs: FilePath) -> Made:
+def records_of(trial: Trial, answers: Sequence[Fields], about: Fields) -> list[Record]:
+    """Those after the first are of restarts."""
+    labels = (trial.method, trial.method + RESTARTED)
+    found = zip(labels, answers, strict=False)
+    return [trial.record({"planner": label, **about, **answer}) for label, answer in found]
+
+
+def on_ray(contestants: Contestants, restarts: bool, run: str, logs: FilePath) -> Execute:
     """Calls in portions, each by a process of its own on a node of a Ray cluster; see `ray_cluster`.
 
     The nodes need this package, and weights and files at the same places.
     """
-    portions = [(name, of[i : i + CHUNK]) for name, of in tasks.items() for i in range(0, len(of), CHUNK)]
-    with ray_cluster() as ray:
-        remote = ray.remote(num_cpus=1)(_portion)
-        running = [remote.remote(planner, portion) for planner, portion in portions]
-        while running:
-            done, running = ray.wait(running, num_returns=1)
-            for reference in done:
-                records, said = ray.get(reference)
-                if said:
-                    logs.mkdir(parents=True, exist_ok=True)
-                    with (logs / f"{records[0].planner}.log").open("a") as log:
-                        log.write(said)
-                yield from records
+    about = {"run": run, "workers": "ray"}
+
+    def execute(trials: Sequence[Trial]) -> Made:
+        of = {label: [trial for trial in trials if trial.method == label] for label in contestants}
+        portions = [(label, t[i : i + CHUNK]) for label, t in of.items() for i in range(0, len(t), CHUNK)]
+        with ray_cluster() as ray:
+            remote = ray.remote(num_cpus=1)(_portion)
+            running = {
+                remote.remote(contestants[label], portion, restarts): (label, portion)
+                for label, portion in portions
+            }
+            while running:
+                done, _ = ray.wait(list(running), num_returns=1)
+                for reference in done:
+                    label, portion = running.pop(reference)
+                    answers, said = ray.get(reference)
+                    if said:
+                        logs.mkdir(parents=True, exist_ok=True)
+                        with (logs / f"{label.replace('/', '_')}.log").open("a") as log:
+                            log.write(said)
+                    for trial, answer in zip(portion, answers, strict=True):
+                        yield trial, records_of(trial, answer, about)
+
+    return execute
 
 
-def _portion(planner: Contestant, tasks: list[Task]) -> tuple[list[Record], str]:
-    """Records of the tasks, and what the planner printed."""
+def _portion(contestant: Contestant, trials: list[Trial], restarts: bool) -> tuple[list[list[Fields]], str]:
+    """The answers to the trials, and what the planner printed."""
     with TemporaryDirectory() as folder:
         log = FilePath(folder) / "log"
-        process = PlannerProcess(planner, log)
+        process = PlannerProcess(contestant, log)
         try:
-            answers = [
-                process.plan(problem_record(task.case.problem), task.seed, task.time_limit) for task in tasks
-            ]
+            answers = [process.plan(trial, restarts) for trial in trials]
         finally:
             process.close()
-        records = [record_of(planner, *pair) for pair in zip(tasks, answers, strict=True)]
-        return records, log.read_text(errors="replace")
+        return answers, log.read_text(errors="replace")

@@ -1,0 +1,57 @@
+"""Who takes part in a bench: a planner, maybe with weights or settings of its own."""
+
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+from robotdiffuse.planners import PLANNERS, load_planner, planner_settings
+from robotdiffuse.planners.base import Planner
+from robotdiffuse.settings import Settings
+
+
+@dataclass(frozen=True)
+class Contestant:
+    """A planner as a bench calls it."""
+
+    name: str
+    """In `planners.PLANNERS`."""
+    weights: str | None = None
+    """A folder; None: those that come with the package."""
+    settings: tuple[str, ...] = ()
+    """NAME=VALUE, other than the defaults."""
+
+    @classmethod
+    def of(cls, text: str) -> "Contestant":
+        """From NAME, NAME@WEIGHTS, NAME:SETTING=VALUE:SETTING=VALUE or NAME@WEIGHTS:SETTING=VALUE.
+
+        Raises InputError for an unknown planner or setting, listing the known, and a value out of bounds.
+        """
+        whole, *settings = text.split(":")
+        name, at, folder = whole.partition("@")
+        PLANNERS.entry(name)
+        found = cls(name, str(FilePath(folder).resolve()) if at else None, tuple(settings))
+        if settings:
+            found._settings()
+        return found
+
+    @property
+    def text(self) -> str:
+        """What `of` makes this from, anywhere."""
+        return ":".join(
+            [self.name if self.weights is None else f"{self.name}@{self.weights}", *self.settings]
+        )
+
+    @property
+    def label(self) -> str:
+        """What it is called in results."""
+        name = self.name if self.weights is None else f"{self.name}@{FilePath(self.weights).name}"
+        return ":".join([name, *self.settings])
+
+    def load(self) -> Planner:
+        """Raises InputError as `load_planner`."""
+        if not self.settings:
+            return load_planner(self.name, weights=self.weights)
+        return load_planner(self.name, self._settings())
+
+    def _settings(self) -> Settings:
+        weights = () if self.weights is None else (f"weights={self.weights}",)
+        return planner_settings(self.name, (*weights, *self.settings))

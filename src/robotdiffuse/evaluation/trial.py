@@ -1,0 +1,155 @@
+"""The one loop of all that is measured: every case by every method with every seed, judged, and kept.
+
+A method is called with a trial and gives the fields of a record, with the judge's verdict; `methods` has
+those for planners, samplers and searches. An executor calls them: in this process, one after the other
+(`in_turn`), or in the processes of a bench. What is kept is not made again.
+"""
+
+import os
+import time
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+
+from robotdiffuse.evaluation.records import Record, RecordFile, record_of_row, record_path
+from robotdiffuse.problems.held_out import SEED, Case
+from robotdiffuse.problems.problem import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """A call that is to be made."""
+
+    case: Case
+    place: int
+    """Of the case among all."""
+    method: str
+    """What it is called in records."""
+    seed: int
+    limit: float = np.inf
+    """Time limit [s]."""
+
+    @property
+    def problem(self) -> Problem:
+        return self.case.problem
+
+    def rng(self) -> np.random.Generator:
+        """The same for all methods."""
+        return np.random.default_rng([SEED, self.seed, self.place])
+
+    def record(self, found: "Fields") -> Record:
+        about = {
+            "planner": self.method,
+            "problem_set": self.case.problem_set,
+            "name": self.case.name,
+            "family": self.case.family,
+            "trivial": self.case.trivial,
+            "reference": self.case.reference,
+            "seed": self.seed,
+            "time_limit": self.limit,
+            "reason": "",
+        }
+        return record_of_row(about | found)
+
+
+Fields = dict[str, Any]
+"""Of a record; what they do not say, the trial does."""
+Method = Callable[[Trial], Iterable[Fields]]
+"""Mostly gives one record; more where one call answers for several time limits, say."""
+Made = Generator[tuple[Trial, list[Record]], None, None]
+Execute = Callable[[Sequence[Trial]], Made]
+Done = Callable[[str, int], None]
+"""Told a method, and how many of its trials are left."""
+
+
+class Clock:
+    """Wall time, and CPU time of this process, of a `with` block [s]."""
+
+    wall = cpu = 0.0
+
+    def __enter__(self) -> "Clock":
+        self._began = time.perf_counter(), time.process_time()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.wall, self.cpu = time.perf_counter() - self._began[0], time.process_time() - self._began[1]
+
+    @property
+    def fields(self) -> Fields:
+        return {"time": round(self.wall, 6), "cpu": round(self.cpu, 6)}
+
+
+def trials_of(
+    cases: Sequence[Case], methods: Iterable[str], seeds: Iterable[int] = (0,), limit: float = np.inf
+) -> list[Trial]:
+    """All, in the order that they are made in: methods take turns on each case, so that what else the machine
+    does hits them alike."""
+    names, places = list(methods), list(enumerate(cases))
+    return [Trial(case, i, name, seed, limit) for seed in seeds for i, case in places for name in names]
+
+
+def run_trials(
+    trials: Sequence[Trial],
+    execute: Execute,
+    files: Mapping[str, RecordFile],
+    done: Done = lambda method, left: None,
+) -> int:
+    """Make the trials and keep their records, each as soon as it is there; returns how many were made."""
+    left = {trial.method: 0 for trial in trials}
+    for trial in trials:
+        left[trial.method] += 1
+    made = 0
+    with closing(execute(trials)) as found:  # a Ctrl-C here ends what makes them too
+        for trial, records in found:
+            for record in records:
+                files[record.planner].append(record)
+            made += 1
+            left[trial.method] -= 1
+            done(trial.method, left[trial.method])
+    return made
+
+
+def in_turn(methods: Mapping[str, Method]) -> Execute:
+    """Calls in this process, one after the other."""
+
+    def execute(trials: Sequence[Trial]) -> Made:
+        for trial in trials:
+            found = list(methods[trial.method](trial))
+            load = {"workers": 1, "load": round(os.getloadavg()[0], 2)}
+            yield trial, [trial.record(load | fields) for fields in found]
+
+    return execute
+
+
+def tried(
+    cases: Sequence[Case],
+    methods: Mapping[str, Method],
+    seeds: Iterable[int] = (0,),
+    limit: float = np.inf,
+    folder: FilePath | None = None,
+    title: str = "trials",
+    bar: bool = True,
+) -> dict[str, list[Record]]:
+    """The records of each method in the order of the cases, made in this process.
+
+    folder: keeps them; the names of methods must say all that they depend on. title: of a bar on the
+        terminal, unless there is to be none.
+    """
+    files = {name: RecordFile(None if folder is None else record_path(folder, name)) for name in methods}
+    there = {(name, record.case) for name, file in files.items() for record in file.records}
+    trials = trials_of(cases, methods, seeds, limit)
+    todo = [t for t in trials if (t.method, (t.case.problem_set, t.case.name, t.seed)) not in there]
+    with Progress(transient=True, console=Console(stderr=True), disable=not bar) as shown:
+        task = shown.add_task(title, total=len(trials), completed=len(trials) - len(todo))
+        run_trials(todo, in_turn(methods), files, lambda *_: shown.advance(task))
+    order = {(t.case.problem_set, t.case.name, t.seed): i for i, t in enumerate(trials)}
+    return {
+        name: sorted((r for r in file.records if r.case in order), key=lambda record: order[record.case])
+        for name, file in files.items()
+    }
