@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from robotdiffuse.evaluation.bench.records import read_records
 
 from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
+from robotdiffuse.evaluation.records import read_records
 from robotdiffuse.generation import GenerationSettings, factory, generate, workers
 
 # read when ray is imported: no telemetry, and no pages of logs when a node is lost
@@ -102,7 +102,7 @@ def test_bench_on_a_cluster_is_as_on_this_machine(cluster: Any, tmp_path: Path) 
     asked = BenchSettings(("rrt_connect",), ("rop",), tmp_path, time_limit=5.0, count=2, cluster="ray")
     assert run_bench(asked, quiet, quiet) == 2
     assert run_bench(replace(asked, cluster=None), quiet, quiet) == 0
-    there = read_records(tmp_path / "records" / "rrt_connect.jsonl")
+    there = read_records(tmp_path)["rrt_connect"]
     assert run_bench(replace(asked, cluster=None, out=tmp_path / "here"), quiet, quiet) == 2
-    here = read_records(tmp_path / "here" / "records" / "rrt_connect.jsonl")
+    here = read_records(tmp_path / "here")["rrt_connect"]
     assert [record.positions for record in sorted(there, key=lambda r: r.name)] == [r.positions for r in here]
