@@ -281,7 +281,7 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     assert np.ptp(changed.meshes["upper"][0].vertices[:, 2]) == pytest.approx(0.32, rel=0.05)
     kept = tmp_path / "robots" / f"tiny-{content_hash(larger)[:8]}"
     stamp = (kept / "robot.json").stat().st_mtime_ns
-    load_robot(larger)
+    assert load_robot(larger) is load_robot(larger)
     assert (kept / "robot.json").stat().st_mtime_ns == stamp
 
 
