@@ -34,8 +34,8 @@ from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial, tried
 from robotdiffuse.paths.shortcut import shortcut
 from robotdiffuse.planners.robotdiffuse import Candidates, RobotDiffuse, unlearned_starts
 from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.problems.families import FAMILIES, Family, load_family
-from robotdiffuse.problems.families.family import uniform_configurations
+from robotdiffuse.problems.families import FAMILIES, load_family
+from robotdiffuse.problems.families.family import Family, uniform_configurations
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.types import Path
 from robotdiffuse.verify import VerifySettings, verifier

@@ -13,7 +13,8 @@ from helpers.code_blocks import ROOT, Notebook, code_blocks
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.planners import PLANNERS
-from robotdiffuse.problems.families import FAMILIES, Family, load_family
+from robotdiffuse.problems.families import FAMILIES, load_family
+from robotdiffuse.problems.families.family import Family
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.scenes.files import SHAPES
 from robotdiffuse.scenes.sampling import sample_surface

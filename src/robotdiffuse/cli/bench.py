@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import count, positive
 from robotdiffuse.errors import InputError
+from robotdiffuse.problems.families import FAMILIES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +35,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--problems",
         required=True,
         metavar="SET,...",
-        help="rop, rop_dense, shelf, crate, table, each also with _nontrivial; files or folders of problems",
+        help=f"{', '.join(FAMILIES)}, each also with _nontrivial; files or folders of problems",
     )
     run.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems and results")
     run.add_argument("--time-limit", type=positive, default=1.0, metavar="S", help="of a call [s] (1)")

@@ -4,6 +4,7 @@ import argparse
 import os
 
 from robotdiffuse.cli.arguments import count, natural, not_negative, share, shares
+from robotdiffuse.problems.families import FAMILIES
 
 
 def add_generate(actions: argparse._SubParsersAction) -> None:
@@ -21,7 +22,7 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
         "--mix",
         type=shares,
         metavar="NAME=P,...",
-        help="shares of rop, rop_dense, shelf, crate and table (default: rop=1)",
+        help=f"shares of {', '.join(FAMILIES)} (default: rop=1)",
     )
     parser.add_argument(
         "--trivial-share",

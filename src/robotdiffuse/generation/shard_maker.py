@@ -14,7 +14,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch
-from robotdiffuse.problems.families import Drawn
+from robotdiffuse.problems.families.family import Drawn
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import PackedScenes

@@ -1,9 +1,11 @@
 """Families of random problems by name: ROP, the paper's, its dense variant, and furniture."""
 
-from robotdiffuse.problems.families.family import Drawn, Family
+from typing import TYPE_CHECKING
+
 from robotdiffuse.registry import Entry, Registry
 
-__all__ = ["FAMILIES", "Drawn", "Family", "load_family"]
+if TYPE_CHECKING:
+    from robotdiffuse.problems.families.family import Family
 
 HERE = "robotdiffuse.problems.families"
 FAMILIES = Registry(
@@ -19,6 +21,6 @@ FAMILIES = Registry(
 """New ones at the end: the seeds of held-out problems go by the place in this table."""
 
 
-def load_family(name: str) -> Family:
+def load_family(name: str) -> "Family":
     """Raises InputError, listing the known names, for an unknown one."""
     return FAMILIES.load(name)
