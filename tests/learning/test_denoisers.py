@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from test_learning import small_model
 
+from helpers.small_model import small_model
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model, save_model
 from robotdiffuse.learning.denoisers import (

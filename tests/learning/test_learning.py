@@ -8,6 +8,7 @@ import torch
 
 from helpers.box_arm import box_arm
 from helpers.example_robots import planar_arm
+from helpers.small_model import SMALL_ENCODER, small_model
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import (
     fingerprint,
@@ -16,40 +17,14 @@ from robotdiffuse.learning.checkpoint import (
     save_encoder,
     save_model,
 )
-from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
-from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
+from robotdiffuse.learning.encoders import PointAutoencoder
 from robotdiffuse.learning.encoders.point_autoencoder import chamfer, nearest
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.settings import settings_from_json, settings_to_json
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.scenes.sampling import PANDA_REGION
-
-SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
-
-
-def small_model(seed: int = 0) -> MotionModel:
-    """A model for the arm of boxes, with random weights in the last layer too."""
-    torch.manual_seed(seed)
-    robot = box_arm()
-    kind, _ = DENOISERS["transformer"]
-    config = MotionModelConfig(
-        robot=robot.name,
-        joint_names=robot.joint_names,
-        lower=tuple(robot.lower.tolist()),
-        upper=tuple(robot.upper.tolist()),
-        frame_offsets=tuple(tuple(map(tuple, T)) for T in robot.frame_offsets.tolist()),
-        links=("l1", "l2", "l3"),
-        frames=16,
-        encoder_settings=SMALL_ENCODER,
-        denoiser_settings=TransformerSettings(width=16, layers=2, heads=2, hidden=32, patch=4),
-    )
-    model = MotionModel(config)
-    assert isinstance(model.denoiser, kind)
-    torch.nn.init.normal_(model.denoiser.out.weight, std=0.2)
-    return model
 
 
 def cloud(n: int, seed: int = 0) -> torch.Tensor:
