@@ -12,6 +12,7 @@ from golden.golden import GOLDEN, SECTIONS
 ANY_PROCESSOR = ("problems", "shard")
 
 
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("section", SECTIONS)
 def test_golden(section: str) -> None:
     made_on = json.loads(GOLDEN.read_text())["processor"]
