@@ -1,4 +1,4 @@
-"""robotdiffuse data info, check, view and export, as a user would run them."""
+"""robotdiffuse data info, check, view, export and import, as a user would run them."""
 
 import json
 import re
@@ -97,6 +97,10 @@ def test_export(folder, capsys):
     assert "1 motions" in capsys.readouterr().out
     with np.load(file) as arrays:
         assert arrays["x_train"].shape == (1, 254, 7) and arrays["y_train"].shape == (1, 23)
+    again = folder.parent / "again"
+    assert run("data", "import", file, "--out", again, "--radius", 0.2) == 0
+    assert f"1 motions in {again}" in capsys.readouterr().out
+    assert run("data", "check", again, "--no-pybullet", "--workers", 1) == 0
 
 
 BAD = {
@@ -104,6 +108,7 @@ BAD = {
     "check without data": (["check", "."], "no data set"),
     "view without data": (["view", "."], "no data set"),
     "export without data": (["export", ".", "x.npz"], "no data set"),
+    "import without a file": (["import", "x.npz", "--out", "y"], "cannot read x.npz"),
     "unknown robot": (["check", "set", "--robot", "pandaa"], "pandaa"),
     "unknown ending": (["view", "set", "--out", "x.png"], "unknown ending '.png'"),
     "page in no folder": (["info", "set", "--page", "no/x.html"], "the folder no does not exist"),

@@ -1,4 +1,4 @@
-"""RopDataset and the authors' layout: every row once, scaled by the limits, with clouds on its obstacles."""
+"""RopDataset: every row once, scaled by the limits, with clouds on its obstacles."""
 
 import pickle
 from dataclasses import fields, replace
@@ -12,11 +12,9 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays, write_store
 from robotdiffuse.data.dataset import RopBatch, RopDataset, resample
-from robotdiffuse.data.export import export_npz
 from robotdiffuse.data.manifest import write_manifest
 from robotdiffuse.data.shards import SPLITS, read_shard, shard_path, split_of, write_shard
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
 
 ARM, FRAMES, SIZES = box_arm(), 20, (150, 0, 130, 40)
@@ -174,37 +172,3 @@ def test_bad_input(store, tmp_path):
     file.write_bytes(b"")
     with pytest.raises(InputError, match=r"shard_00000\.zarr, array trajectories is damaged"):
         RopDataset(tmp_path)
-
-
-def test_export_for_the_authors(tmp_path):
-    panda = load_robot("panda")
-    write_store(tmp_path, panda, (30, 20))
-    arrays = random_arrays(panda, 3, np.random.default_rng(1))
-    arrays["obstacle_kinds"][:] = [SPHERE, SPHERE, SPHERE, 0]  # one too many
-    arrays["obstacle_kinds"][0] = [SPHERE, 0, 0, SPHERE]
-    arrays["obstacle_params"][0, 3, :3] = [1, 2, 3]
-    write_shard(tmp_path, 2, arrays, {})
-    count = export_npz(tmp_path, tmp_path / "robot.npz")
-    with np.load(tmp_path / "robot.npz") as file:
-        x, y = file["x_train"], file["y_train"]
-    kinds = np.concatenate([read_shard(tmp_path, i)["obstacle_kinds"] for i in (0, 1)])
-    assert count == len(x) == ((kinds == SPHERE).sum(1) == 2).sum() + 1
-    assert x.shape[1:] == (254, 7) and y.shape[1:] == (23,)
-    assert x.dtype == y.dtype == np.float32
-    np.testing.assert_array_equal(x[-1], arrays["trajectories"][0])
-    centers = arrays["obstacle_params"][0, [0, 3], :3].reshape(-1)
-    goal = arrays["goals"][0, arrays["goal_index"][0]]
-    expected = np.concatenate([arrays["start"][0], goal, centers, arrays["target_pose"][0, 4:]])
-    np.testing.assert_array_equal(y[-1], expected)
-    np.testing.assert_array_equal(y[:, :14], np.concatenate([x[:, 0], x[:, -1]], 1))
-    with pytest.raises(InputError, match=r"cannot write .*nothing.robot\.npz"):
-        export_npz(tmp_path, tmp_path / "nothing" / "robot.npz")
-
-
-def test_what_cannot_be_exported(store, tmp_path):
-    with pytest.raises(InputError, match=r"20 frames of 3 joints; robot\.npz holds 254 frames of 7 joints"):
-        export_npz(store, tmp_path / "robot.npz")
-    write_store(tmp_path, load_robot("panda"), ())
-    with pytest.raises(InputError, match="no scene of exactly two spheres"):
-        export_npz(tmp_path, tmp_path / "robot.npz")
-    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]

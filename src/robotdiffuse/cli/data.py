@@ -15,3 +15,4 @@ def add(commands: argparse._SubParsersAction) -> None:
     data_look.add_check(actions)
     data_look.add_view(actions)
     data_look.add_export(actions)
+    data_look.add_import(actions)

@@ -1,11 +1,11 @@
-"""robotdiffuse data info, check, view and export"""
+"""robotdiffuse data info, check, view, export and import"""
 
 import argparse
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import count, natural
+from robotdiffuse.cli.arguments import count, natural, positive
 from robotdiffuse.errors import InputError
 
 if TYPE_CHECKING:
@@ -82,6 +82,24 @@ def add_export(actions: argparse._SubParsersAction) -> None:
     parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
     parser.add_argument("file", metavar="FILE.npz", help="where to write it")
     parser.set_defaults(run=run_export)
+
+
+def add_import(actions: argparse._SubParsersAction) -> None:
+    parser = actions.add_parser(
+        "import",
+        help="make a data set of the authors' robot.npz",
+        description="Make a data set of a file in the layout of the authors' robot.npz, to be checked and "
+        "trained on like any other. The file does not say how large the spheres are.",
+    )
+    parser.add_argument("file", metavar="FILE.npz", help="x_train n x 254 x 7, y_train n x 23")
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")
+    parser.add_argument(
+        "--robot", default="panda", metavar="NAME", help="bundled name or URDF (default: panda)"
+    )
+    parser.add_argument(
+        "--radius", type=positive, default=0.25, metavar="M", help="of the spheres [m] (default: 0.25)"
+    )
+    parser.set_defaults(run=run_import)
 
 
 def _robot(name: str | None) -> "Robot | None":
@@ -257,8 +275,24 @@ def _exhibits(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator
 
 
 def run_export(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.data.export import export_npz
+    from robotdiffuse.data.robot_npz import export_npz
 
     made = export_npz(arguments.folder, arguments.file)
     print(f"wrote {arguments.file}: {made:,} motions")
+    return 0
+
+
+def run_import(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.data.robot_npz import import_npz
+
+    with _bar() as bar:
+        task = bar.add_task("motions", total=None)
+        made = import_npz(
+            arguments.file,
+            arguments.out,
+            arguments.robot,
+            arguments.radius,
+            lambda done, total: bar.update(task, completed=done, total=total),
+        )
+    print(f"{made:,} motions in {arguments.out}; judge them with: robotdiffuse data check {arguments.out}")
     return 0
