@@ -40,7 +40,7 @@ def made(folder: Path, **changes: np.ndarray) -> Path:
     export_npz(folder / "set", folder / "robot.npz")
     with np.load(folder / "robot.npz") as file:
         arrays = {name: file[name] for name in file.files}
-    np.savez(folder / "robot.npz", **arrays | changes)
+    np.savez(folder / "robot.npz", allow_pickle=False, **arrays | changes)
     return folder / "robot.npz"
 
 
@@ -134,7 +134,7 @@ def test_what_cannot_be_imported(tmp_path, monkeypatch):
         ({"x_train": x, "y_train": moved}, "row 1 has a goal that differs from its last frame by 0.01 rad"),
         ({"x_train": np.array(["text"]), "y_train": y}, "is no robot.npz"),
     ]:
-        np.savez(file, **arrays)
+        np.savez(file, allow_pickle=False, **arrays)
         with pytest.raises(InputError, match=message) as caught:
             import_npz(file, out)
         assert "\n" not in str(caught.value) and not out.exists()

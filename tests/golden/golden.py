@@ -46,8 +46,8 @@ PLANNERS = (
     *("a_star", "d_star_lite", "ompl_rrt", "ompl_rrt_connect"),
 )
 UNSTEADY = ("mpd", "edmp")
-"""Their guides follow many small gradients: how a process happened to compile them can decide a path, on shelves
-mostly. What differs is printed, and counts for nothing."""
+"""Their guides follow many small gradients: how a process happened to compile them can decide a path, most of
+all on shelves. What differs is printed, and counts for nothing."""
 SEED = 3
 TIME_LIMIT = 60.0
 STEPS, BATCH = 100, 8
