@@ -29,7 +29,7 @@ demo: .venv/core.stamp
 	$(BIN)/robotdiffuse demo
 
 test: .venv/dev.stamp
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: .venv/dev.stamp
 	$(BIN)/ruff check .

@@ -32,7 +32,7 @@ from robotdiffuse.collision.kernels.lanes import W, make_workspace
 from robotdiffuse.collision.kernels.motions import Space, motion_free
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.collision.signed_distance import SignedDistance
-from robotdiffuse.planners.rrt_connect.planner import RRTConnectSettings
+from robotdiffuse.planners.rrt_connect import RRTConnectSettings
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE

@@ -95,7 +95,7 @@ class Batch:
         self.model: MotionModel = model
         self.problem, self.settings = problem, planner.settings
         self.checker = CollisionChecker(problem.robot, problem.scene)
-        self.clearances = link_clearances(self.checker, model.config)
+        self.clearances = link_clearances(self.checker, model.settings)
         self.guidance = CollisionGuidance(self.checker, self.settings.guidance)
         self.code = self.encode()
 
@@ -185,9 +185,9 @@ Inputs = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 def inputs(model: MotionModel) -> Inputs:
     """Of one pass of the denoiser, by its own shapes."""
-    config, generator = model.config, torch.Generator().manual_seed(SEED)
-    features = 2 * model.dof + config.sees_clearances * len(config.links) + config.sees_gradients * model.dof
-    condition = config.encoder_settings.code + 2 * model.dof
+    settings, generator = model.settings, torch.Generator().manual_seed(SEED)
+    features = model.dof * (2 + settings.sees_gradients) + settings.sees_clearances * len(model.robot.links)
+    condition = settings.encoder_settings.code + 2 * model.dof
     shapes = ((SAMPLES, model.rows, features), (SAMPLES,), (SAMPLES, condition))
     first, level, last = (torch.rand(shape, generator=generator) for shape in shapes)
     return first, level, last
@@ -291,10 +291,9 @@ def main() -> None:
     planner = RobotDiffuse(replace(NETWORK_ALONE, weights=arguments.weights))
     model = planner.model(PANDA)
     assert model is not None
-    config = model.config
-    print(
-        f"weights: {arguments.weights or 'the bundled ones'}: {config.denoiser}, {config.denoiser_settings}"
-    )
+    settings = model.settings
+    print(f"weights: {arguments.weights or 'the bundled ones'}")
+    print(f"{settings.denoiser}, {settings.denoiser_settings}")
     batches = [Batch(planner, case.problem) for case in draw_cases("rop", arguments.problems).hard]
     waiting(batches, arguments.repeats)
     split(batches, arguments.repeats)

@@ -21,7 +21,7 @@ from robotdiffuse.robots import load_robot
 
 STAGES = {
     "drawing scene, start and goals (inverse kinematics)": ("shard_maker.py", "draw"),
-    "search": ("shared_tree.py", "run"),
+    "search": ("shared_tree/planner.py", "run"),
     "judge": ("verify.py", "path"),
 }
 
@@ -70,7 +70,7 @@ def main() -> None:
         / whole
         for name, (file, function) in STAGES.items()
     }
-    shares["setting up, frames, records"] = 1 - sum(shares.values())
+    shares["setting up, waypoints, records"] = 1 - sum(shares.values())
     print_table(
         "Where it goes", ["stage", "share"], [[name, f"{100 * x:.0f} %"] for name, x in shares.items()]
     )

@@ -127,7 +127,7 @@ def main() -> None:
     tried(cases[:1], {"": sampled(from_network(loaded))}, title="compiling")
     grid = [(g, 1.0, n) for g in GRADIENT_STEPS for n in STEPS if n < LONG or g in (0, usual)]
     collision, free = try_all(loaded, cases, grid, "Collision guidance"), {}
-    if model.config.null_condition:
+    if model.settings.null_condition:
         scaled = [(g, scale, n) for g in (0, usual) for scale in SCALES for n in SCALED_STEPS]
         free = try_all(loaded, cases[: max(len(cases) // 2, 1)], scaled, "Classifier-free guidance")
     else:

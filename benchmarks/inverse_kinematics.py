@@ -7,14 +7,10 @@ at configurations drawn uniformly within the limits. Errors are measured by NumP
 """
 
 import argparse
-import os
-import platform
 import time
-from datetime import date
-from importlib.metadata import version
-from pathlib import Path
 
 import numpy as np
+from report import header
 
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
@@ -24,22 +20,12 @@ from robotdiffuse.transforms import rotation_angle, transform
 FRAME = "panda_hand"
 
 
-def processor() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.exists() else []
-    return next(
-        (line.split(": ")[1] for line in lines if line.startswith("model name")), platform.processor()
-    )
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description="Share solved, exactness and time of inverse kinematics.")
     parser.add_argument("--poses", type=int, default=1000)
     poses = parser.parse_args().poses
     robot, rng = load_robot("panda"), np.random.default_rng(0)
-    packages = ", ".join(f"{name} {version(name)}" for name in ("numpy", "numba"))
-    print(f"{date.today()}; {processor()}, one core; Python {platform.python_version()}, {packages}")
-    print(f"load average of the machine's {os.cpu_count()} cores before: {os.getloadavg()[0]:.1f}")
+    print(header("numpy", "numba"))
 
     start = time.perf_counter()
     inverse_kinematics(robot, FRAME, transform(np.array([0.4, 0.0, 0.4])), rng=rng)

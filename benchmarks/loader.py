@@ -27,7 +27,7 @@ from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import PackedScenes
 
-FRAMES, SLOTS, GOALS, SHARD = 254, 12, 10, 1000
+WAYPOINTS, SLOTS, GOALS, SHARD = 254, 12, 10, 1000
 POINTS, BATCH, DENSE_SHARE = 1400, 256, 0.15
 WARM_UP = 8
 TARGET = 20_000
@@ -42,7 +42,7 @@ def write_store(folder: str, robot: Robot, trajectories: int) -> None:
         joint_names=robot.joint_names,
         lower=tuple(robot.lower.tolist()),
         upper=tuple(robot.upper.tolist()),
-        frames=FRAMES,
+        waypoints=WAYPOINTS,
         timing="arc",
         families={"rop": {}, "rop_dense": {}},
         floors=dict.fromkeys(("rop", "rop_dense"), floor_record(ROP.floor)),
@@ -54,7 +54,7 @@ def write_store(folder: str, robot: Robot, trajectories: int) -> None:
         versions={},
     )
     write_manifest(folder, manifest)
-    rng, s = np.random.default_rng(0), np.linspace(0, 1, FRAMES, dtype=np.float32)[:, None]
+    rng, s = np.random.default_rng(0), np.linspace(0, 1, WAYPOINTS, dtype=np.float32)[:, None]
     for index in range(-(-trajectories // SHARD)):
         n = min(SHARD, trajectories - index * SHARD)
         ends = rng.uniform(robot.lower, robot.upper, (2, n, robot.dof)).astype(np.float32)
@@ -108,7 +108,7 @@ def main() -> None:
         count = len(RopDataset(folder, SPLITS[0]))
         opened = time.perf_counter() - start
         print(
-            f"{options.trajectories:,} trajectories of {FRAMES} frames, {size / 1e6:.0f} MB; opened in "
+            f"{options.trajectories:,} trajectories of {WAYPOINTS} waypoints, {size / 1e6:.0f} MB; opened in "
             f"{opened:.2f} s; split for training: {count:,}; clouds of {POINTS:,} points; batches of {BATCH}"
         )
         rows = []

@@ -31,9 +31,9 @@ from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.evaluation.methods import NETWORK_ALONE
 from robotdiffuse.evaluation.tables import Column
 from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial, tried
-from robotdiffuse.paths.shortcut import shortcut
+from robotdiffuse.paths.simplify import shortcut
+from robotdiffuse.planners.aorrtc import kernel
 from robotdiffuse.planners.robotdiffuse import Candidates, RobotDiffuse, unlearned_starts
-from robotdiffuse.planners.rrt_connect import kernel
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.family import Family, uniform_configurations
 from robotdiffuse.problems.problem import JointGoal
@@ -44,7 +44,7 @@ EACH = 4
 """Starts of refinement for each goal."""
 NODES = 2_000
 """Most of a search's trees."""
-REACH = np.float32(1.0)
+RANGE = np.float32(1.0)
 SHORTCUTS = 25
 
 Paths = list[ndarray | None]
@@ -70,7 +70,7 @@ def with_goals(case: Case, planner: RobotDiffuse, family: Family, count: int, pl
 def search(arena: Arena, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
     """Shortened; no rows if a pair of trees is full without a path."""
     trees = kernel.make_trees(arena.start, goal[None], NODES)
-    path = kernel.search(arena.space, trees, REACH, 2 * NODES, arena.state)
+    path = kernel.connect(arena.space, trees, RANGE, 2 * NODES, arena.state)
     return shortcut(arena.space, path, SHORTCUTS, arena.state) if len(path) else path
 
 
@@ -80,8 +80,8 @@ def by_network(arena: Arena, _seconds: float) -> Paths:
 
 
 def by_bumps(arena: Arena, _seconds: float) -> Paths:
-    frames = arena.model.config.frames
-    starts = [unlearned_starts(arena.start, goal, EACH, frames, PANDA, arena.rng) for goal in arena.goals]
+    waypoints = arena.model.settings.waypoints
+    starts = [unlearned_starts(arena.start, goal, EACH, waypoints, PANDA, arena.rng) for goal in arena.goals]
     q = np.concatenate(starts).astype(np.float32)
     return shortest_free(arena, Candidates(q, np.zeros(len(q), bool), ""))
 

@@ -22,7 +22,7 @@ import numpy as np
 from report import WIDTH, header
 from searches import bumps, network, search
 
-from problems import PANDA, RUNS, SEARCH_TIME, Case, Drawn, draw_cases, families_of
+from problems import PANDA, SEARCH_TIME, Case, Drawn, draw_cases, families_of
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     Draw,
@@ -64,7 +64,7 @@ def alone(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
             f"{name}, clearances hidden": from_network(of, hidden=True),
             f"{name}, both": from_network(of, other, hidden=True),
         }
-    control = without_network(planner.settings, model.config.frames)
+    control = without_network(planner.settings, model.settings.waypoints)
     return found | {"control: guidance of line and bumps": control}
 
 
@@ -140,7 +140,7 @@ def main() -> None:
         drawn = draw_cases(family, arguments.problems, arguments.cases)
         report(family, drawn, arguments.weights, arguments.parts)
     print(
-        f"\n* joint-space length against the shortest of {RUNS + 1} RRT-Connect runs with shortcuts, mean of "
+        "\n* joint-space length against a path of `aorrtc`, mean of "
         "ratios\nsingle: share of samples that pass the judge; best: problems with one that does. Shares "
         "with 95 %\nintervals; times are CPU time, as the machine may do other work."
     )

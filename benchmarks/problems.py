@@ -14,12 +14,12 @@ from typing import NamedTuple
 from rich.console import Console
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.problem_sets import RUNS, SEARCH_TIME, case_file, judge, search
+from robotdiffuse.evaluation.problem_sets import SEARCH_TIME, case_file, judge, search
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import SEED, Case, goal_of
 from robotdiffuse.robots import load_robot
 
-__all__ = ["PANDA", "RUNS", "SEARCH_TIME", "SEED", "Case", "draw_cases", "families_of", "goal_of"]
+__all__ = ["PANDA", "SEARCH_TIME", "SEED", "Case", "draw_cases", "families_of", "goal_of"]
 
 PANDA = load_robot("panda")
 

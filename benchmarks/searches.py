@@ -18,7 +18,7 @@ from robotdiffuse.collision.motion import search_space
 from robotdiffuse.evaluation.methods import Search
 from robotdiffuse.evaluation.trial import Trial
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.paths.shortcut import shortcut
+from robotdiffuse.paths.simplify import shortcut
 from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.robotdiffuse import Candidates, RobotDiffuse, unlearned_starts
@@ -30,6 +30,8 @@ DRAFT = {"samples": 4, "sampling_steps": 3}
 """Of the network's repeated batches."""
 BUMPS = 4
 """Unlearned starts in a repeated batch: as many."""
+CLEARANCE, SHORTCUTS = 0.002, 80
+"""Distance to obstacles that searches keep where the ends do [m]; attempts to shorten each candidate."""
 
 
 class Arena:
@@ -47,7 +49,7 @@ class Arena:
         self.model: MotionModel = model
         if self.ends.reachable:
             self.start, self.goals = self.ends.rows()
-            self.clearance = self.ends.kept_clearance(planner.settings.search.clearance)
+            self.clearance = self.ends.kept_clearance(CLEARANCE)
             self.space = search_space(self.checker, planner.settings.resolution, self.clearance)
 
     def line(self) -> Float[ndarray, "2 dof"] | None:
@@ -62,19 +64,19 @@ class Arena:
     def sampled(self, planner: RobotDiffuse, code: Float[ndarray, "code"]) -> Candidates:
         return planner.sample(self.model, self.checker, code, self.start, self.goals, self.rng)
 
-    def bumps(self, number: int) -> Float[ndarray, "n frames dof"]:
+    def bumps(self, number: int) -> Float[ndarray, "n waypoints dof"]:
         """The line, and as many random bumps as make up the number."""
-        frames = self.model.config.frames
-        return unlearned_starts(self.start, self.goals[0], number, frames, self.robot, self.rng)
+        waypoints = self.model.settings.waypoints
+        return unlearned_starts(self.start, self.goals[0], number, waypoints, self.robot, self.rng)
 
-    def refined(self, q: Float[ndarray, "n frames dof"]) -> Candidates:
+    def refined(self, q: Float[ndarray, "n waypoints dof"]) -> Candidates:
         return self.planner.refine(self.checker, q)
 
     def shortened(self, found: Candidates) -> Iterator[ndarray]:
         """The shortest of the free candidates after shortcuts."""
         settings = self.planner.settings
         for path in sorted(found.q[found.free], key=path_length)[: settings.shortened]:
-            yield shortcut(self.space, path, settings.shortcuts, self.state)
+            yield shortcut(self.space, path, SHORTCUTS, self.state)
 
 
 Tries = Callable[[Arena], Iterator[ndarray | None]]

@@ -6,9 +6,12 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
+APART = ("learning", "robots", "scenes", "viewer")
+"""Rooms whose tests need little of the compiled code of searches."""
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 
 
@@ -36,3 +39,12 @@ install_import_hook(checked_modules(), "beartype.beartype")
 # the same examples at every run: a suite that fails by chance guards nothing
 settings.register_profile("suite", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("suite")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Two workers begin with the first and the second half: where searches are not compiled yet, one compiles
+    them, while the other is busy with what does not need them."""
+    apart = [item for item in items if item.path.parent.name in APART]
+    others = [item for item in items if item.path.parent.name not in APART]
+    half = len(items) // 2
+    items[:] = [*others[:half], *apart, *others[half:]]

@@ -16,6 +16,7 @@ CHAIN = (
     "registry",
     "settings",
     "files",
+    "processes",
     "transforms",
     "types",
     "results",
@@ -39,7 +40,7 @@ EXTRAS = {
     "pybullet": {"simulation"},
     "pybullet_data": {"simulation"},
     "ompl": {"planners"},
-    "ray": {"generation"},
+    "ray": {"processes"},
     "zarr": {"data"},
     "accelerate": {"learning"},
     "viser": {"viewer"},
@@ -95,6 +96,16 @@ def run(code: str) -> str:
 def test_import_loads_nothing_heavy() -> None:
     code = "import sys, robotdiffuse, robotdiffuse.cli; print([m for m in {} if m in sys.modules])"
     assert run(code.format(("torch", "numba", "coal", "toppra", "matplotlib"))) == "[]"
+
+
+def test_searches_the_hybrid_the_judge_and_the_data_factory_load_no_pytorch() -> None:
+    """It takes longer to load than all else that their processes need at the start."""
+    code = (
+        "import sys, robotdiffuse.generation.shard_maker, robotdiffuse.verify\n"
+        "import robotdiffuse.planners.rrt_connect, robotdiffuse.planners.robotdiffuse\n"
+        "print('torch' in sys.modules)"
+    )
+    assert run(code) == "False"
 
 
 def test_public_names_resolve_and_verify_is_the_function() -> None:

@@ -18,6 +18,10 @@ READING_ORDER = (
 TABLES = {
     "Planners": "planners:PLANNERS",
     "Families of random problems": "problems.families:FAMILIES",
+    "Denoisers": "learning.denoisers:DENOISERS",
+    "Encoders": "learning.encoders:ENCODERS",
+    "Samplers": "learning.samplers:SAMPLERS",
+    "Guidance costs": "learning.costs:COSTS",
 }
 """On the page of parts by name."""
 MARK = re.compile(r"^<!-- generated: (.+) -->$", re.MULTILINE)

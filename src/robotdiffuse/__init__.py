@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from robotdiffuse.errors import InputError as InputError
     from robotdiffuse.planners import load_planner as load_planner
     from robotdiffuse.planners import plan as plan
+    from robotdiffuse.planners.many import plan_many as plan_many
     from robotdiffuse.problems.files import load_problem as load_problem
     from robotdiffuse.problems.problem import JointGoal as JointGoal
     from robotdiffuse.problems.problem import PoseGoal as PoseGoal
@@ -37,6 +38,7 @@ _HOME = {
     "load_result": "robotdiffuse.results",
     "load_planner": "robotdiffuse.planners",
     "plan": "robotdiffuse.planners",
+    "plan_many": "robotdiffuse.planners.many",
     "JointGoal": "robotdiffuse.problems.problem",
     "PoseGoal": "robotdiffuse.problems.problem",
     "Problem": "robotdiffuse.problems.problem",

@@ -50,6 +50,11 @@ class Registry(dict[str, Entry]):
             return None
         return getattr(import_module(entry.location.partition(":")[0]), entry.settings)
 
+    def defaults(self, name: str) -> Any:
+        """The settings of an entry as they are if nothing is said; None if it has none."""
+        kind = self.settings(name)
+        return None if kind is None else kind()
+
     def make(self, name: str, settings: object | None = None) -> Any:
         """An instance of the entry's class, with its default settings unless some are given.
 

@@ -17,6 +17,7 @@ import math
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -66,11 +67,16 @@ class Bound:
         return " and ".join(part for part in (low, high) if part) or "a number"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class OneOf:
     """A name in a table or list."""
 
     names: Iterable[str]
+
+
+@dataclass(frozen=True)
+class Filled:
+    """A tuple that has entries."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,8 @@ NotNegative = Annotated[float, Bound(least=0.0)]
 Share = Annotated[float, Bound(least=0.0, most=1.0)]
 Count = Annotated[int, Bound(least=1.0)]
 Natural = Annotated[int, Bound(least=0.0)]
+Sizes = Annotated[tuple[Count, ...], Filled()]
+"""Of layers, one at least."""
 
 
 class Setting(NamedTuple):
@@ -149,9 +157,10 @@ class Settings:
         found: dict[str, Any] = {}
         for name, field in fields.items():
             if name in values:
-                kind = _settings_class(hints[name], values, fields)
                 at = f"{where}.{name}"
-                if kind is not None and values[name] is not None:
+                # where there are none, what another field names need not be in a table
+                kind = None if values[name] is None else _settings_class(hints[name], values, fields)
+                if kind is not None:
                     found[name] = kind.from_json(values[name], at)
                 else:
                     found[name] = _typed(hints[name], values[name], at)
@@ -211,6 +220,7 @@ class Settings:
         return found
 
 
+@cache
 def _hints(kind: type) -> dict[str, Any]:
     hints = get_type_hints(kind, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(kind)}
@@ -248,6 +258,8 @@ def _check_mark(where: str, mark: Any, value: Any, owner: object) -> None:
         problem = mark.problem(value)
         if problem is not None:
             raise InputError(f"{where} is {value}; it must be {problem}")
+    elif isinstance(mark, Filled) and value == ():
+        raise InputError(f"{where} is (); it must have at least one entry")
     elif isinstance(mark, OneOf) and isinstance(value, str) and value not in mark.names:
         raise unknown_name(where, value, mark.names)
     elif isinstance(mark, SettingsOf):

@@ -32,6 +32,12 @@ class Status(Enum):
     """Every goal is out of limits or in collision."""
     UNREACHABLE_GOAL = "unreachable_goal"
     """Inverse kinematics found no configuration for the goal pose."""
+    ERROR = "error"
+    """Of many problems: this one raised an error, or its process died of it."""
+
+
+FIRST, SHORT, LIMIT = UNTIL = ("first", "short", "limit")
+"""When planning ends: with the first verified motion; when more time stops paying; when time runs out."""
 
 
 @dataclass(frozen=True, eq=False)

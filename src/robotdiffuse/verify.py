@@ -6,8 +6,10 @@ judge knows nothing of planners.
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Annotated
 
 import numpy as np
+from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision.exact import describe_contact
@@ -15,44 +17,43 @@ from robotdiffuse.collision.motion import Contact, ContinuousCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.settings import Bound, Natural, NotNegative, Positive, Settings
 from robotdiffuse.transforms import rotation_angle
 from robotdiffuse.types import Path, Trajectory
 
 
 @dataclass(frozen=True)
-class VerifySettings:
+class VerifySettings(Settings, name="verify"):
     """What counts as a violation."""
 
-    contact: float = 1e-4
-    """Meshes closer than this [m] count as touching; at or above it, clearances are certified."""
-    limit_slack: float = 1e-6
+    contact: Positive = 1e-4
+    """Meshes closer than this [m] count as touching; at or above it, clearances are certified, the smaller it
+    is, the longer it takes."""
+    limit_slack: NotNegative = 1e-6
     """Joint limits may be exceeded by this [rad] or [m]."""
-    start_tolerance: float = 1e-6
+    start_tolerance: NotNegative = 1e-6
     """Largest difference of any joint from the problem's start [rad] or [m]."""
-    goal_tolerance: float = 1e-4
+    goal_tolerance: NotNegative = 1e-4
     """Largest difference of any joint from one of the goal configurations [rad] or [m]."""
-    goal_distance: float = 0.01
+    goal_distance: NotNegative = 0.01
     """Largest distance from the position of a goal pose [m] (the paper's 1 cm)."""
-    goal_angle: float = float(np.radians(15))
+    goal_angle: NotNegative = float(np.radians(15))
     """Largest angle from the orientation of a goal pose [rad] (the paper's 15 degrees)."""
-    rate_slack: float = 0.01
+    rate_slack: NotNegative = 0.01
     """Share by which a trajectory may exceed velocity and acceleration limits."""
-    jump: float = 1.5
+    jump: Positive = 1.5
     """A step of a trajectory longer than this times what the velocity limit allows in its time is a jump."""
-    reversal_angle: float = float(np.radians(150))
+    reversal_angle: NotNegative = float(np.radians(150))
     """A turn in joint space by more than this [rad] is a sharp reversal ..."""
-    reversal_step: float = 0.05
+    reversal_step: NotNegative = 0.05
     """... if the straight moves before and after it are both at least this long [rad, joint-space L2]."""
-    reversals: int = 3
+    reversals: Natural = 3
     """More sharp reversals than this are twitching."""
-    tightness: float = 0.5
+    tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
     """Each clearance of a `Report` is at least this share of the least one that was measured, in (0, 1)."""
 
-    def __post_init__(self) -> None:
-        if not 0 < self.tightness < 1:
-            raise InputError(f"tightness is {self.tightness}; it must lie between 0 and 1, both excluded")
-        if self.contact <= 0:
-            raise InputError(f"contact is {self.contact}; it must be positive, or bisection has no end")
+
+DEFAULT = VerifySettings()
 
 
 @dataclass(frozen=True)
@@ -87,10 +88,6 @@ class Report:
     motion, at most 1 m. None for an invalid motion."""
     self_clearance: float | None
     """The same to the links that it is checked against."""
-    sphere_checks: int
-    """Configurations checked by covering spheres."""
-    mesh_checks: int
-    """Distances of one link to the scene or to another link, by exact meshes."""
 
     @property
     def min_clearance(self) -> float | None:
@@ -100,22 +97,20 @@ class Report:
         return min(self.scene_clearance, self.self_clearance)
 
 
-def verify(problem: Problem, path: Path, settings: VerifySettings | None = None) -> Report:
+def verify(problem: Problem, path: Path, settings: VerifySettings = DEFAULT) -> Report:
     """Judge a path for a problem. Raises InputError if its joints are not those of the robot."""
-    return verifier(problem, settings or VerifySettings()).path(path)
+    return verifier(problem, settings).path(path)
 
 
-def verify_trajectory(
-    problem: Problem, trajectory: Trajectory, settings: VerifySettings | None = None
-) -> Report:
+def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
     """Judge a trajectory, taken as straight in joint space between its rows, with its rates and times."""
-    return verifier(problem, settings or VerifySettings()).trajectory(trajectory)
+    return verifier(problem, settings).trajectory(trajectory)
 
 
 class Verifier:
     """Judges motions for one problem; what the robot and the scene need is prepared once."""
 
-    def __init__(self, problem: Problem, settings: VerifySettings) -> None:
+    def __init__(self, problem: Problem, settings: VerifySettings = DEFAULT) -> None:
         self.problem, self.settings, self.robot = problem, settings, problem.robot
 
     def path(self, path: Path) -> Report:
@@ -134,12 +129,12 @@ class Verifier:
                 )
         if not all(np.isfinite(values).all() for values in rows):
             violation = Violation("not_finite", 0.0, "the trajectory holds values that are not finite")
-            return Report(False, violation, None, None, 0, 0)
+            return Report(False, violation, None, None)
         backwards = np.flatnonzero(np.diff(trajectory.times) <= 0)
         if len(backwards):
             at = float(trajectory.times[backwards[0] + 1])
             message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
-            return Report(False, Violation("time", at, message), None, None, 0, 0)
+            return Report(False, Violation("time", at, message), None, None)
         return self._report(trajectory.positions, trajectory.times, self._rates(trajectory))
 
     def collision_free(self, path: Path) -> bool:
@@ -162,7 +157,7 @@ class Verifier:
         if len(bad):
             at = float(bad[0] if times is None else times[bad[0]])
             message = f"waypoint {bad[0]} holds values that are not finite"
-            return Report(False, Violation("not_finite", at, message), None, None, 0, 0)
+            return Report(False, Violation("not_finite", at, message), None, None)
         clock = np.arange(len(q), dtype=float) if times is None else times
         found = [
             v
@@ -181,7 +176,7 @@ class Verifier:
         violation = min(every, key=lambda v: v.time, default=None)
         valid = violation is None
         scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
-        return Report(valid, violation, scene, itself, sweep.sphere_checks, sweep.mesh_checks)
+        return Report(valid, violation, scene, itself)
 
     def _start(self, q: ndarray) -> Violation | None:
         difference = np.abs(q[0] - self.problem.start)
@@ -225,12 +220,10 @@ class Verifier:
 
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
         """More sharp reversals than allowed, counted on waypoints at least `reversal_step` apart."""
-        settings, kept = self.settings, [0]
+        settings = self.settings
         if not len(q) > settings.reversals + 2:
             return None
-        for i in range(1, len(q)):
-            if np.linalg.norm(q[i] - q[kept[-1]]) >= settings.reversal_step:
-                kept.append(i)
+        kept = _apart(np.ascontiguousarray(q, np.float64), settings.reversal_step)
         steps = np.diff(q[kept], axis=0)
         steps /= np.linalg.norm(steps, axis=1, keepdims=True)
         cosines = (steps[1:] * steps[:-1]).sum(axis=1)
@@ -268,8 +261,22 @@ class Verifier:
         return ContinuousCollision(self.robot, self.problem.scene, settings.contact, settings.tightness)
 
 
+@njit(cache=True)
+def _apart(q, step):
+    """Indices of rows of q[n, dof] that are each at least `step` from the one before, with the first."""
+    kept, count = np.zeros(len(q), np.int64), 1
+    for i in range(1, len(q)):
+        total = 0.0
+        for j in range(q.shape[1]):
+            total += (q[i, j] - q[kept[count - 1], j]) ** 2
+        if total >= step * step:
+            kept[count] = i
+            count += 1
+    return kept[:count]
+
+
 @lru_cache(maxsize=8)
-def verifier(problem: Problem, settings: VerifySettings) -> Verifier:
+def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
     """The Verifier of a problem; the last few are kept, so that many paths of one problem are judged fast."""
     return Verifier(problem, settings)
 

@@ -18,7 +18,7 @@ from robotdiffuse.data.manifest import read_manifest, write_manifest
 from robotdiffuse.data.shards import check_shard, shard_indices
 from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.factory import manifest_of
-from robotdiffuse.learning.denoisers import PAPER_SIZE
+from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
@@ -165,9 +165,12 @@ BAD_CALL = {
         ["plan", "problem.json", "--planner", "rrt_connect", "--weights", "w"],
         "planner rrt_connect has no weights",
     ),
-    "weights that are none": (["plan", "problem.json", "--weights", "."], "model.json"),
-    "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: a_star, d_star_lite"),
+    "weights that are none": (["plan", "problem.json", "--weights", "."], "holds no model"),
+    "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: a_star, aorrtc, d_star_lite"),
     "no time": (["plan", "problem.json", "--time-limit", "0"], "'0' is not a positive number"),
+    "unknown end": (["plan", "problem.json", "--until", "soon"], "'first', 'short', 'limit'"),
+    "negative clearance": (["plan", "problem.json", "--clearance", "-1"], "'-1' is not a number of at le"),
+    "scaled too far": (["plan", "problem.json", "--velocity-scaling", "2"], "'2' is not between 0 and 1"),
     "endless time": (["plan", "problem.json", "--time-limit", "inf"], "'inf' is not a positive number"),
     "negative seed": (["plan", "problem.json", "--seed", "-1"], "-1"),
     "unknown ending": (["plan", "problem.json", "--out", "r.xml"], "unknown ending '.xml'; known: .json"),
@@ -186,10 +189,10 @@ BAD_CALL = {
     "unknown schedule": ([*TRAIN, "--schedule", "sine"], "known: cosine, flow, linear"),
     "unknown objective": ([*TRAIN, "--objective", "score"], "known: clean, noise, velocity"),
     "unknown denoiser": ([*TRAIN, "--denoiser", "net"], "known: decoder_only, encoder_decoder, transformer"),
-    "unknown parametrization": ([*TRAIN, "--parametrization", "spline"], "known: b_spline, frames"),
+    "unknown parametrization": ([*TRAIN, "--parametrization", "spline"], "known: b_spline, waypoints"),
     "unknown target": ([*TRAIN, "--target", "line"], "known: absolute, residual"),
-    "rows of frames": ([*TRAIN, "--rows", "20"], "rows is 20"),
-    "too few frames": ([*TRAIN, "--frames", "2"], "frames is 2"),
+    "rows of waypoints": ([*TRAIN, "--rows", "20"], "rows is 20"),
+    "too few waypoints": ([*TRAIN, "--waypoints", "2"], "waypoints is 2"),
     "no condition at all": ([*TRAIN, "--condition-drop", "1"], "condition_drop is 1.0"),
     "unknown device": ([*TRAIN, "--device", "tpu"], "known: cpu, cuda"),
     "no factory": ([*TRAIN, "--generate", "0"], "'0' is not an integer of at least 1"),
@@ -223,7 +226,7 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         return {}
 
     monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
-    parts = ["--objective", "velocity", "--sampler", "euler", "--schedule", "flow", "--frames", "64"]
+    parts = ["--objective", "velocity", "--sampler", "euler", "--schedule", "flow", "--waypoints", "64"]
     spline = ["--parametrization", "b_spline", "--rows", "12", "--condition-drop", "0.2"]
     spline += ["--target", "residual"]
     assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, *spline, "--device", "cpu") == 0
@@ -233,12 +236,12 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
     assert changed == replace(
         paper,
         denoiser="unet",
-        denoiser_settings=PAPER_SIZE["unet"],
+        denoiser_settings=UNetSettings.paper_size(),
         objective="velocity",
         sampler="euler",
         schedule=ScheduleSettings(kind="flow"),
         target="residual",
-        frames=64,
+        waypoints=64,
         parametrization="b_spline",
         rows=12,
         condition_drop=0.2,
@@ -250,7 +253,7 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
 def test_data_are_made_meanwhile(tmp_path: Path) -> None:
     """The factory goes on by the manifest while the folder is used; it leaves whole shards and no process."""
     out = tmp_path / "data"
-    settings = GenerationSettings(trajectories=10_000, shard=2, frames=16)
+    settings = GenerationSettings(trajectories=10_000, shard=2, waypoints=16)
     out.mkdir()
     write_manifest(out, manifest_of(settings))
     with filled_meanwhile(str(out), 1, "panda"):
@@ -290,7 +293,7 @@ def test_problem_of_a_jsonl_file(tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def test_ctrl_c(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(*_: object) -> None:
+    def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("robotdiffuse.cli.plan.solve", interrupted)
@@ -310,7 +313,7 @@ def test_planners_lists_them_all_without_loading_them() -> None:
 def test_settings_of_a_planner_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("planners", "rrt_connect") == 0
     printed = capsys.readouterr().out
-    assert "reach" in printed and "1.0" in printed and "Longest extension of a tree" in printed
+    assert "range" in printed and "1.0" in printed and "Longest extension of a tree" in printed
     assert run("planners", "teleport") == 2
     assert "unknown planner 'teleport'" in capsys.readouterr().err
 
@@ -318,23 +321,23 @@ def test_settings_of_a_planner_are_listed(capsys: pytest.CaptureFixture[str]) ->
 def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     given: list[object] = []
 
-    def solve(_problem: object, planner: str, *rest: object) -> PlanResult:
+    def solve(_problem: object, planner: str, *rest: object, **_request: object) -> PlanResult:
         given.extend(rest)
         return PlanResult(Status.NO_PATH, "none", planner, "panda", 0.1, 0)
 
     monkeypatch.setattr("robotdiffuse.cli.plan.solve", solve)
-    sets = ("--set", "search.reach=0.5", "--set", "samples=4")
+    sets = ("--set", "search.range=0.5", "--set", "samples=4")
     assert run("plan", write(tmp_path), *sets) == 1
-    settings = planner_settings("robotdiffuse", ["samples=4", "search.reach=0.5"])
+    settings = planner_settings("robotdiffuse", ["samples=4", "search.range=0.5"])
     assert settings in given and settings != planner_settings("robotdiffuse", [])
 
 
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("reech=0.5", "has no setting 'reech'; it has reach=1.0, resolution=0.05, "),
-        ("reach=0", "rrt_connect.reach is 0.0; it must be positive"),
-        ("reach", "'reach' is not NAME=VALUE; rrt_connect has reach=1.0, "),
+        ("rangee=0.5", "has no setting 'rangee'; it has range=1.0, resolution=0.05, "),
+        ("range=0", "rrt_connect.range is 0.0; it must be positive"),
+        ("range", "'range' is not NAME=VALUE; rrt_connect has range=1.0, "),
     ],
 )
 def test_wrong_settings_are_told(
@@ -364,7 +367,7 @@ def test_data_generate_is_resumed_and_refuses_other_settings(
     command = ("data", "generate", "--out", "set", "--trajectories", 4, "--shard", 2, "--workers", 1)
     assert run(*command) == 0
     first = capsys.readouterr().out
-    assert first == "4 trajectories of 254 frames in set\n" and run(*command) == 0
+    assert first == "4 trajectories of 254 waypoints in set\n" and run(*command) == 0
     assert capsys.readouterr().out == first
     assert run(*command, "--seed", 1) == 2
     assert "seed 0, not 1" in capsys.readouterr().err

@@ -43,8 +43,9 @@ def test_info_prints_figures_and_writes_the_page(folder, capsys):
     printed = capsys.readouterr().out
     for text in (
         "panda: 5 motions",
-        "100, evenly spaced in length",
-        "9: 71.4 % solved",
+        "waypoints, evenly spaced in length",
+        "71.4 %",
+        "of 9 problems",
         "rop_dense",
         "length [rad]",
         "clearance [cm]",
@@ -67,7 +68,7 @@ def test_check_finds_a_collision(folder, capsys):
     assert run("data", "check", folder, "--workers", 1) == 1
     printed = capsys.readouterr().out
     assert "violations found" in printed and printed.count("shard 0, row 2") == 2
-    assert re.search(r"found by PyBullet *│ *1 ", printed) and "inside sphere" in printed
+    assert re.search(r"found by PyBullet +1\b", printed) and "inside sphere" in printed
 
 
 def test_view_shows_samples_in_one_page(folder, capsys, monkeypatch):
@@ -91,7 +92,7 @@ def test_view_shows_samples_in_one_page(folder, capsys, monkeypatch):
 def test_export(folder, capsys):
     two = Scene([Sphere([2.0, 0.0, 0.5], 0.25), Sphere([2.0, 1.0, 0.5], 0.25)])
     folder = folder.parent / "spheres"
-    write_motions(folder, PANDA, [record(PANDA, two, line(START, GOAL, 254))], frames=254)
+    write_motions(folder, PANDA, [record(PANDA, two, line(START, GOAL, 254))], waypoints=254)
     file = folder.parent / "robot.npz"
     assert run("data", "export", folder, file) == 0
     assert "1 motions" in capsys.readouterr().out

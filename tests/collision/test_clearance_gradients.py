@@ -12,16 +12,15 @@ from robotdiffuse.collision.arrays import compile_robot
 from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.collision.signed_distance import SignedDistance
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.checkpoint import load_model, save_model
+from robotdiffuse.learning.checkpoint import load_model, save_network
 from robotdiffuse.learning.clearances import link_clearances
-from robotdiffuse.learning.denoisers import TransformerSettings
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.config import PlannerTraining
-from robotdiffuse.learning.training.planner import moving_links
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
@@ -43,14 +42,8 @@ def configurations(*shape: int, seed: int = 0) -> np.ndarray:
     return q.astype(np.float32)
 
 
-def model_config(robot: Robot, **changes) -> MotionModelConfig:
-    return MotionModelConfig(
-        robot=robot.name,
-        joint_names=robot.joint_names,
-        lower=tuple(robot.lower.tolist()),
-        upper=tuple(robot.upper.tolist()),
-        frame_offsets=tuple(tuple(tuple(row) for row in T) for T in robot.frame_offsets.tolist()),
-        links=moving_links(robot),
+def model_settings(**changes) -> MotionModelSettings:
+    return MotionModelSettings(
         denoiser_settings=TransformerSettings(width=32, layers=1, heads=2, hidden=48, patch=8),
         **changes,
     )
@@ -62,7 +55,7 @@ def test_training_is_told_what_planning_is() -> None:
     scenes = [family.scene(rng) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     scenes.append(Scene(scenes[0].shapes[:1]))
     packed = PackedScenes.pack(scenes, 12, floor=True)
-    q, config = configurations(len(packed), 60), model_config(PANDA, sees_gradients=True)
+    q, config = configurations(len(packed), 60), model_settings(sees_gradients=True)
     given = compile_robot(PANDA), packed, q, config.clearance_high
     clearances, gradients = packed_clearances_and_gradients(*given, config.gradient_margin)
     np.testing.assert_array_equal(clearances, packed_link_clearances(*given))
@@ -144,9 +137,9 @@ def test_what_the_denoiser_sees() -> None:
     q = configurations(2, 16, seed=6).astype(np.float64)
     for sees in (False, True):
         torch.manual_seed(0)
-        model = MotionModel(model_config(PANDA, frames=16, sees_gradients=sees))
+        model = MotionModel(RobotIdentity.of(PANDA), model_settings(waypoints=16, sees_gradients=sees))
         between = model.between(q[:, 0], q[:, -1])
-        told = link_clearances(CollisionChecker(PANDA, scene), model.config)
+        told = link_clearances(CollisionChecker(PANDA, scene), model.settings)
         seen[sees] = model.features(model.to_rows(q.astype(np.float32), between), between, told)
     np.testing.assert_array_equal(seen[True][..., : seen[False].shape[-1]], seen[False])
     gradients = seen[True][..., seen[False].shape[-1] :]
@@ -159,7 +152,7 @@ def test_what_the_denoiser_sees() -> None:
         checker.cost_gradients(at, MARGIN, self_margin=-1.0)[0] for at in (q.reshape(-1, 7)[hit], inwards)
     ]
     assert hit.sum() > 3 and (costs[1] > costs[0]).all()
-    sampled = model.sample(np.zeros(model.config.encoder_settings.code), q[0, 0], q[0, -1], 2, rng, told, 2)
+    sampled = model.sample(np.zeros(model.settings.encoder_settings.code), q[0, 0], q[0, -1], 2, rng, told, 2)
     assert sampled.shape == (2, 16, 7)
 
 
@@ -167,13 +160,13 @@ def test_gradients_need_clearances() -> None:
     with pytest.raises(InputError, match="sees_gradients is True and sees_clearances is False"):
         PlannerTraining(data="data", encoder="encoder", sees_clearances=False, sees_gradients=True)
     with pytest.raises(InputError, match="sees_gradients"):
-        model_config(PANDA, sees_clearances=False, sees_gradients=True)
+        model_settings(sees_clearances=False, sees_gradients=True)
 
 
 def test_models_from_before_see_none(tmp_path) -> None:
-    save_model(MotionModel(model_config(PANDA)), tmp_path, {})
+    save_network("model", MotionModel(RobotIdentity.of(PANDA), model_settings()), tmp_path, {})
     about = json.loads((tmp_path / "model.json").read_text())
     for name in ("sees_gradients", "gradient_margin", "gradient_unit"):
-        del about["model"][name]
+        del about["settings"][name]
     (tmp_path / "model.json").write_text(json.dumps(about))
-    assert load_model(tmp_path, PANDA).config == model_config(PANDA)
+    assert load_model(tmp_path, PANDA).settings == model_settings()

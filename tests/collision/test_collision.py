@@ -11,6 +11,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from helpers.box_arm import box_arm
+from helpers.clearances import least_clearance
 from helpers.example_robots import example_robot
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.arrays import compile_scene, robot_groups
@@ -162,7 +163,7 @@ def test_clearances_are_exact(name: str) -> None:
     assert checker.pairs == robot.checked_pairs()
     np.testing.assert_allclose(checker.pair_clearances(q), between, atol=TOLERANCE)
     least = np.minimum(right.min(axis=1), between.min(axis=1, initial=1))
-    np.testing.assert_allclose(checker.clearance(q), least, atol=TOLERANCE)
+    np.testing.assert_allclose(least_clearance(checker, q), least, atol=TOLERANCE)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -176,7 +177,7 @@ def test_free_is_the_sign_of_the_clearance(name: str, padding: float) -> None:
     )
     clear = np.abs(least) > TOLERANCE
     np.testing.assert_array_equal(checker.free(q)[clear], (least > 0)[clear])
-    np.testing.assert_array_equal((checker.clearance(q) > 0)[clear], (least > 0)[clear])
+    np.testing.assert_array_equal((least_clearance(checker, q) > 0)[clear], (least > 0)[clear])
     assert 0 < checker.free(q).mean() < 1
 
 
@@ -218,7 +219,7 @@ def test_any_number_of_configurations(count: int) -> None:
     robot = with_spheres("panda")
     checker, q = CollisionChecker(robot, solids()), rows(robot, 17)
     np.testing.assert_array_equal(checker.free(q[:count]), checker.free(q)[:count])
-    np.testing.assert_array_equal(checker.clearance(q[:count]), checker.clearance(q)[:count])
+    np.testing.assert_array_equal(least_clearance(checker, q[:count]), least_clearance(checker, q)[:count])
     assert checker.cost_gradients(q[:count], 0.05)[1].shape == (count, robot.dof)
 
 
@@ -248,7 +249,7 @@ def test_self_collision() -> None:
     checker = CollisionChecker(allowed, Scene())
     assert checker.free(q).all()
     assert checker.pair_clearances(q).shape == (3000, 0)
-    assert (checker.clearance(q) == 1).all()
+    assert (least_clearance(checker, q) == 1).all()
 
 
 def test_locked_fingers_change_the_result() -> None:
@@ -345,7 +346,7 @@ def test_points_just_beyond_the_reach_count() -> None:
     q = np.zeros((1, 3))
     right = link_distances(robot, scene, q).min()
     assert 0.02 < right < 0.1
-    assert CollisionChecker(robot, scene).clearance(q)[0] == pytest.approx(right, abs=TOLERANCE)
+    assert least_clearance(CollisionChecker(robot, scene), q)[0] == pytest.approx(right, abs=TOLERANCE)
     assert CollisionChecker(robot, scene, right - 0.001).free(q)[0]
     assert not CollisionChecker(robot, scene, right + 0.001).free(q)[0]
 
@@ -372,9 +373,9 @@ def test_links_with_spheres_larger_than_the_grids_band() -> None:
     np.testing.assert_array_equal(cloud.free(q), spheres.free(q))
     free = cloud.free(q)
     assert 0 < free.mean() < 1
-    assert ((cloud.clearance(q) > 0) == free).all()
+    assert ((least_clearance(cloud, q) > 0) == free).all()
     # no cost from points that are further away than the margin
-    clear = spheres.clearance(q) > 0.05
+    clear = least_clearance(spheres, q) > 0.05
     assert (cloud.cost_gradients(q[clear], 0.04)[0] == 0).all()
 
 
@@ -453,7 +454,7 @@ def test_a_robot_without_spheres_is_free() -> None:
     q = rows(robot, 5)
     assert checker.links == checker.pairs == ()
     assert checker.free(q).all()
-    assert (checker.clearance(q) == 1).all()
+    assert (least_clearance(checker, q) == 1).all()
     costs, gradients = checker.cost_gradients(q, 0.05)
     assert not costs.any()
     assert not gradients.any()
@@ -477,7 +478,7 @@ def test_fixed_links_do_not_count_against_the_scene() -> None:
 
 def test_wrong_configurations_are_refused() -> None:
     checker = CollisionChecker(box_arm(), Scene())
-    for call in (checker.free, checker.clearance, checker.link_clearances, checker.pair_clearances):
+    for call in (checker.free, checker.link_clearances, checker.pair_clearances):
         with pytest.raises(InputError, match="q has 4 columns; it must have the 3 planned joints"):
             call(np.zeros((2, 4)))
         with pytest.raises(InputError, match="not finite"):
@@ -491,7 +492,7 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
     def use(scene: Scene) -> None:
         checker = CollisionChecker(robot, scene)
         checker.free(q)
-        checker.clearance(q)
+        least_clearance(checker, q)
         checker.cost_gradients(q, 0.05)
 
     def compiled() -> list[int]:

@@ -11,19 +11,20 @@ from torch.utils.data import DataLoader
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays, write_store
-from robotdiffuse.data.dataset import RopBatch, RopDataset, resample
+from robotdiffuse.data.dataset import RopBatch, RopDataset
 from robotdiffuse.data.manifest import write_manifest
+from robotdiffuse.data.rows import resample
 from robotdiffuse.data.shards import SPLITS, read_shard, shard_path, split_of, write_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
 
-ARM, FRAMES, SIZES = box_arm(), 20, (150, 0, 130, 40)
+ARM, WAYPOINTS, SIZES = box_arm(), 20, (150, 0, 130, 40)
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rop")
-    write_store(folder, ARM, SIZES, FRAMES)
+    write_store(folder, ARM, SIZES, WAYPOINTS)
     return folder
 
 
@@ -161,13 +162,13 @@ def test_bad_input(store, tmp_path):
         RopDataset(store).batches(0)
     with pytest.raises(InputError, match="no data set"):
         RopDataset(tmp_path)
-    write_manifest(tmp_path, manifest_of(ARM, FRAMES))
+    write_manifest(tmp_path, manifest_of(ARM, WAYPOINTS))
     with pytest.raises(InputError, match="holds no shard"):
         RopDataset(tmp_path)
-    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), FRAMES + 1), {})
+    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), WAYPOINTS + 1), {})
     with pytest.raises(InputError, match=r"shard_00000\.zarr, array trajectories has rows of shape"):
         RopDataset(tmp_path)
-    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), FRAMES), {})
+    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), WAYPOINTS), {})
     file = next(p for p in (shard_path(tmp_path, 0) / "trajectories" / "c").rglob("*") if p.is_file())
     file.write_bytes(b"")
     with pytest.raises(InputError, match=r"shard_00000\.zarr, array trajectories is damaged"):

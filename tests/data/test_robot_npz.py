@@ -36,7 +36,7 @@ def two_spheres(count: int = 3) -> list[dict[str, np.ndarray]]:
 
 def made(folder: Path, **changes: np.ndarray) -> Path:
     """A robot.npz of them, with some arrays changed."""
-    write_motions(folder / "set", PANDA, two_spheres(), frames=254)
+    write_motions(folder / "set", PANDA, two_spheres(), waypoints=254)
     export_npz(folder / "set", folder / "robot.npz")
     with np.load(folder / "robot.npz") as file:
         arrays = {name: file[name] for name in file.files}
@@ -76,7 +76,9 @@ def test_export_for_the_authors(tmp_path):
 def test_what_cannot_be_exported(tmp_path):
     store = tmp_path / "arm"
     write_store(store, box_arm(), (3,), 20)
-    with pytest.raises(InputError, match=r"20 frames of 3 joints; robot\.npz holds 254 frames of 7 joints"):
+    with pytest.raises(
+        InputError, match=r"20 waypoints of 3 joints; robot\.npz holds 254 waypoints of 7 joints"
+    ):
         export_npz(store, tmp_path / "robot.npz")
     write_store(tmp_path / "panda", PANDA, ())
     with pytest.raises(InputError, match="no scene of exactly two spheres"):
@@ -131,7 +133,10 @@ def test_what_cannot_be_imported(tmp_path, monkeypatch):
         ({"x_train": x, "y_train": y[:2]}, r"y_train has shape \(2, 23\); it must be n x 23"),
         ({"x_train": x[:0], "y_train": y[:0]}, "with n at least 1"),
         ({"x_train": endless, "y_train": y}, "x_train holds numbers that are not finite"),
-        ({"x_train": x, "y_train": moved}, "row 1 has a goal that differs from its last frame by 0.01 rad"),
+        (
+            {"x_train": x, "y_train": moved},
+            "row 1 has a goal that differs from its last waypoint by 0.01 rad",
+        ),
         ({"x_train": np.array(["text"]), "y_train": y}, "is no robot.npz"),
     ]:
         np.savez(file, allow_pickle=False, **arrays)

@@ -34,17 +34,17 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.scenes.packed import PackedScenes
 
-ARM, FRAMES = box_arm(), 12
+ARM, WAYPOINTS = box_arm(), 12
 
 
 @pytest.fixture
 def arrays():
-    return random_arrays(ARM, 7, np.random.default_rng(0), FRAMES)
+    return random_arrays(ARM, 7, np.random.default_rng(0), WAYPOINTS)
 
 
 @pytest.fixture
 def store(tmp_path):
-    write_store(tmp_path, ARM, (7, 3), FRAMES)
+    write_store(tmp_path, ARM, (7, 3), WAYPOINTS)
     return tmp_path
 
 
@@ -65,17 +65,17 @@ def test_what_is_written_is_read(tmp_path, arrays):
     assert not shard["trajectories"].flags.writeable
     assert set(read_shard(tmp_path, 3, ("cost", "seed")).arrays) == {"cost", "seed"}
     assert shard_indices(tmp_path) == [3]
-    check_shard(tmp_path, 3, manifest_of(ARM, FRAMES))
+    check_shard(tmp_path, 3, manifest_of(ARM, WAYPOINTS))
 
 
 def test_times_and_no_rows(tmp_path, arrays):
-    timed = {name: array[:0] for name, array in arrays.items()} | {"times": np.zeros((0, FRAMES))}
+    timed = {name: array[:0] for name, array in arrays.items()} | {"times": np.zeros((0, WAYPOINTS))}
     write_shard(tmp_path, 0, timed, {})
-    shard = check_shard(tmp_path, 0, manifest_of(ARM, FRAMES, timing="time"))
+    shard = check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS, timing="time"))
     assert len(shard) == 0
-    assert shard["trajectories"].shape == (0, FRAMES, ARM.dof)
+    assert shard["trajectories"].shape == (0, WAYPOINTS, ARM.dof)
     with pytest.raises(InputError, match="array times: it must be there only where timing is time"):
-        check_shard(tmp_path, 0, manifest_of(ARM, FRAMES))
+        check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))
 
 
 def test_the_store_is_plain_zarr(store):
@@ -104,12 +104,12 @@ def test_a_compressed_or_divided_array_is_read_too(tmp_path, arrays):
         group.create_array(
             "trajectories",
             data=arrays["trajectories"],
-            chunks=(rows, FRAMES, ARM.dof),
+            chunks=(rows, WAYPOINTS, ARM.dof),
             compressors=compressors,
             attributes=prints,
             overwrite=True,
         )
-        q = check_shard(tmp_path, 0, manifest_of(ARM, FRAMES))["trajectories"]
+        q = check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))["trajectories"]
         assert not isinstance(q, np.memmap)
         np.testing.assert_array_equal(q, arrays["trajectories"])
 
@@ -150,7 +150,7 @@ def die(self, name, **how):
     if name == "goals":
         os.kill(os.getpid(), 9)
 zarr.Group.create_array = die
-write_shard({str(store)!r}, 1, random_arrays(box_arm(), 3, np.random.default_rng(5), {FRAMES}), {{}})
+write_shard({str(store)!r}, 1, random_arrays(box_arm(), 3, np.random.default_rng(5), {WAYPOINTS}), {{}})
 """
     assert subprocess.run([sys.executable, "-c", code]).returncode == -9
     assert shard_indices(store) == [0, 1]
@@ -244,7 +244,7 @@ def test_numbers_that_are_not_finite(tmp_path, arrays):
     arrays["trajectories"][1, 2, 0] = np.nan
     write_shard(tmp_path, 0, arrays, {})
     with pytest.raises(InputError, match="array trajectories holds numbers that are not finite"):
-        check_shard(tmp_path, 0, manifest_of(ARM, FRAMES))
+        check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))
 
 
 def test_manifest(tmp_path):
@@ -254,7 +254,7 @@ def test_manifest(tmp_path):
     write_manifest(tmp_path, manifest)
     assert read_manifest(tmp_path) == manifest
     data = json.loads((tmp_path / "manifest.json").read_text())
-    assert (data["format"], data["dof"], data["frames"]) == (1, 3, 254)
+    assert (data["format"], data["dof"], data["waypoints"]) == (1, 3, 254)
     for change, message in [
         ({"format": 2}, r"manifest\.json: format is 2; this version reads 1"),
         ({"wings": 2}, r"manifest\.json is damaged: .*wings"),

@@ -11,11 +11,13 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation import ablation
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.statistics import bootstrap_interval
-from robotdiffuse.learning.denoisers import DENOISERS, Transformer
-from robotdiffuse.learning.encoders import ENCODERS
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.denoisers.transformer import Transformer
+from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
-from robotdiffuse.learning.training.planner import _model_config
+from robotdiffuse.learning.training.planner import _model_settings
 from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")
@@ -26,21 +28,21 @@ def test_every_config_makes_a_model(name: str) -> None:
     given = {"data": "data"} if "encoder" in CONFIGS[name].changes else {"data": "data", "encoder": "folder"}
     settings = planner_training(name, given)
     encoder = settings.encoder if settings.jointly else "compression_autoencoder"
-    network, kind = ENCODERS[encoder]
-    model = MotionModel(_model_config(settings, PANDA, network(kind())))
-    assert isinstance(model.denoiser, DENOISERS[settings.denoiser][0])
+    model = MotionModel(RobotIdentity.of(PANDA), _model_settings(settings, make_encoder(encoder)))
+    assert isinstance(model.denoiser, DENOISERS.load(settings.denoiser))
     assert (settings.minutes is None) != (settings.samples is None)
 
 
 def test_the_papers_config_has_its_figures() -> None:
     settings = planner_training("paper", {"data": "data", "encoder": "folder"})
     assert settings.samples == 64 * 25_000 and settings.batch == 64 and settings.learning_rate == 3e-4
-    assert settings.schedule.steps == 200 and settings.frames == 254 and settings.objective == "clean"
-    model = MotionModel(_model_config(settings, PANDA, ENCODERS["compression_autoencoder"][0](
-        ENCODERS["compression_autoencoder"][1]())))  # fmt: skip
+    assert settings.schedule.steps == 200 and settings.waypoints == 254 and settings.objective == "clean"
+    model = MotionModel(
+        RobotIdentity.of(PANDA), _model_settings(settings, make_encoder("compression_autoencoder"))
+    )
     assert isinstance(model.denoiser, Transformer)
     assert (model.denoiser.settings.width, model.denoiser.settings.layers) == (512, 8)
-    assert model.config.encoder_settings.code == 60
+    assert model.settings.encoder_settings.code == 60
 
 
 def test_what_is_given_beside_a_config_wins() -> None:
@@ -79,6 +81,8 @@ def test_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     base = ["bench", "ablation", "--data", str(tmp_path), "--out", str(tmp_path / "out")]
     assert main([*base, "--rows", "Ourz"]) == 2
     assert "known: " in capsys.readouterr().err
+    assert main([*base, "--family", "ropp"]) == 2
+    assert "known: crate" in capsys.readouterr().err
     assert main(base) == 2 and "no data set" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main([*base, "--samples", "0"])

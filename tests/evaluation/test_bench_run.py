@@ -23,8 +23,9 @@ from robotdiffuse.evaluation.problem_sets import gather_cases, judge
 from robotdiffuse.evaluation.records import Record, RecordFile, read_records
 from robotdiffuse.evaluation.trial import Trial
 from robotdiffuse.planners import PLANNERS
+from robotdiffuse.planners.aorrtc.planner import AORRTCSettings
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse
-from robotdiffuse.planners.rrt_connect.planner import RRTConnect
+from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length
 from robotdiffuse.types import Path as Motion
@@ -77,7 +78,7 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
     far_side = sys.executable, str(Path(faulty_planner.__file__))
     monkeypatch.setattr(planner_process, "FAR_SIDE", far_side)
-    monkeypatch.setattr(planner_process, "PATIENCE", 20.0)
+    monkeypatch.setattr(planner_process, "PATIENCE", 6.0)
     monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
 
 
@@ -125,7 +126,7 @@ def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Pat
     before = {file: file.read_text() for file in (tmp_path / "records").iterdir()}
     assert main(arguments) == 0
     for file in (tmp_path / "records").iterdir():
-        assert file.read_text().startswith(before[file].rpartition("\n")[0])
+        assert file.read_text().startswith(before.get(file, "").rpartition("\n")[0])
         assert keys(RecordFile(file).records) == {("rop", f"rop/{i}", 0, 2.0): 1 for i in range(4)}
 
 
@@ -218,9 +219,14 @@ def test_a_planner_with_settings_is_a_row_of_its_own(tmp_path: Path) -> None:
     planner = Contestant.of(texts[1]).load()
     assert isinstance(planner, RRTConnect)
     assert (planner.settings.optimize_time, planner.settings.shortcuts) == (0.05, 0)
-    nested = Contestant.of("robotdiffuse:search.reach=0.5:samples=4").load()
+    calls = Contestant.of("aorrtc:until=limit:gain=0.01:clearance=0")
+    assert calls.request()["until"] == "limit" and calls.request()["clearance"] == 0
+    assert calls.load().settings == AORRTCSettings(gain=0.01)
+    with pytest.raises(InputError, match="unknown until 'soon'"):
+        Contestant.of("aorrtc:until=soon")
+    nested = Contestant.of("robotdiffuse:search.range=0.5:samples=4").load()
     assert isinstance(nested, RobotDiffuse)
-    assert (nested.settings.search.reach, nested.settings.samples) == (0.5, 4)
+    assert (nested.settings.search.range, nested.settings.samples) == (0.5, 4)
 
 
 @pytest.mark.parametrize("cut", [1, 20, 100])
@@ -284,9 +290,9 @@ def test_problems_of_files_and_folders(tmp_path: Path) -> None:
         ({"planners": ("rrt_connect", "rrt_connect")}, "called the same"),
         ({"planners": ("rrt_connect@.",)}, "rrt_connect has no weights"),
         ({"planners": ("rrt_connect:stp=1",)}, "rrt_connect has no setting 'stp'; it has .*shortcuts"),
-        ({"planners": ("rrt_connect:reach=-1",)}, "rrt_connect.reach is -1.0; it must be positive"),
-        ({"planners": ("rrt_connect:reach",)}, "'reach' is not NAME=VALUE"),
-        ({"planners": ("robotdiffuse@nowhere",)}, "model.json is missing"),
+        ({"planners": ("rrt_connect:range=-1",)}, "rrt_connect.range is -1.0; it must be positive"),
+        ({"planners": ("rrt_connect:range",)}, "'range' is not NAME=VALUE"),
+        ({"planners": ("robotdiffuse@nowhere",)}, "nowhere holds no model"),
         ({"planners": ("mpnet@nowhere",)}, "nowhere holds no mpnet"),
         ({"problems": ("rop", "rop")}, "none twice"),
         ({"problems": ("ropp",)}, "neither a file or folder nor a family"),

@@ -62,10 +62,10 @@ def test_collision_is_found_by_both_judges(tmp_path, pybullet):
 
 def test_collision_between_frames_is_found(tmp_path, pybullet):
     thin = Scene([Box([0.0, 1.1, 0.0], [0.01, 0.01, 0.01])])
-    q = line(AWAY, BACK, frames=4)
+    q = line(AWAY, BACK, waypoints=4)
     row = record(ARM, thin, q)
     assert row["clearance"] > 0.05
-    write_motions(tmp_path, ARM, [row], frames=4)
+    write_motions(tmp_path, ARM, [row], waypoints=4)
     assert found(tmp_path) == {"collision": 1, "pybullet": 1}
 
 
@@ -81,7 +81,7 @@ def test_limit_violation_is_found(tmp_path, pybullet):
     check = check_data(tmp_path, ARM)
     assert {kind: n for kind, n in check.counts.items() if n} == {"limits": 1}
     (example,) = check.examples
-    assert example.where == "shard 0, row 1" and "j0 is 2.801 at frame 7" in example.message
+    assert example.where == "shard 0, row 1" and "j0 is 2.801 at waypoint 7" in example.message
 
 
 def test_start_out_of_limits_is_found(tmp_path, pybullet):

@@ -12,8 +12,8 @@ from helpers.box_arm import box_arm
 from helpers.motion_stores import random_motions, write_motions
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.data import report
-from robotdiffuse.evaluation.data.page import size_in_words, write_page
-from robotdiffuse.evaluation.data.report import FRAMES_KEPT, QUANTILES, describe, read_columns
+from robotdiffuse.evaluation.data.page import write_page
+from robotdiffuse.evaluation.data.report import FRAMES_KEPT, facts, read_figures, size_in_words, tables
 from robotdiffuse.robots import load_robot
 
 ARM = box_arm()
@@ -26,33 +26,32 @@ def rows():
 
 def test_figures(tmp_path, rows):
     write_motions(tmp_path, ARM, rows, shard=4)
-    summary = describe(tmp_path)
+    found = read_figures(tmp_path)
     costs = np.array([row["cost"] for row in rows])
-    assert (summary.trajectories, summary.planned, summary.shards, summary.frames) == (11, 11, 3, 220)
-    assert summary.counts == {"tried": 17, "solved": 11, "unsolved": 3, "refused": 0, "thinned": 3}
-    assert summary.success == pytest.approx(11 / 14)
-    assert sum(summary.splits.values()) == 11 and list(summary.splits) == ["train", "validation", "test"]
-    assert summary.length.mean == pytest.approx(costs.mean())
-    assert summary.length.quantiles == pytest.approx(np.quantile(costs, QUANTILES))
-    assert summary.detour.quantiles == pytest.approx(np.ones(5), abs=1e-5)
-    assert summary.trivial == pytest.approx(7 / 11)
-    assert summary.safety_distance == pytest.approx(0.05) and summary.kept == summary.kept_throughout == 1.0
-    assert summary.goals_reached == 1
-    assert {name: family.trajectories for name, family in summary.families.items()} == {
-        "rop": 6,
-        "rop_dense": 5,
-    }
-    assert summary.bytes == sum(f.stat().st_size for f in tmp_path.glob("*.zarr/**/*") if f.is_file())
+    assert (found.trajectories, found.manifest.trajectories, found.shards) == (11, 11, 3)
+    assert facts(found)[:2] == [("11", "motions"), ("220", "waypoints, evenly spaced in length")]
+    assert found.counts == {"tried": 17, "solved": 11, "unsolved": 3, "refused": 0, "thinned": 3}
+    assert found.success == pytest.approx(11 / 14)
+    assert sum(found.splits.values()) == 11 and list(found.splits) == ["train", "validation", "test"]
+    _, families, spreads = tables(found)
+    assert [row[:2] for row in families.rows] == [("rop", 6), ("rop_dense", 5)]
+    lengths = [costs.mean(), *np.quantile(costs, [0, 0.05, 0.5, 0.95, 1])]
+    assert spreads.texts[0] == ["length [rad]", *(f"{length:.3f}" for length in lengths)]
+    assert spreads.texts[1][1:] == ["1.000"] * 6
+    assert found.trivial == pytest.approx(7 / 11)
+    assert found.safety_distance == pytest.approx(0.05) and found.kept == found.kept_throughout == 1.0
+    assert found.goals_reached == 1
+    assert found.bytes == sum(f.stat().st_size for f in tmp_path.glob("*.zarr/**/*") if f.is_file())
 
 
 def test_large_sets_are_sampled_evenly(tmp_path, rows, monkeypatch):
     monkeypatch.setattr(report, "SAMPLE", 4)
     write_motions(tmp_path, ARM, rows, shard=3)
-    columns = read_columns(tmp_path)
-    assert len(columns.all["cost"]) == 11
+    found = read_figures(tmp_path)
+    assert len(found.all["cost"]) == 11
     chosen = [rows[i] for i in (0, 2, 4, 6, 8, 10)]
-    assert np.array_equal(columns.sample["start"], [row["start"] for row in chosen])
-    kept = columns.sample["trajectories"]
+    assert np.array_equal(found.sample["start"], [row["start"] for row in chosen])
+    kept = found.sample["trajectories"]
     assert kept.shape == (6, min(FRAMES_KEPT, 20), 3)
     assert np.array_equal(kept[:, [0, -1]], [row["trajectories"][[0, -1]] for row in chosen])
 
@@ -93,10 +92,10 @@ def test_page_of_hardly_any_motions(n, tmp_path, rows):
 
 def test_bad_input(tmp_path, rows):
     with pytest.raises(InputError, match="no data set"):
-        describe(tmp_path)
+        read_figures(tmp_path)
     write_motions(tmp_path, ARM, [])
     with pytest.raises(InputError, match="holds no shards"):
-        describe(tmp_path)
+        read_figures(tmp_path)
     write_motions(tmp_path, ARM, rows)
     with pytest.raises(InputError, match=r"unknown ending '\.pdf'"):
         write_page(tmp_path, tmp_path / "report.pdf", ARM)

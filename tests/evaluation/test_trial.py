@@ -1,4 +1,4 @@
-"""The one loop: methods take turns, what is kept is not made again; planners, samplers, searches judged."""
+"""The one loop: methods take turns, what is kept is not made again; planners, networks, searches judged."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +11,7 @@ from robotdiffuse.evaluation.methods import planned, sampled, searched
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, summary
 from robotdiffuse.evaluation.trial import Fields, Trial, tried
-from robotdiffuse.planners.rrt_connect.planner import RRTConnect
+from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot

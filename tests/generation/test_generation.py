@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
+from helpers.clearances import least_clearance
 from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.data.manifest import read_manifest
@@ -31,7 +32,7 @@ from robotdiffuse.types import Path as Motion
 from robotdiffuse.verify import verify
 
 MIX = {"rop": 0.5, "rop_dense": 0.5}
-SETTINGS = GenerationSettings(trajectories=12, shard=4, frames=32, seed=3, mix=MIX, goals=4)
+SETTINGS = GenerationSettings(trajectories=12, shard=4, waypoints=32, seed=3, mix=MIX, goals=4)
 PANDA = load_robot("panda")
 
 
@@ -121,22 +122,22 @@ def test_every_trajectory_is_what_it_claims_to_be(i: int, folder: Path) -> None:
     assert ((q >= PANDA.lower - 1e-6) & (q <= PANDA.upper + 1e-6)).all()
     assert verify(problem, Motion(PANDA.joint_names, q.astype(float))).valid
     fine = np.concatenate([a + np.linspace(0, 1, 20)[:, None] * (b - a) for a, b in pairwise(q)])
-    assert checker.clearance(fine.astype(float)).min() > -1e-3
+    assert least_clearance(checker, fine.astype(float)).min() > -1e-3
 
-    # costs: of the best goal, not shorter than the line, and hardly longer than the frames
+    # costs: of the best goal, not shorter than the line, and hardly longer than the waypoints
     assert row["cost"] == row["goal_costs"][row["goal_index"]] == np.nanmin(row["goal_costs"])
     straight = np.linalg.norm(q[-1] - q[0])
     lines = np.linalg.norm(row["goals"] - row["start"], axis=1)
     assert (np.isnan(lines) | (row["goal_costs"] >= lines * (1 - 1e-5))).all()
     length = np.linalg.norm(np.diff(q, axis=0), axis=1)
     assert length.sum() <= row["cost"] * (1 + 1e-5) and length.sum() > 0.97 * row["cost"]
-    # even, but for frames that cut a corner
+    # even, but for waypoints that cut a corner
     assert length.max() <= row["cost"] / 31 * (1 + 1e-4)
     np.testing.assert_allclose(row["detour"], row["cost"] / straight, rtol=1e-5)
 
     # difficulty: by other means than the search's
     line = q[0] + np.linspace(0, 1, 400)[:, None] * (q[-1] - q[0])
-    deepest = checker.clearance(line.astype(float)).min()
+    deepest = least_clearance(checker, line.astype(float)).min()
     assert deepest > -0.01 if row["line_free"] else deepest < 0.01
     assert row["line_free"] or row["detour"] > 1 + 1e-4
     links = checker.link_clearances(fine.astype(float)).min(axis=1)
@@ -200,7 +201,7 @@ def test_frames_in_time_keep_the_velocity_limits() -> None:
         ("shard", 0),
         ("goals", 0),
         ("goals", 128),
-        ("frames", 1),
+        ("waypoints", 1),
         ("trivial_share", -0.1),
         ("trivial_share", float("nan")),
     ],

@@ -22,9 +22,9 @@ from helpers.factory_runs import (
 from robotdiffuse.errors import InputError
 from robotdiffuse.generation import GenerationSettings, factory, generate
 
-TRAJECTORIES, SHARD, FRAMES = 72, 3, 16
+TRAJECTORIES, SHARD, WAYPOINTS = 36, 3, 16
 SHARDS = TRAJECTORIES // SHARD
-SETTINGS = GenerationSettings(trajectories=TRAJECTORIES, shard=SHARD, frames=FRAMES)
+SETTINGS = GenerationSettings(trajectories=TRAJECTORIES, shard=SHARD, waypoints=WAYPOINTS)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,7 @@ def test_killed_at_random_moments_it_ends_in_the_same_data(
 ) -> None:
     rng = np.random.default_rng(7)
     for _ in range(2):
-        run = start(tmp_path, TRAJECTORIES, SHARD, FRAMES, 2)
+        run = start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
         wait_for_shards(run, tmp_path, shards(tmp_path) + 1)
         time.sleep(rng.uniform(0, 0.3))
         assert len(members(run.pid)) >= 3, "the command and two workers"
@@ -50,10 +50,10 @@ def test_killed_at_random_moments_it_ends_in_the_same_data(
         run.communicate(timeout=120)
         assert run.returncode == -signal.SIGKILL and shards(tmp_path) < SHARDS
         assert group_ends(run.pid), "workers outlive the command"
-    run = start(tmp_path, TRAJECTORIES, SHARD, FRAMES, 2)
+    run = start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
     said, complaints = run.communicate(timeout=400)
     assert (run.returncode, complaints) == (0, "")
-    assert said == f"{TRAJECTORIES} trajectories of {FRAMES} frames in {tmp_path}\n"
+    assert said == f"{TRAJECTORIES} trajectories of {WAYPOINTS} waypoints in {tmp_path}\n"
     assert contents(tmp_path) == undisturbed
     assert group_ends(run.pid)
 
@@ -61,7 +61,7 @@ def test_killed_at_random_moments_it_ends_in_the_same_data(
 @pytest.mark.parametrize("count", [0, 1])
 def test_ctrl_c_stops_all_in_one_line(count: int, tmp_path: Path) -> None:
     """As a terminal does it, to all processes: while the workers start, and while they work."""
-    run = start(tmp_path, TRAJECTORIES, SHARD, FRAMES, 2)
+    run = start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
     while len(members(run.pid)) < 3:
         assert run.poll() is None
         time.sleep(0.02)
@@ -107,7 +107,7 @@ def test_a_worker_killed_from_outside_is_one_line_and_the_next_call_goes_on(
             (worker,) = multiprocessing.active_children()
             os.kill(worker.pid or 0, signal.SIGKILL)
 
-    with pytest.raises(InputError, match=r"worker process was killed.*the same command goes on$"):
+    with pytest.raises(InputError, match=r"worker process was killed.*give the same command again$"):
         generate(SETTINGS, tmp_path, progress=kill)
     assert 0 < shards(tmp_path) < SHARDS
     monkeypatch.setattr(factory, "on_this_machine", in_this_process)

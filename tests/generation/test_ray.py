@@ -14,7 +14,7 @@ from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
 from robotdiffuse.evaluation.records import read_records
-from robotdiffuse.generation import GenerationSettings, factory, generate, workers
+from robotdiffuse.generation import GenerationSettings, factory, generate
 
 # read when ray is imported: no telemetry, and no pages of logs when a node is lost
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
@@ -22,19 +22,29 @@ os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = "Raylet is terminated"
 ray: Any = pytest.importorskip("ray", reason="the extra `cluster` (ray) is not installed")
 cluster_utils: Any = pytest.importorskip("ray.cluster_utils")
 
-SETTINGS = GenerationSettings(trajectories=60, shard=4, frames=16)
+SETTINGS = GenerationSettings(trajectories=24, shard=2, waypoints=16)
 STORE = 80 * 2**20
 """Smallest object store of a node, about [bytes]."""
+HEALTH_CHECKS = {"health_check_period_ms": 500, "health_check_timeout_ms": 3000}
+"""A node that is gone is missed at once, not after some times 3 seconds."""
+
+
+@pytest.fixture(scope="module")
+def head() -> Iterator[Any]:
+    """A cluster of one node with one core."""
+    of_head = {"num_cpus": 1, "include_dashboard": False, "_system_config": HEALTH_CHECKS}
+    made = cluster_utils.Cluster(
+        initialize_head=True, head_node_args=of_head | {"object_store_memory": STORE}
+    )
+    yield made
+    made.shutdown()
 
 
 @pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A head with one core; RAY_ADDRESS names it."""
-    head = {"num_cpus": 1, "object_store_memory": STORE, "include_dashboard": False}
-    made = cluster_utils.Cluster(initialize_head=True, head_node_args=head)
-    monkeypatch.setenv("RAY_ADDRESS", made.address)
-    yield made
-    made.shutdown()
+def cluster(head: Any, monkeypatch: pytest.MonkeyPatch) -> Any:
+    """RAY_ADDRESS names it."""
+    monkeypatch.setenv("RAY_ADDRESS", head.address)
+    return head
 
 
 def test_a_node_killed_midway_changes_nothing(
@@ -56,17 +66,17 @@ def test_a_node_killed_midway_changes_nothing(
     killer = threading.Thread(target=kill)
     killer.start()
     try:
-        assert generate(SETTINGS, tmp_path / "ray", cluster="ray", progress=progress) == 60
+        assert generate(SETTINGS, tmp_path / "ray", cluster="ray", progress=progress) == 24
     finally:
         begun.set()
         killer.join()
-    assert seen == list(range(0, 61, 4))
+    assert seen == list(range(0, 25, 2))
     assert not ray.is_initialized()
     assert len(cluster.list_all_nodes()) == 1
 
     # nodes that make other data are refused, by what differs
-    older = workers.versions() | {"numba": "0.1"}
-    monkeypatch.setattr(workers, "versions", lambda: older)
+    older = factory.versions() | {"numba": "0.1"}
+    monkeypatch.setattr(factory, "versions", lambda: older)
     with pytest.raises(InputError, match=r"node of the Ray cluster has numba .*, this machine 0\.1"):
         generate(SETTINGS, tmp_path / "other", cluster="ray")
     monkeypatch.undo()

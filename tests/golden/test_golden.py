@@ -13,7 +13,7 @@ ANY_PROCESSOR = ("problems", "shard")
 
 
 @pytest.mark.timeout(1800)
-@pytest.mark.parametrize("section", SECTIONS)
+@pytest.mark.parametrize("section", [name for name in SECTIONS if name != "unsteady"])
 def test_golden(section: str) -> None:
     made_on = json.loads(GOLDEN.read_text())["processor"]
     if section not in ANY_PROCESSOR and made_on != get_host_cpu_name():

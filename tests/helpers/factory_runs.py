@@ -5,11 +5,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
-from robotdiffuse.generation import GenerationSettings
-from robotdiffuse.generation.shard_maker import Arrays, Counts, make_shard
+from robotdiffuse.processes import Results
 
 HEARS_CTRL_C = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
 """Where a shell starts the tests in the background, they and their children would ignore it."""
@@ -17,12 +17,10 @@ RUN = "from robotdiffuse.cli import main; raise SystemExit(main())"
 COMMAND = (sys.executable, "-c", f"{HEARS_CTRL_C}; {RUN}")
 
 
-def in_this_process(
-    settings: GenerationSettings, indices: list[int], _workers: int
-) -> Iterator[tuple[int, tuple[Arrays, Counts]]]:
-    """Makes shards as `workers.on_this_machine` does, but without processes."""
-    for index in indices:
-        yield index, make_shard(settings, index)
+def in_this_process(call: Callable[..., Any], calls: Sequence[tuple], _workers: int) -> Results:
+    """As `processes.on_this_machine`, but without processes."""
+    for number, arguments in enumerate(calls):
+        yield number, call(*arguments)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -31,9 +29,9 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in files}
 
 
-def start(out: Path, trajectories: int, shard: int, frames: int, workers: int) -> subprocess.Popen[str]:
+def start(out: Path, trajectories: int, shard: int, waypoints: int, workers: int) -> subprocess.Popen[str]:
     """The command, as the first of a process group of its own."""
-    sizes = {"trajectories": trajectories, "shard": shard, "frames": frames, "workers": workers}
+    sizes = {"trajectories": trajectories, "shard": shard, "waypoints": waypoints, "workers": workers}
     options = [text for name, value in sizes.items() for text in (f"--{name}", str(value))]
     return subprocess.Popen(
         [*COMMAND, "data", "generate", "--out", str(out), *options],

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from robotdiffuse.evaluation.bench import planner_process
 from robotdiffuse.planners import PLANNERS, Entry
-from robotdiffuse.planners.rrt_connect.planner import RRTConnect
+from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 
@@ -18,7 +18,7 @@ SOLVES, RAISES, DIES, HANGS, TALKS = range(5)
 class Faulty(RRTConnect):
     name = "faulty"
 
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
+    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0, **request: object) -> PlanResult:
         if seed == RAISES:
             raise ValueError("no such\nthing")
         if seed == DIES:

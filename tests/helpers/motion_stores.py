@@ -14,12 +14,12 @@ from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
-FRAMES = 20
+WAYPOINTS = 20
 FAMILIES = ("rop", "rop_dense")
 
 
-def line(start: ndarray, goal: ndarray, frames: int = FRAMES) -> ndarray:
-    s = np.linspace(0, 1, frames)[:, None]
+def line(start: ndarray, goal: ndarray, waypoints: int = WAYPOINTS) -> ndarray:
+    s = np.linspace(0, 1, waypoints)[:, None]
     return ((1 - s) * start + s * goal).astype(np.float32)
 
 
@@ -53,11 +53,11 @@ def record(
 
 
 def write_motions(
-    folder: Path, robot: Robot, rows: list[dict[str, ndarray]], shard: int = 100, frames: int = FRAMES
+    folder: Path, robot: Robot, rows: list[dict[str, ndarray]], shard: int = 100, waypoints: int = WAYPOINTS
 ) -> Manifest:
     """A data set of these rows without a floor, so many in a shard."""
     of = {"families": {name: {} for name in FAMILIES}, "floors": dict.fromkeys(FAMILIES)}
-    manifest = manifest_of(robot, frames, trajectories=len(rows), shard=shard, **of)
+    manifest = manifest_of(robot, waypoints, trajectories=len(rows), shard=shard, **of)
     write_manifest(folder, manifest)
     for i in range(0, len(rows), shard):
         part = rows[i : i + shard]

@@ -13,17 +13,17 @@ from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import BOX, SPHERE
 
-FRAMES, SLOTS, GOALS = 254, 4, 3
+WAYPOINTS, SLOTS, GOALS = 254, 4, 3
 
 
-def manifest_of(robot: Robot, frames: int = FRAMES, **changes: Any) -> Manifest:
+def manifest_of(robot: Robot, waypoints: int = WAYPOINTS, **changes: Any) -> Manifest:
     fields: dict[str, Any] = {
         "robot": robot.name,
         "robot_fingerprint": robot_fingerprint(robot),
         "joint_names": robot.joint_names,
         "lower": tuple(robot.lower.tolist()),
         "upper": tuple(robot.upper.tolist()),
-        "frames": frames,
+        "waypoints": waypoints,
         "timing": "arc",
         "families": {"rop": {"sphere_radius": [0.25, 0.25]}},
         "floors": {"rop": {"center": [0.0, 0.0, -0.05], "size": [2.0, 2.0, 0.1]}},
@@ -37,9 +37,9 @@ def manifest_of(robot: Robot, frames: int = FRAMES, **changes: Any) -> Manifest:
     return Manifest(**fields | changes)
 
 
-def random_arrays(robot: Robot, n: int, rng: Generator, frames: int = FRAMES) -> dict[str, ndarray]:
+def random_arrays(robot: Robot, n: int, rng: Generator, waypoints: int = WAYPOINTS) -> dict[str, ndarray]:
     """Arrays of a shard: bows between random ends among spheres and boxes."""
-    s = np.linspace(0, 1, frames)[:, None]
+    s = np.linspace(0, 1, waypoints)[:, None]
     ends = rng.uniform(0.6 * robot.lower, 0.6 * robot.upper, (2, n, 1, robot.dof))
     bow = rng.uniform(-0.3, 0.3, (n, 1, robot.dof)) * np.sin(np.pi * s)
     q = (ends[0] * (1 - s) + ends[1] * s + bow).astype(np.float32)
@@ -78,10 +78,10 @@ def random_arrays(robot: Robot, n: int, rng: Generator, frames: int = FRAMES) ->
     }
 
 
-def write_store(folder: Path, robot: Robot, sizes: tuple[int, ...], frames: int = FRAMES) -> Manifest:
+def write_store(folder: Path, robot: Robot, sizes: tuple[int, ...], waypoints: int = WAYPOINTS) -> Manifest:
     """A manifest and a shard of each size."""
-    rng, manifest = np.random.default_rng(0), manifest_of(robot, frames)
+    rng, manifest = np.random.default_rng(0), manifest_of(robot, waypoints)
     write_manifest(folder, manifest)
     for i, n in enumerate(sizes):
-        write_shard(folder, i, random_arrays(robot, n, rng, frames), {"tried": n, "solved": n})
+        write_shard(folder, i, random_arrays(robot, n, rng, waypoints), {"tried": n, "solved": n})
     return manifest

@@ -15,7 +15,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from helpers.box_arm import box_arm
 from robotdiffuse.learning.checkpoint import write_tensors
-from robotdiffuse.learning.settings import settings_from_json
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.processes import Processes
@@ -73,11 +72,7 @@ def bad_step_in_one(out: str) -> dict[str, float]:
     run = TrainingRun(
         module,
         out,
-        EncoderTraining(minutes=None, samples=20, batch=2),
-        average=0.9,
-        weight_decay=0.0,
-        gradient_norm=1.0,
-        bad_steps=3,
+        EncoderTraining(minutes=None, samples=20, batch=2, average=0.9, bad_steps=3),
         identity={},
         processes=processes,
     )
@@ -94,5 +89,5 @@ if __name__ == "__main__":
     kind, values, folder = sys.argv[1:]
     arm = box_arm()
     training.load_robot = lambda name: arm
-    given = settings_from_json(PlannerTraining, json.loads(Path(values).read_text()), "settings")
+    given = PlannerTraining.from_json(json.loads(Path(values).read_text()), "settings")
     {"slow": slow, "two": two}[kind](given, Path(folder))

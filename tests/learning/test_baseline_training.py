@@ -14,36 +14,39 @@ from torch import Tensor, nn
 from helpers.motion_stores import random_motions, write_motions
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.networks import NETWORKS, Entry, checkpoint, network_class
-from robotdiffuse.learning.networks.base import BaselineNetwork, JointRanges
-from robotdiffuse.learning.networks.checkpoint import load_baseline
-from robotdiffuse.learning.networks.training import baseline_training, train_baseline
+from robotdiffuse.learning import checkpoint
+from robotdiffuse.learning.checkpoint import load_network
+from robotdiffuse.learning.networks import NETWORKS
+from robotdiffuse.learning.networks.base import BaselineNetwork
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.validation import motions_free
+from robotdiffuse.registry import Entry
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.settings import Settings
 
 
 @dataclass(frozen=True)
-class ReversalSettings:
+class ReversalSettings(Settings):
     width: int = 7
 
 
 class Reversal(BaselineNetwork):
     """Learns that a motion's middle lies halfway."""
 
-    settings_class = ReversalSettings
     training_defaults: ClassVar[dict] = {"batch": 16, "learning_rate": 0.05}
 
-    def __init__(self, ranges: JointRanges, settings: ReversalSettings) -> None:
-        super().__init__(ranges, settings)
+    def __init__(self, robot: RobotIdentity, settings: ReversalSettings) -> None:
+        super().__init__(robot, settings)
         self.layer = nn.Linear(2 * self.dof, self.dof)
 
     def loss(self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator) -> Tensor:
-        q = self.normalized(torch.from_numpy(data.q[rng.integers(0, len(data), count)]))
+        q = self.normalizer.to_unit(torch.from_numpy(data.q[rng.integers(0, len(data), count)]))
         middle = self.layer(torch.cat([q[:, 0], q[:, -1]], -1))
         return (middle - q[:, q.shape[1] // 2]).square().mean()
 
@@ -53,14 +56,14 @@ class Reversal(BaselineNetwork):
 
 @pytest.fixture
 def data(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    monkeypatch.setitem(NETWORKS, "reversal", Entry(f"{__name__}:Reversal", "for tests"))
+    monkeypatch.setitem(NETWORKS, "reversal", Entry(f"{__name__}:Reversal", "for tests", "ReversalSettings"))
     robot = load_robot("panda")
     write_motions(tmp_path / "data", robot, random_motions(robot, 40))
     return str(tmp_path / "data")
 
 
 def weights(folder: Path) -> dict[str, Tensor]:
-    return load_baseline("reversal", str(folder), load_robot("panda")).state_dict()
+    return load_network("reversal", str(folder), load_robot("panda")).state_dict()
 
 
 def test_training_learns_and_a_stopped_run_ends_the_same(
@@ -92,23 +95,23 @@ def test_training_learns_and_a_stopped_run_ends_the_same(
 def test_weights_of_another_robot_or_none_are_refused(data: str, tmp_path: Path) -> None:
     panda = load_robot("panda")
     with pytest.raises(
-        InputError, match="no weights of reversal come with the package for panda; train them"
+        InputError, match="no weights of the network reversal come with the package for panda; train them"
     ):
-        load_baseline("reversal", None, panda)
+        load_network("reversal", None, panda)
     with pytest.raises(
         InputError, match="holds no reversal; train them: robotdiffuse train baseline reversal"
     ):
-        load_baseline("reversal", str(tmp_path), panda)
+        load_network("reversal", str(tmp_path), panda)
     settings = baseline_training("reversal", {"data": data, "samples": 160})
     train_baseline(settings, str(tmp_path / "out"))
     narrow = panda.with_locked({"panda_joint7": 0.0})
     with pytest.raises(InputError, match="was trained for panda with joints"):
-        load_baseline("reversal", str(tmp_path / "out"), narrow)
+        load_network("reversal", str(tmp_path / "out"), narrow)
     file = tmp_path / "out" / "reversal.safetensors"
     file.write_bytes(file.read_bytes()[:-1])
-    checkpoint._load.cache_clear()
+    checkpoint._loaded.cache_clear()
     with pytest.raises(InputError, match="damaged"):
-        load_baseline("reversal", str(tmp_path / "out"), panda)
+        load_network("reversal", str(tmp_path / "out"), panda)
 
 
 def test_command(data: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
@@ -118,17 +121,18 @@ def test_command(data: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -
     assert main([*asked, "--samples", "320", "--batch", "8"]) == 2
     assert "holds a run with batch = 16" in capfd.readouterr().err
     assert main(["train", "baseline", "nonsense", "--data", data, "--out", "x"]) == 2
-    assert "unknown baseline 'nonsense'; known: mpinets, mpnet" in capfd.readouterr().err
+    assert "unknown network 'nonsense'; known: model, mpinets, mpnet" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("name", sorted(NETWORKS))
 def test_every_network_normalizes_by_the_joint_limits(name: str) -> None:
-    kind, panda = network_class(name), load_robot("panda")
-    network = kind(JointRanges.of(panda), kind.settings_class())
+    panda = load_robot("panda")
+    network = NETWORKS.load(name)(RobotIdentity.of(panda), NETWORKS.defaults(name))
     ends = np.stack([panda.lower, panda.upper])
-    np.testing.assert_allclose(network.normalized(ends), [[-1] * 7, [1] * 7])
+    np.testing.assert_allclose(network.normalizer.to_unit(ends), [[-1] * 7, [1] * 7])
     torch.testing.assert_close(
-        network.joints(network.normalized(torch.from_numpy(ends))), torch.from_numpy(ends)
+        network.normalizer.from_unit(network.normalizer.to_unit(torch.from_numpy(ends))),
+        torch.from_numpy(ends),
     )
 
 

@@ -7,69 +7,67 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.box_arm import box_arm
 from helpers.small_model import small_model
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.checkpoint import load_model, save_model
-from robotdiffuse.learning.denoisers import (
-    DENOISERS,
-    PAPER_SIZE,
-    DecoderOnlySettings,
-    Denoiser,
-    EncoderDecoderSettings,
-    TransformerSettings,
-    UNetSettings,
-)
+from robotdiffuse.learning.checkpoint import load_model, save_network
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.denoisers.base import Denoiser
+from robotdiffuse.learning.denoisers.decoder_only import DecoderOnlySettings
+from robotdiffuse.learning.denoisers.encoder_decoder import EncoderDecoderSettings
 from robotdiffuse.learning.denoisers.layers import DENSE_TOKENS, Linear, attend
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.learning.settings import settings_from_json, settings_to_json
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.config import PlannerTraining
 
 DOF, FEATURES, CODE = 3, 9, 8
 CONDITION = CODE + 2 * DOF
 SMALL = {
-    "transformer": TransformerSettings(32, 2, 2, 48, patch=1),
-    "encoder_decoder": EncoderDecoderSettings(32, 1, 2, 2, 48, patch=1),
-    "decoder_only": DecoderOnlySettings(32, 2, 2, 48, patch=1),
+    "transformer": TransformerSettings(32, 2, 2, 48, 1),
+    "encoder_decoder": EncoderDecoderSettings(32, 2, 2, 48, 1, encoder_layers=1),
+    "decoder_only": DecoderOnlySettings(32, 2, 2, 48, 1),
     "unet": UNetSettings(16, (1, 2, 2), 3, 32),
 }
 LENGTHS = (12, 48, 254)
 
 
-def denoiser(name: str, frames: int = 12, settings: object = None) -> Denoiser:
+def denoiser(name: str, waypoints: int = 12, settings: object = None) -> Denoiser:
     """A small one, with random weights in the last layer too."""
     torch.manual_seed(0)
-    network = DENOISERS[name][0](settings or SMALL[name], frames, DOF, FEATURES, CONDITION)
+    network = DENOISERS.load(name)(settings or SMALL[name], waypoints, DOF, FEATURES, CONDITION)
     torch.nn.init.normal_(network.out.weight, std=0.2)
     return network
 
 
-def inputs(frames: int = 12, batch: int = 2, seed: int = 1) -> tuple[torch.Tensor, ...]:
+def inputs(waypoints: int = 12, batch: int = 2, seed: int = 1) -> tuple[torch.Tensor, ...]:
     random = torch.Generator().manual_seed(seed)
     return (
-        torch.randn(batch, frames, FEATURES, generator=random),
+        torch.randn(batch, waypoints, FEATURES, generator=random),
         torch.rand(batch, generator=random),
         torch.randn(batch, CONDITION, generator=random),
     )
 
 
 def test_every_denoiser_is_tested():
-    assert set(SMALL) == set(PAPER_SIZE) == set(DENOISERS)
+    assert set(SMALL) == set(DENOISERS)
 
 
-@pytest.mark.parametrize("frames", LENGTHS)
+@pytest.mark.parametrize("waypoints", LENGTHS)
 @pytest.mark.parametrize("name", DENOISERS)
-def test_shapes(name, frames):
-    network = denoiser(name, frames)
-    out = network(*inputs(frames))
-    assert out.shape == (2, frames, DOF)
+def test_shapes(name, waypoints):
+    network = denoiser(name, waypoints)
+    out = network(*inputs(waypoints))
+    assert out.shape == (2, waypoints, DOF)
     assert out.dtype == torch.float32
     assert out.isfinite().all()
-    assert network(*inputs(frames, batch=1)).shape == (1, frames, DOF)
+    assert network(*inputs(waypoints, batch=1)).shape == (1, waypoints, DOF)
 
 
 @pytest.mark.parametrize("name", DENOISERS)
 def test_untrained_network_predicts_the_mean_trajectory(name):
-    network = DENOISERS[name][0](DENOISERS[name][1](), 12, DOF, FEATURES, CONDITION)
+    network = DENOISERS.load(name)(DENOISERS.defaults(name), 12, DOF, FEATURES, CONDITION)
     assert not network(*inputs()).any()
 
 
@@ -92,13 +90,14 @@ def test_output_depends_on_level_and_on_every_number_of_the_condition(name):
         assert (slopes.abs() > 1e-9).all()
 
 
-def seen_by(name: str, frames: int = 12) -> np.ndarray:
-    """[frames, frames]: whether the output of one frame (row) depends on the input of another (column)."""
-    network = denoiser(name, frames)
-    features, level, condition = inputs(frames, batch=1)
+def seen_by(name: str, waypoints: int = 12) -> np.ndarray:
+    """[waypoints, waypoints]: whether the output of one waypoint (row) depends on the input of another
+    (column)."""
+    network = denoiser(name, waypoints)
+    features, level, condition = inputs(waypoints, batch=1)
     features.requires_grad_()
     out = network(features, level, condition).square().sum((0, 2))
-    rows = [torch.autograd.grad(frame, features, retain_graph=True)[0][0] for frame in out]
+    rows = [torch.autograd.grad(waypoint, features, retain_graph=True)[0][0] for waypoint in out]
     return (torch.stack(rows).abs().sum(-1) > 0).numpy()
 
 
@@ -156,12 +155,12 @@ def test_learns_a_small_batch_by_heart(name):
 @pytest.mark.parametrize("name", DENOISERS)
 def test_sizes(name):
     """The defaults are comparable; so are the networks of the paper's size, 8 layers of width 512."""
-    for settings, frames, low, high in (
-        (DENOISERS[name][1](), 48, 1.6e6, 1.8e6),
-        (PAPER_SIZE[name], 254, 16e6, 19e6),
+    for settings, waypoints, low, high in (
+        (DENOISERS.defaults(name), 48, 1.6e6, 1.8e6),
+        (DENOISERS.defaults(name).paper_size(), 254, 16e6, 19e6),
     ):
         with torch.device("meta"):
-            network = DENOISERS[name][0](settings, frames, 7, 23, 60 + 14)
+            network = DENOISERS.load(name)(settings, waypoints, 7, 23, 60 + 14)
         assert low < sum(values.numel() for values in network.parameters()) < high
 
 
@@ -171,7 +170,7 @@ def test_z_tk_as_a_token_only():
     added.load_state_dict(network.state_dict())
     assert not torch.allclose(network(*inputs()), added(*inputs()))
     for parameter, values in network.named_parameters():
-        if parameter.endswith("merge.weight"):  # attention is the only way from the token to the frames
+        if parameter.endswith("merge.weight"):  # attention is the only way from the token to the waypoints
             torch.nn.init.zeros_(values)
     features, level, condition = inputs()
     torch.testing.assert_close(network(features, level, condition), network(features, level, 2 * condition))
@@ -186,16 +185,17 @@ def test_fused_and_written_out_attention_agree(monkeypatch, causal):
 
 
 def test_unet_pads_and_crops():
-    """Of a length that can be halved, nothing is added; of another, what is added is the last frame again."""
-    for frames, padding in ((12, 0), (13, 3), (254, 2), (1, 3)):
-        network = denoiser("unet", frames)
+    """Of a length that can be halved, nothing is added; of another, what is added is the last waypoint
+    again."""
+    for waypoints, padding in ((12, 0), (13, 3), (254, 2), (1, 3)):
+        network = denoiser("unet", waypoints)
         assert network.padding == padding
-        features, level, condition = inputs(frames)
-        longer = denoiser("unet", frames + padding)
+        features, level, condition = inputs(waypoints)
+        longer = denoiser("unet", waypoints + padding)
         longer.load_state_dict(network.state_dict())
         added = torch.cat([features, features[:, -1:].expand(-1, padding, -1)], 1)
         torch.testing.assert_close(
-            network(features, level, condition), longer(added, level, condition)[:, :frames]
+            network(features, level, condition), longer(added, level, condition)[:, :waypoints]
         )
 
 
@@ -218,20 +218,20 @@ def test_bad_settings(kind, values, message):
 
 @pytest.mark.parametrize("name", ["transformer", "encoder_decoder", "decoder_only"])
 def test_frames_must_fill_the_patches(name):
-    with pytest.raises(InputError, match=f"{name}.patch is 5; it must divide the 12 frames"):
+    with pytest.raises(InputError, match=f"{name}.patch is 5; it must divide the 12 waypoints"):
         denoiser(name, 12, replace(SMALL[name], patch=5))
 
 
 def model_with(name: str, null_condition: bool = False) -> MotionModel:
     torch.manual_seed(0)
-    config = replace(
-        small_model().config,
+    settings = replace(
+        small_model().settings,
         denoiser=name,
         denoiser_settings=SMALL[name],
-        frames=12,
+        waypoints=12,
         null_condition=null_condition,
     )
-    model = MotionModel(config)
+    model = MotionModel(RobotIdentity.of(box_arm()), settings)
     torch.nn.init.normal_(model.denoiser.out.weight, std=0.2)
     if model.null_condition is not None:
         torch.nn.init.normal_(model.null_condition)
@@ -239,11 +239,11 @@ def model_with(name: str, null_condition: bool = False) -> MotionModel:
 
 
 def sample(model: MotionModel, scale: float = 1.0) -> np.ndarray:
-    code = np.ones(model.config.encoder_settings.code, np.float32)
+    code = np.ones(model.settings.encoder_settings.code, np.float32)
     start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
 
     def clearances(q: np.ndarray) -> np.ndarray:
-        return np.full((*q.shape[:-1], len(model.config.links)), 0.1, np.float32)
+        return np.full((*q.shape[:-1], len(model.robot.links)), 0.1, np.float32)
 
     rng = np.random.default_rng(0)
     return model.sample(code, start, goal, 3, rng, clearances, steps=3, guidance_scale=scale)
@@ -256,63 +256,65 @@ def test_files(tmp_path, name, null_condition):
     for module in model.modules():
         if isinstance(module, torch.nn.Linear):
             module.weight.data = module.weight.data.half().float()  # as they are stored
-    save_model(model, tmp_path, {})
+    save_network("model", model, tmp_path, {})
     loaded = load_model(tmp_path)
-    assert loaded.config == model.config
-    assert type(loaded.denoiser) is DENOISERS[name][0]
+    assert loaded.settings == model.settings
+    assert type(loaded.denoiser) is DENOISERS.load(name)
     scale = 2.0 if null_condition else 1.0
     np.testing.assert_array_equal(sample(loaded, scale), sample(model.for_inference(), scale))
 
 
 def test_files_from_before_there_was_a_choice(tmp_path):
     model = model_with("transformer")
-    save_model(model, tmp_path, {})
+    save_network("model", model, tmp_path, {})
     file = tmp_path / "model.json"
     about = json.loads(file.read_text())
-    del about["model"]["null_condition"], about["model"]["denoiser"]
-    del about["model"]["denoiser_settings"]["add_z_tk"]
+    del about["settings"]["null_condition"], about["settings"]["denoiser"]
+    del about["settings"]["denoiser_settings"]["add_z_tk"]
     file.write_text(json.dumps(about))
-    assert load_model(tmp_path).config == model.config
-    assert load_model("panda").config.denoiser == "transformer"
+    assert load_model(tmp_path).settings == model.settings
+    assert load_model("panda").settings.denoiser == "transformer"
 
 
 @pytest.mark.parametrize("name", DENOISERS)
 def test_settings_of_a_run_as_json(name):
-    settings = PlannerTraining("data", "encoder", denoiser=name, denoiser_settings=SMALL[name])
-    text = json.dumps(settings_to_json(settings))
-    assert settings_from_json(PlannerTraining, json.loads(text), "x") == settings
-    kind = DENOISERS[name][1]
+    settings = PlannerTraining(data="data", encoder="encoder", denoiser=name, denoiser_settings=SMALL[name])
+    text = json.dumps(settings.to_json())
+    assert PlannerTraining.from_json(json.loads(text), "x") == settings
+    kind = type(DENOISERS.defaults(name))
     other = next(s for s in SMALL.values() if type(s) is not kind)
     with pytest.raises(InputError, match=f"denoiser is {name}, .* must be {kind.__name__}"):
-        PlannerTraining("data", "encoder", denoiser=name, denoiser_settings=other)
+        PlannerTraining(data="data", encoder="encoder", denoiser=name, denoiser_settings=other)
 
 
 def test_unknown_names_list_the_known():
-    values = settings_to_json(PlannerTraining("data", "encoder", denoiser_settings=SMALL["transformer"]))
+    values = PlannerTraining(data="data", encoder="encoder", denoiser_settings=SMALL["transformer"]).to_json()
     known = "'gpt'; known: decoder_only, encoder_decoder, transformer, unet"
     for settings in (None, values["denoiser_settings"]):
         with pytest.raises(InputError, match=known):
             given = {"denoiser": "gpt", "denoiser_settings": settings}
-            settings_from_json(PlannerTraining, values | given, "x")
+            PlannerTraining.from_json(values | given, "x")
     with pytest.raises(InputError, match=known):
-        PlannerTraining("data", "encoder", denoiser="gpt")
+        PlannerTraining(data="data", encoder="encoder", denoiser="gpt")
     for bad in (3, ["unet"], None):
         with pytest.raises(InputError, match=r"x\.denoiser is .*; it must be of type str"):
-            settings_from_json(PlannerTraining, values | {"denoiser": bad}, "x")
+            PlannerTraining.from_json(values | {"denoiser": bad}, "x")
 
 
 @pytest.mark.parametrize("field", ["width", "wings"])
 def test_bad_settings_in_a_file_are_named(field):
-    values = settings_to_json(PlannerTraining("d", "e", denoiser="unet", denoiser_settings=SMALL["unet"]))
+    values = PlannerTraining(
+        data="d", encoder="e", denoiser="unet", denoiser_settings=SMALL["unet"]
+    ).to_json()
     values["denoiser_settings"][field] = "wide"
     with pytest.raises(InputError, match=f"x.denoiser_settings.{field}"):
-        settings_from_json(PlannerTraining, values, "x")
+        PlannerTraining.from_json(values, "x")
 
 
 @pytest.mark.parametrize("share", [-0.1, 1.0])
 def test_share_of_dropped_conditions_is_checked(share):
     with pytest.raises(InputError, match="condition_drop"):
-        PlannerTraining("data", "encoder", condition_drop=share)
+        PlannerTraining(data="data", encoder="encoder", condition_drop=share)
 
 
 @pytest.mark.parametrize("name", DENOISERS)

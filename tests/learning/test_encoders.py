@@ -16,28 +16,25 @@ from robotdiffuse.data.manifest import write_manifest
 from robotdiffuse.data.shards import write_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
-from robotdiffuse.learning.denoisers import TransformerSettings
-from robotdiffuse.learning.encoders import (
-    ENCODERS,
-    PAPER_SIZE,
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
+from robotdiffuse.learning.encoders.base import Autoencoder
+from robotdiffuse.learning.encoders.compression_autoencoder import (
     CompressionAutoencoder,
     CompressionAutoencoderSettings,
-    DGCNNSettings,
-    PointAutoencoderSettings,
-    PointNetSettings,
-    encoder_name,
-    make_encoder,
 )
-from robotdiffuse.learning.encoders.base import Autoencoder
-from robotdiffuse.learning.encoders.dgcnn import EdgeConvolution, neighbours
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
-from robotdiffuse.learning.settings import settings_from_json, settings_to_json
+from robotdiffuse.learning.encoders.dgcnn import DGCNNSettings, EdgeConvolution, neighbours
+from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
+from robotdiffuse.learning.encoders.pointnet import PointNetSettings
+from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training import encoder as encoder_training
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.batches import Batches, load_data, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.encoder import linear_readout, train_encoder
 from robotdiffuse.learning.training.planner import train_planner
+from robotdiffuse.learning.training.run import TrainingRun
 from robotdiffuse.scenes.packed import SPHERE
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 
@@ -50,7 +47,7 @@ SMALL = {
     ),
     "dgcnn": DGCNNSettings(code=8, cloud=32, neighbours=4, edges=(8, 12), embedding=16, head=(16,)),
 }
-ALONE = [name for name, (network, _) in ENCODERS.items() if network.trained == "alone"]
+ALONE = [name for name, entry in ENCODERS.items() if entry.kind == "alone"]
 JOINTLY = [name for name in ENCODERS if name not in ALONE]
 every_encoder = pytest.mark.parametrize("name", ENCODERS)
 
@@ -148,7 +145,7 @@ def test_files(name, tmp_path):
             encoder.standardize(encoder.encode(cloud(40, 30)))
     save_encoder(encoder, tmp_path, {})
     loaded = load_encoder(tmp_path)
-    assert type(loaded) is ENCODERS[name][0]
+    assert type(loaded) is ENCODERS.load(name)
     assert loaded.settings == encoder.settings
     assert not any(p.requires_grad for p in loaded.parameters())
     points = cloud(40)
@@ -159,21 +156,18 @@ def test_files(name, tmp_path):
 
 @every_encoder
 def test_settings_are_read_by_name(name):
-    config = MotionModelConfig(
-        robot="r", joint_names=("a", "b"), lower=(-1.0, -1.0), upper=(1.0, 1.0), frame_offsets=(),
-        links=("l",), encoder=name, encoder_settings=SMALL[name],
-    )  # fmt: skip
-    assert settings_from_json(MotionModelConfig, settings_to_json(config), "x") == config
-    z = MotionModel(config).encode(cloud(3000)[0].numpy().astype(np.float64))
+    settings = MotionModelSettings(encoder=name, encoder_settings=SMALL[name])
+    assert MotionModelSettings.from_json(settings.to_json(), "x") == settings
+    z = MotionModel(RobotIdentity.of(box_arm()), settings).encode(cloud(3000)[0].numpy().astype(np.float64))
     assert z.shape == (8,)
-    other = next(settings for settings in SMALL.values() if settings is not SMALL[name])
+    other = next(other for other in SMALL.values() if other is not SMALL[name])
     with pytest.raises(InputError, match=f"encoder is {name}, but its settings are {type(other).__name__}"):
-        replace(config, encoder_settings=other)
+        replace(settings, encoder_settings=other)
 
 
-@pytest.mark.parametrize("name", PAPER_SIZE)
+@pytest.mark.parametrize("name", ["compression_autoencoder", "pointnet", "dgcnn"])
 def test_sizes_of_the_papers(name):
-    encoder = make_encoder(name, PAPER_SIZE[name])
+    encoder = make_encoder(name, ENCODERS.defaults(name).paper_size())
     assert encoder.settings.code == 60
     weights = sum(p.numel() for p in encoder.parameters())
     # PointNet 3.5 million, of which the head to 40 classes is small; DGCNN 1.8 million
@@ -283,7 +277,7 @@ def test_training_alone(name, tmp_path, monkeypatch):
     error = "chamfer" if name == "point_autoencoder" else "reconstruction"
     assert report[error] < 0.9 * before[error]
     sizes = drawn - {None}
-    assert sizes <= set(range(8, 65)) and len(sizes) > 30 if ENCODERS[name][0].any_size else sizes == {40}
+    assert sizes <= set(range(8, 65)) and len(sizes) > 30 if ENCODERS.load(name).any_size else sizes == {40}
     encoder = load_encoder(tmp_path / "long")
     assert encoder_name(encoder) == name
     scenes = random_scenes(300, 12, np.random.default_rng(5))
@@ -345,7 +339,7 @@ def test_joint_training_changes_the_encoder(name, data, tmp_path):
     fresh = small(name)
     train_planner(planned, str(tmp_path / "out"))
     model = load_model(tmp_path / "out", box_arm())
-    assert type(model.encoder) is ENCODERS[name][0]
+    assert type(model.encoder) is ENCODERS.load(name)
     trained = dict(model.encoder.named_parameters())
     moved = {key for key, p in fresh.named_parameters() if (trained[key] - p).abs().max() > 1e-3}
     own = ("decoder", "query") if name in ALONE else ()  # what only reconstructs takes no part
@@ -358,7 +352,7 @@ def test_joint_training_changes_the_encoder(name, data, tmp_path):
 def test_joint_training_resumes(data, tmp_path, monkeypatch):
     planned = planner(data, "pointnet", encoder_settings=SMALL["pointnet"])
     whole = train_planner(planned, str(tmp_path / "whole"))
-    original = training.TrainingRun.step
+    original = TrainingRun.step
 
     def interrupted(self, loss):
         original(self, loss)
@@ -366,10 +360,10 @@ def test_joint_training_resumes(data, tmp_path, monkeypatch):
             self.save()
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(training.TrainingRun, "step", interrupted)
+    monkeypatch.setattr(TrainingRun, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         train_planner(planned, str(tmp_path / "parts"))
-    monkeypatch.setattr(training.TrainingRun, "step", original)
+    monkeypatch.setattr(TrainingRun, "step", original)
     assert train_planner(planned, str(tmp_path / "parts")) == whole
 
 
@@ -385,14 +379,11 @@ def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
 def test_batches_with_clouds_instead_of_codes(data):
     arm = box_arm()
     encoder = small("dgcnn")
-    config = MotionModelConfig(
-        robot=arm.name, joint_names=arm.joint_names, lower=tuple(arm.lower.tolist()),
-        upper=tuple(arm.upper.tolist()), frame_offsets=(), links=("l1", "l2", "l3"), encoder="dgcnn",
-        encoder_settings=encoder.settings,
-    )  # fmt: skip
-    kept = load_data(str(data), arm, None, config.frames, lambda text: None)
+    settings = MotionModelSettings(encoder="dgcnn", encoder_settings=encoder.settings)
+    model = MotionModel(RobotIdentity.of(arm), settings)
+    kept = load_data(str(data), arm, None, settings.waypoints, lambda text: None)
     assert kept.codes is None
-    batches = Batches(kept, MotionModel(config), lambda scenes, q: np.ones((*q.shape[:2], 3)), 0.1, 5.0)
+    batches = Batches(kept, model, lambda scenes, q: np.ones((*q.shape[:2], 3)), 0.1, 5.0)
     first, again = (batches.draw(8, np.random.default_rng(3)) for _ in range(2))
     assert first.clouds is not None and again.clouds is not None
     assert first.clouds.shape == (8, 32, 3)

@@ -16,12 +16,12 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Sphere
 
-FRAMES = 24
+WAYPOINTS = 24
 BALL = (1.02, 0.55, 0.0)
 
 
-def straight(start: ndarray, goal: ndarray, frames: int = FRAMES) -> ndarray:
-    return (start + np.linspace(0, 1, frames)[:, None] * (goal - start)).astype(np.float32)
+def straight(start: ndarray, goal: ndarray, waypoints: int = WAYPOINTS) -> ndarray:
+    return (start + np.linspace(0, 1, waypoints)[:, None] * (goal - start)).astype(np.float32)
 
 
 def swing() -> tuple[CollisionChecker, ndarray]:
@@ -60,11 +60,11 @@ def test_no_steps_change_nothing() -> None:
     assert (costs == 0).all()
 
 
-@pytest.mark.parametrize("frames", [1, 2, 3])
-def test_short_trajectories(frames: int) -> None:
+@pytest.mark.parametrize("waypoints", [1, 2, 3])
+def test_short_trajectories(waypoints: int) -> None:
     checker, lines = swing()
-    moved, _ = CollisionGuidance(checker)(lines[:, FRAMES // 2 - 1 :][:, :frames], 3)
-    assert moved.shape == (2, frames, 3)
+    moved, _ = CollisionGuidance(checker)(lines[:, WAYPOINTS // 2 - 1 :][:, :waypoints], 3)
+    assert moved.shape == (2, waypoints, 3)
     assert np.isfinite(moved).all()
 
 

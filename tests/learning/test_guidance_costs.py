@@ -11,7 +11,10 @@ from numpy import ndarray
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.guidance import COSTS, CollisionGuidance, GuidanceSettings
+from robotdiffuse.learning.costs import COSTS
+from robotdiffuse.learning.costs.cost import Cost
+from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
+from robotdiffuse.registry import Entry
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -35,11 +38,11 @@ CROWDED = CollisionChecker(
 )
 
 
-def random_motions(seed: int, count: int = 4, frames: int = 32) -> ndarray:
+def random_motions(seed: int, count: int = 4, waypoints: int = 32) -> ndarray:
     """Waves between random configurations, within the limits."""
     rng = np.random.default_rng(seed)
     ends = rng.uniform(PANDA.lower, PANDA.upper, (2, count, 1, PANDA.dof))
-    t = np.linspace(0.0, 1.0, frames)[:, None]
+    t = np.linspace(0.0, 1.0, waypoints)[:, None]
     q = ends[0] + t * (ends[1] - ends[0])
     for harmonic in (1, 2, 5):
         q = q + np.sin(np.pi * harmonic * t) * rng.normal(0.0, 0.5 / harmonic, (count, 1, PANDA.dof))
@@ -82,9 +85,11 @@ def test_steps_go_down_the_slope(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["smoothness", "length"])
 def test_a_full_step_is_newton_s(name: str) -> None:
-    """A single free frame goes where the formula is smallest, and no further."""
+    """A single free waypoint goes where the formula is smallest, and no further."""
     guidance = CollisionGuidance(CROWDED, ALONE[name])
-    q = 0.3 * random_motions(2, count=1, frames=7) + ((PANDA.lower + PANDA.upper) * 0.35).astype(np.float32)
+    q = 0.3 * random_motions(2, count=1, waypoints=7) + ((PANDA.lower + PANDA.upper) * 0.35).astype(
+        np.float32
+    )
     moved, _ = guidance(q, 1, prefix=3, suffix=3)
     np.testing.assert_array_equal(moved[:, [0, 1, 2, 4, 5, 6]], q[:, [0, 1, 2, 4, 5, 6]])
     shift = np.zeros_like(q, float)
@@ -134,6 +139,26 @@ def test_collision_costs_add_up_to_the_checker_s() -> None:
     )
 
 
+def test_a_further_cost_acts_between_the_compiled_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It draws the first joint to zero; ends stay, and costs that are compiled take no name in `further`."""
+    drawn = Cost(
+        lambda _checker, q, strength: strength * (q[..., 0] ** 2).sum(1),
+        lambda _checker, q, strength: q * np.where(np.arange(q.shape[2]) == 0, 1 - strength, 1),
+    )
+    monkeypatch.setitem(globals(), "DRAWN", drawn)
+    monkeypatch.setitem(COSTS, "drawn", Entry(f"{__name__}:DRAWN", "for tests"))
+    q = random_motions(5)
+    guidance = CollisionGuidance(CROWDED, replace(NOTHING, further={"drawn": 0.5}))
+    moved, _ = guidance(q, 3, prefix=2)
+    np.testing.assert_allclose(moved[:, 2:-1, 0], q[:, 2:-1, 0] / 8, rtol=1e-5)
+    np.testing.assert_array_equal(moved[:, [0, 1, -1]], q[:, [0, 1, -1]])
+    assert (guidance.costs(moved)["drawn"] < guidance.costs(q)["drawn"]).all()
+    with pytest.raises(InputError, match="further names length; it has a setting, length"):
+        replace(NOTHING, further={"length": 0.5})
+    with pytest.raises(InputError, match="unknown guidance cost 'lenght'"):
+        replace(NOTHING, further={"lenght": 0.5})
+
+
 def test_together_they_reach_a_free_and_smooth_path_that_none_reaches_alone() -> None:
     """A line through a ball, with a jerk in it: pushes alone leave the jerk, the others alone the ball."""
     checker = CollisionChecker(box_arm(), Scene([Sphere([1.02, 0.55, 0.0], 0.08)]))
@@ -164,7 +189,7 @@ def test_frames_near_limits_come_back() -> None:
 
 
 @pytest.mark.parametrize(("prefix", "suffix"), [(1, 1), (5, 1), (1, 7), (4, 6), (16, 16), (40, 40)])
-def test_known_frames_stay(prefix: int, suffix: int) -> None:
+def test_known_waypoints_stay(prefix: int, suffix: int) -> None:
     q = random_motions(5)
     moved, _ = CollisionGuidance(CROWDED, EVERYTHING)(q, 5, prefix, suffix)
     np.testing.assert_array_equal(moved[:, :prefix], q[:, :prefix])

@@ -10,7 +10,8 @@ from robotdiffuse.learning.training.losses import ArmDistance, LossSettings, Sur
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import ForwardKinematics, link_pose
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
@@ -19,8 +20,8 @@ PANDA = load_robot("panda")
 DOUBLE = ForwardKinematics(PANDA, torch.float64)
 
 
-def configurations(n: int, frames: int, seed: int = 0) -> torch.Tensor:
-    q = np.random.default_rng(seed).uniform(PANDA.lower, PANDA.upper, (n, frames, 7))
+def configurations(n: int, waypoints: int, seed: int = 0) -> torch.Tensor:
+    q = np.random.default_rng(seed).uniform(PANDA.lower, PANDA.upper, (n, waypoints, 7))
     return torch.from_numpy(q)
 
 
@@ -84,7 +85,7 @@ def test_the_collision_loss_sets_in_as_scheduled() -> None:
     )
 
 
-@pytest.mark.parametrize(("name", "value"), [("point", -1.0), ("begin", 1.5), ("frames", 0)])
+@pytest.mark.parametrize(("name", "value"), [("point", -1.0), ("begin", 1.5), ("waypoints", 0)])
 def test_bad_settings_are_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"losses.{name} is {value}"):
         LossSettings(**{name: value})  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Frames and splines: ends exact, straight lines straight, smooth trajectories nearly so."""
+"""Waypoints and splines: ends exact, straight lines straight, smooth trajectories nearly so."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.parametrization import PARAMETRIZATIONS, parametrization
 
-ROWS = {"frames": 48, "b_spline": 12}
+ROWS = {"waypoints": 48, "b_spline": 12}
 
 
 @pytest.fixture(params=list(PARAMETRIZATIONS))
@@ -51,7 +51,7 @@ def test_a_bend_needs_few_control_points() -> None:
     assert errors[0] > errors[1] > errors[2] and errors[1] < 0.03
 
 
-@pytest.mark.parametrize(("name", "rows"), [("frames", 12), ("b_spline", 3), ("b_spline", 49)])
+@pytest.mark.parametrize(("name", "rows"), [("waypoints", 12), ("b_spline", 3), ("b_spline", 49)])
 def test_numbers_of_rows_that_do_not_fit(name: str, rows: int) -> None:
     with pytest.raises(InputError, match=f"rows is {rows}"):
         parametrization(name, 48, rows)

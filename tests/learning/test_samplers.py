@@ -11,8 +11,9 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.diffusion import SCHEDULES, NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.objectives import OBJECTIVES, objective_for
-from robotdiffuse.learning.samplers import SAMPLERS, ddim, ddpm, euler
-from robotdiffuse.learning.settings import settings_from_json
+from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.learning.samplers.ddim import ddim
+from robotdiffuse.learning.samplers.ddpm import ddpm
 
 ORDERS = {"ddim": 1, "euler": 1, "dpm_solver": 2}
 """Of the deterministic samplers."""
@@ -57,7 +58,7 @@ def flow_errors(name: str, schedule: NoiseSchedule, steps: list[int]) -> np.ndar
     """RMS distance of samples from where the exact flow takes the same noise."""
     noise = np.random.default_rng(0).standard_normal((64, 2))
     exact, predict = exact_flow(schedule, noise), best_predictor(schedule)
-    samples = [SAMPLERS[name](predict, schedule, lambda: noise, n, 0.0) for n in steps]
+    samples = [SAMPLERS.load(name)(predict, schedule, lambda: noise, n, 0.0) for n in steps]
     return np.array([np.sqrt(((x - exact) ** 2).mean()) for x in samples])
 
 
@@ -75,7 +76,7 @@ def exact_moments(
         draws += 1
         return impulses[:, draws - 1]
 
-    x = SAMPLERS[name](best_predictor(schedule), schedule, draw, steps, eta)
+    x = SAMPLERS.load(name)(best_predictor(schedule), schedule, draw, steps, eta)
     return x[0], (x[1:] - x[0]).T @ (x[1:] - x[0])
 
 
@@ -153,7 +154,7 @@ def test_euler_is_euler_s_method_for_the_velocity():
     for i in range(20):
         velocity = (x - predict(x, 200 - 10 * i)) / t
         x, t = x - velocity / 20, t - 1 / 20
-    np.testing.assert_allclose(euler(predict, schedule, lambda: noise, 20), x, atol=1e-12)
+    np.testing.assert_allclose(SAMPLERS.load("euler")(predict, schedule, lambda: noise, 20), x, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", SAMPLERS)
@@ -169,7 +170,9 @@ def test_calls_of_the_predictor(name, kind, steps):
         said.append(rng.uniform(-1, 1, x.shape).astype(np.float32))
         return said[-1]
 
-    x = SAMPLERS[name](predict, schedule, lambda: rng.standard_normal((2, 3), dtype=np.float32), steps, 0.5)
+    x = SAMPLERS.load(name)(
+        predict, schedule, lambda: rng.standard_normal((2, 3), dtype=np.float32), steps, 0.5
+    )
     assert x is said[-1]
     assert x.dtype == np.float32
     assert levels == schedule.sampling_levels(steps)[:-1].tolist()
@@ -181,10 +184,10 @@ def test_refused_steps_and_shares(name):
     schedule, predict = schedule_of("cosine"), best_predictor(schedule_of("cosine"))
     for steps in (-1, 0, 201):
         with pytest.raises(InputError, match=f"sampling steps is {steps}; it must be between 1 and 200"):
-            SAMPLERS[name](predict, schedule, lambda: np.zeros((1, 2)), steps, 0.0)
+            SAMPLERS.load(name)(predict, schedule, lambda: np.zeros((1, 2)), steps, 0.0)
     for eta in (-0.1, 1.5, float("nan")):
         with pytest.raises(InputError, match=f"eta is {eta}; it must be between 0 and 1"):
-            SAMPLERS[name](predict, schedule, lambda: np.zeros((1, 2)), 5, eta)
+            SAMPLERS.load(name)(predict, schedule, lambda: np.zeros((1, 2)), 5, eta)
 
 
 def network(x: np.ndarray, level: int) -> np.ndarray:
@@ -210,7 +213,7 @@ def our_steps(name: str, schedule: NoiseSchedule, steps: int, eta: float) -> np.
         found.append(x)
         return network(x, level)
 
-    sample = SAMPLERS[name](predict, schedule, draws.__next__, steps, eta)
+    sample = SAMPLERS.load(name)(predict, schedule, draws.__next__, steps, eta)
     return np.array([*found, sample])
 
 
@@ -328,7 +331,7 @@ def test_linear_schedule_is_ddpm_s():
         ({"steps": 1}, "schedule.steps is 1; it must be at least 2"),
         ({"steps": 20, "kind": "linear"}, "schedule.steps is 20; the linear schedule needs more than 20"),
         ({"offset": -0.1}, "schedule.offset is -0.1"),
-        ({"floor": 0.0}, "schedule.floor is 0.0; it must be between 0 and 1"),
+        ({"floor": 0.0}, "schedule.floor is 0.0; it must be above 0 and below 1"),
     ],
 )
 def test_refused_schedules(settings, message):
@@ -341,7 +344,7 @@ def test_refused_schedules(settings, message):
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_objective_round_trip(name, kind, tensors):
     """x_t and the target give the clean trajectory back, at all levels but where the noise is all of x_t."""
-    schedule, objective = schedule_of(kind), OBJECTIVES[name]
+    schedule, objective = schedule_of(kind), OBJECTIVES.make(name)
     last = 199 if (name, kind) == ("noise", "flow") else 200
     clean, noise = np.random.default_rng(0).standard_normal((2, last + 1, 5, 2))
     a, s = (v[: last + 1, None, None] for v in (schedule.signal, schedule.noise))
@@ -358,7 +361,7 @@ def test_objective_round_trip(name, kind, tensors):
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_objectives_weigh_levels_alike(name, kind, limit):
     """The weighted error of the output is that of the clean trajectory, but where the limit cuts it."""
-    schedule, objective = schedule_of(kind), OBJECTIVES[name]
+    schedule, objective = schedule_of(kind), OBJECTIVES.make(name)
     t = np.arange(1, 200)
     a, s = schedule.signal[t], schedule.noise[t]
     weight = objective.weight(schedule, t, limit)
@@ -380,15 +383,14 @@ def test_objectives_refused():
         objective_for("v", schedule_of("flow"))
     with pytest.raises(InputError, match=r"objective is 'noise' and schedule\.kind is 'flow'"):
         objective_for("noise", schedule_of("flow"))
-    assert objective_for("noise", schedule_of("linear")) is OBJECTIVES["noise"]
+    assert type(objective_for("noise", schedule_of("linear"))) is OBJECTIVES.load("noise")
 
 
 def test_bundled_model_samples_as_when_it_was_published():
     """Bit for bit: its description, which names no kind of schedule, and DDIM as written then."""
     about = {"steps": 200, "offset": 0.008, "floor": 0.0001}
     model = load_model("panda")
-    config = model.config
-    assert config.schedule == settings_from_json(ScheduleSettings, about, "schedule")
+    assert model.settings.schedule == ScheduleSettings.from_json(about, "schedule")
     t = np.arange(201) / 200
     curve = np.cos((t + 0.008) / 1.008 * np.pi / 2) ** 2
     alpha_bar = np.maximum(curve / curve[0], 1e-4)
@@ -396,11 +398,11 @@ def test_bundled_model_samples_as_when_it_was_published():
     np.testing.assert_array_equal(model.schedule.signal, signal)
     np.testing.assert_array_equal(model.schedule.noise, noise)
     rng = np.random.default_rng(0)
-    start, goal = rng.uniform(config.lower, config.upper, (2, len(config.lower)))
+    start, goal = rng.uniform(model.robot.lower, model.robot.upper, (2, model.dof))
     z = model.encode(rng.uniform([0.2, -0.5, 0.1], [0.7, 0.5, 0.8], (100, 3)))
 
     def clearances(q):
-        return np.repeat(0.2 + 0.1 * np.sin(q.sum(-1, keepdims=True)), len(config.links), -1)
+        return np.repeat(0.2 + 0.1 * np.sin(q.sum(-1, keepdims=True)), len(model.robot.links), -1)
 
     def as_it_was(predict, schedule, draw_noise, steps, eta):
         a, s = signal.tolist(), noise.tolist()
@@ -422,5 +424,5 @@ def test_bundled_model_samples_as_when_it_was_published():
     for eta in (0.0, 0.5):
         now = sample(eta)
         with pytest.MonkeyPatch.context() as patch:
-            patch.setitem(SAMPLERS, config.sampler, as_it_was)
+            patch.setattr("robotdiffuse.learning.samplers.ddim.ddim", as_it_was)
             np.testing.assert_array_equal(sample(eta), now)

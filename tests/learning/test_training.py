@@ -17,7 +17,7 @@ import pytest
 import torch
 
 from helpers.box_arm import box_arm
-from helpers.stores import FRAMES as STORED
+from helpers.stores import WAYPOINTS as STORED
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.data.manifest import write_manifest
@@ -25,13 +25,16 @@ from robotdiffuse.data.shards import shard_path, split_of, write_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.files import alone_in
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors, save_encoder
-from robotdiffuse.learning.denoisers import DENOISERS, TransformerSettings, UNetSettings
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
-from robotdiffuse.learning.encoders import PointAutoencoder, PointAutoencoderSettings
+from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoder, PointAutoencoderSettings
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.objectives import OBJECTIVES
-from robotdiffuse.learning.settings import settings_to_json
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training import planner as training
+from robotdiffuse.learning.training import trainee
 from robotdiffuse.learning.training.batches import (
     Batch,
     Batches,
@@ -42,7 +45,7 @@ from robotdiffuse.learning.training.batches import (
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.losses import LossSettings
-from robotdiffuse.learning.training.planner import moving_links, train_planner
+from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.run import TrainingRun, Validation
 from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
@@ -52,7 +55,7 @@ from robotdiffuse.scenes.shapes import Box, Sphere
 
 SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
 SMALL_DENOISER = TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8)
-FRAMES = 48
+WAYPOINTS = 48
 
 
 @pytest.fixture
@@ -143,7 +146,7 @@ def test_encoder_learns(tmp_path):
 def start(kind, settings, out, *launcher):
     """A training of training_processes.py, in a process group of its own."""
     file = out.parent / f"{out.name}.json"
-    file.write_text(json.dumps(settings_to_json(settings)))
+    file.write_text(json.dumps(settings.to_json()))
     script = str(Path(__file__).parents[1] / "helpers" / "training_processes.py")
     return subprocess.Popen(
         [sys.executable, *launcher, script, kind, str(file), str(out)],
@@ -229,14 +232,14 @@ def test_takes_in_data_that_are_still_being_made(tmp_path, data, monkeypatch, ca
         if self.at.step == 3:
             (tmp_path / "later").rename(shard_path(data, 1))
 
-    read = training.load_data
+    read = trainee.load_data
 
     def count_reading(*given):
         known.append(read(*given))
         return known[-1]
 
     monkeypatch.setattr(TrainingRun, "step", step)
-    monkeypatch.setattr(training, "load_data", count_reading)
+    monkeypatch.setattr(trainee, "load_data", count_reading)
     settings = planner_settings(data, checkpoint_seconds=0.0, samples=96, validation_problems=1)
     train_planner(settings, str(tmp_path / "out"))
     assert len(known) == 2 and len(known[0]) < len(known[1])
@@ -253,11 +256,11 @@ def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
         data, denoiser=denoiser, denoiser_settings=None, losses=losses, condition_drop=0.5
     )
     encoder = load_encoder(data.parent / "encoder")
-    model = MotionModel(training._model_config(settings, arm, encoder))
-    loaded = load_data(str(data), arm, encoder, FRAMES, lambda text: None)
+    model = MotionModel(RobotIdentity.of(arm), training._model_settings(settings, encoder))
+    loaded = load_data(str(data), arm, encoder, WAYPOINTS, lambda text: None)
 
     def far(scenes, q):
-        return np.full((*q.shape[:-1], len(model.config.links)), 0.4, np.float32)
+        return np.full((*q.shape[:-1], len(model.robot.links)), 0.4, np.float32)
 
     rng = np.random.default_rng(0)
     batch = Batches(loaded, model, far, 0.1, 5.0).draw(4, rng)
@@ -317,7 +320,7 @@ def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
         {"objective": "noise"},
         {"objective": "velocity", "schedule": ScheduleSettings(kind="flow"), "sampler": "euler"},
         {"sees_clearances": False, "sampler": "dpm_solver"},
-        {"losses": LossSettings(point=0.1, collision=0.1, frames=4)},
+        {"losses": LossSettings(point=0.1, collision=0.1, waypoints=4)},
     ],
     ids=lambda changes: "-".join(map(str, changes)),
 )
@@ -335,7 +338,7 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm):
         return np.full((*q.shape[:2], 3), 0.3, np.float32)
 
     q = model.sample(z, start, goal, 3, np.random.default_rng(0), clearances, steps=8)
-    assert q.shape == (3, FRAMES, 3) and np.isfinite(q).all()
+    assert q.shape == (3, WAYPOINTS, 3) and np.isfinite(q).all()
     assert (q[:, 0] == start).all() and (q[:, -1] == goal).all()
     assert (q >= arm.lower).all() and (q <= arm.upper).all()
 
@@ -350,9 +353,9 @@ def test_two_trainings_do_not_share_a_folder(tmp_path, data):
 def test_errors_in_space_weigh_the_same_whatever_is_predicted(data, arm, objective):
     """They once had the weight of the output's error: 10,000 times too much for noise at the last level."""
     encoder = load_encoder(data.parent / "encoder")
-    loaded = load_data(str(data), arm, None, FRAMES, print)
+    loaded = load_data(str(data), arm, None, WAYPOINTS, print)
     settings = planner_settings(data, objective=objective)
-    model = MotionModel(training._model_config(settings, arm, encoder))
+    model = MotionModel(RobotIdentity.of(arm), training._model_settings(settings, encoder))
     batches = Batches(loaded, model, lambda _, q: np.zeros((*q.shape[:2], 3), np.float32), 0.1, 5.0)
     levels = np.arange(1, model.schedule.steps + 1)
     batch = batches.at(np.zeros(len(levels), np.int64), levels, np.random.default_rng(0))
@@ -375,7 +378,9 @@ def test_planner_learns_which_side(tmp_path, data, arm):
     assert list((out / "tensorboard").iterdir()), "the extra `train` is installed: a log for TensorBoard"
     model = load_model(out, arm)
     about = json.loads((out / "model.json").read_text())
-    assert about["training"]["trajectories"] == len(load_data(str(data), arm, model.encoder, FRAMES, print))
+    assert about["training"]["trajectories"] == len(
+        load_data(str(data), arm, model.encoder, WAYPOINTS, print)
+    )
     rng = np.random.default_rng(0)
     start, goal = np.array([-1.0, 0.2, 0.5]), np.array([1.0, -0.3, 0.4])
     for side in (-1.0, 1.0):
@@ -387,7 +392,7 @@ def test_planner_learns_which_side(tmp_path, data, arm):
             return checker.link_clearances(q.reshape(-1, 3)).reshape(*q.shape[:2], 3)
 
         q = model.sample(z, start, goal, 4, rng, clearances)
-        bow = q[:, FRAMES // 2] - (start + goal) / 2
+        bow = q[:, WAYPOINTS // 2] - (start + goal) / 2
         assert (bow * side > 0.1).all()
         np.testing.assert_allclose(bow.mean(), 0.5 * side, atol=0.2)
 
@@ -395,20 +400,20 @@ def test_planner_learns_which_side(tmp_path, data, arm):
 def test_codes_are_kept_beside_the_data(data, arm):
     encoder = load_encoder(data.parent / "encoder")
     said = []
-    first = load_data(str(data), arm, encoder, FRAMES, said.append)
+    first = load_data(str(data), arm, encoder, WAYPOINTS, said.append)
     kept = sorted((data / "codes").iterdir())
     assert len(kept) == 2
     assert f"{len(first)} trajectories" in said[-1]
     kept[0].write_bytes(b"damaged")
-    again = load_data(str(data), arm, encoder, FRAMES, said.append)
+    again = load_data(str(data), arm, encoder, WAYPOINTS, said.append)
     np.testing.assert_array_equal(again.codes, first.codes)
     assert again.digest == first.digest
 
 
 def test_turned_copies_are_for_training_alone(data, arm):
     encoder, said = load_encoder(data.parent / "encoder"), []
-    plain = load_data(str(data), arm, encoder, FRAMES, said.append)
-    turned = load_data(str(data), arm, encoder, FRAMES, said.append, turns=2)
+    plain = load_data(str(data), arm, encoder, WAYPOINTS, said.append)
+    turned = load_data(str(data), arm, encoder, WAYPOINTS, said.append, turns=2)
     assert turned.validation == plain.validation and len(turned) > len(plain)
     for split, more in zip(plain.split(10**6), turned.split(10**6), strict=True):
         apart = np.abs(split.q[:, None, :, 1:] - more.q[None, :, :, 1:]).max((2, 3))
@@ -419,15 +424,13 @@ def test_turned_copies_are_for_training_alone(data, arm):
 def test_losses_that_are_not_finite_are_skipped(tmp_path):
     torch.manual_seed(0)
     module = torch.nn.Linear(2, 1)
-    settings = EncoderTraining(minutes=None, samples=40, batch=1, warmup_steps=1, checkpoint_seconds=0.0)
+    settings = EncoderTraining(
+        minutes=None, samples=40, batch=1, warmup_steps=1, checkpoint_seconds=0.0, average=0.9, bad_steps=3
+    )
     run = TrainingRun(
         module,
         str(tmp_path),
         settings,
-        average=0.9,
-        weight_decay=0.0,
-        gradient_norm=1.0,
-        bad_steps=3,
         identity={},
         processes=Processes("cpu"),
     )
@@ -448,15 +451,11 @@ def test_losses_that_are_not_finite_are_skipped(tmp_path):
 
 def test_hopeless_training_stops(tmp_path):
     module = torch.nn.Linear(2, 1)
-    settings = EncoderTraining(minutes=None, samples=40, batch=1)
+    settings = EncoderTraining(minutes=None, samples=40, batch=1, average=0.9, bad_steps=3)
     run = TrainingRun(
         module,
         str(tmp_path),
         settings,
-        average=0.9,
-        weight_decay=0.0,
-        gradient_norm=1.0,
-        bad_steps=3,
         identity={},
         processes=Processes("cpu"),
     )
@@ -479,14 +478,14 @@ def test_damaged_checkpoint_is_named(tmp_path, data):
 
 
 def test_splits_and_frames(data, arm):
-    """Training and validation share no scene, the test split stays out, and frames are even again."""
-    loaded = load_data(str(data), arm, load_encoder(data.parent / "encoder"), FRAMES, print)
+    """Training and validation share no scene, the test split stays out, and waypoints are even again."""
+    loaded = load_data(str(data), arm, load_encoder(data.parent / "encoder"), WAYPOINTS, print)
     kept, held_out = loaded.split(1000)
     assert set(split_of(kept.scenes)) == {0}
     assert set(split_of(held_out.scenes)) == {1}
     assert 120 < len(kept) + len(held_out) == len(loaded) < 160
     assert len(loaded.split(2)[1]) == 2
-    assert kept.q.shape[1:] == (FRAMES, arm.dof)
+    assert kept.q.shape[1:] == (WAYPOINTS, arm.dof)
 
 
 @pytest.mark.parametrize("case", ["none", "damaged", "robot"])
@@ -503,17 +502,13 @@ def test_bad_data_give_one_line(case, data, arm):
         shutil.rmtree(shard_path(data, 1) / "line_free")
     robot = replace(arm, spheres={}) if case == "robot" else arm
     with pytest.raises(InputError, match=message[case]) as caught:
-        load_data(str(data), robot, load_encoder(data.parent / "encoder"), FRAMES, print)
+        load_data(str(data), robot, load_encoder(data.parent / "encoder"), WAYPOINTS, print)
     assert "\n" not in str(caught.value)
 
 
 def test_length_is_given_once():
     with pytest.raises(InputError, match="exactly one"):
         EncoderTraining(minutes=3.0, samples=4)
-
-
-def test_moving_links(arm):
-    assert moving_links(arm) == ("l1", "l2", "l3")
 
 
 def test_trains_without_some_conditions(data, tmp_path):
@@ -526,7 +521,7 @@ def test_trains_without_some_conditions(data, tmp_path):
     ends = np.full(model.dof, -0.5), np.full(model.dof, 0.5)
 
     def far(q):
-        return np.full((*q.shape[:-1], len(model.config.links)), 0.4, np.float32)
+        return np.full((*q.shape[:-1], len(model.robot.links)), 0.4, np.float32)
 
     plain, pushed = (
         model.sample(

@@ -207,3 +207,16 @@ def test_refusals() -> None:
         TimingSettings(sample_time=0.0)
     with pytest.raises(InputError, match="corner_deviation"):
         TimingSettings(corner_deviation=-0.1)
+
+
+@given(seed=st.integers(0, 2**32 - 1), deviation=st.sampled_from([0.0, 0.02, 0.1]))
+def test_durations_are_those_of_toppra(seed: int, deviation: float) -> None:
+    rng, robot = np.random.default_rng(seed), arm()
+    p = path(robot, np.cumsum(rng.normal(0, 0.4, (rng.integers(2, 8), 7)), axis=0))
+    ours, theirs = (
+        time_parameterize(
+            robot, p, always, always, TimingSettings(corner_deviation=deviation, solver=solver)
+        ).duration
+        for solver in ("compiled", "toppra")
+    )
+    assert ours == pytest.approx(theirs, rel=1e-3)

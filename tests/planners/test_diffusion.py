@@ -8,7 +8,7 @@ import pytest
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.planners.diffusion import Diffusion, DiffusionSettings, bundled_model, encode
+from robotdiffuse.planners.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
@@ -21,7 +21,7 @@ LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
 PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
-MODEL = bundled_model("panda")
+MODEL = Diffusion().model(PANDA)
 assert MODEL is not None
 
 
@@ -61,15 +61,16 @@ def test_weights_are_used_with_their_own_sampler_and_steps(monkeypatch: pytest.M
         return own(self, features, level, *rest)
 
     monkeypatch.setattr(MotionModel, "denoise", denoise)
-    assert MODEL is not None
-    for steps, calls in ((None, MODEL.config.sampling_steps), (3, 3)):
+    model = Diffusion().model(PANDA)  # the one that planners will be given
+    assert model is not None
+    for steps, calls in ((None, model.settings.sampling_steps), (3, 3)):
         levels.clear()
         Diffusion(DiffusionSettings(sampling_steps=steps)).plan(PROBLEM, time_limit=60.0)
         assert len(levels) == calls and levels[0] == 1.0
-    monkeypatch.setattr(MODEL, "config", replace(MODEL.config, sampling_steps=None))
+    monkeypatch.setattr(model, "settings", replace(model.settings, sampling_steps=None))
     levels.clear()
     Diffusion(DiffusionSettings(samples=1, guidance_steps=0)).plan(PROBLEM, time_limit=1e-3)
-    assert len(levels) == MODEL.config.schedule.steps
+    assert len(levels) == model.settings.schedule.steps
 
 
 def test_batches_repeat_until_one_has_a_valid_sample(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,7 +107,9 @@ def test_no_valid_sample_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> 
 
 def test_a_robot_without_weights_is_refused() -> None:
     stranger = replace(PANDA, name="stranger")
-    with pytest.raises(InputError, match="no weights of diffusion come with the package for stranger; train"):
+    with pytest.raises(
+        InputError, match="no weights of the network model come with the package for stranger"
+    ):
         Diffusion().plan(Problem(stranger, Scene([BALL]), LEFT, JointGoal(RIGHT[None])))
 
 

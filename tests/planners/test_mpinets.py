@@ -9,11 +9,11 @@ import torch
 from torch import nn
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.networks.base import JointRanges
-from robotdiffuse.learning.networks.checkpoint import load_baseline, save_baseline
+from robotdiffuse.learning.checkpoint import load_network, save_network
 from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, MPiNetsNetworkSettings, RollOuts
 from robotdiffuse.learning.networks.point_groups import group_points
 from robotdiffuse.learning.networks.pointnet2 import PooledLayers
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.planners.mpinets import MPiNets, MPiNetsSettings
 from robotdiffuse.problems.problem import PoseGoal, Problem
@@ -26,7 +26,7 @@ from robotdiffuse.types import Status
 from robotdiffuse.verify import verify
 
 PANDA = load_robot("panda")
-RANGES = JointRanges.of(PANDA)
+RANGES = RobotIdentity.of(PANDA)
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 WALL = [0.45, 0.0, 0.25, 0.3, 0.05, 0.5, 1.0, 0.0, 0.0, 0.0]
@@ -152,10 +152,10 @@ def test_roll_outs_stay_within_limits(network: MPiNetsNetwork) -> None:
         roll_outs.advance(np.full((3, 7), 0.5, np.float32))
         if i == 1:
             roll_outs.stop(np.array([False, True, False]))
-    frames = np.stack(roll_outs.frames)
-    assert (frames >= PANDA.lower - 1e-5).all() and (frames <= PANDA.upper + 1e-5).all()
-    assert (frames[2:, 1] == frames[2, 1]).all()
-    assert np.abs(frames[-1, [0, 2]] - start[0]).max() > 0.5
+    waypoints = np.stack(roll_outs.waypoints)
+    assert (waypoints >= PANDA.lower - 1e-5).all() and (waypoints <= PANDA.upper + 1e-5).all()
+    assert (waypoints[2:, 1] == waypoints[2, 1]).all()
+    assert np.abs(waypoints[-1, [0, 2]] - start[0]).max() > 0.5
 
 
 @pytest.mark.parametrize(("walls", "share"), [(False, 1.0), (True, 0.0)])
@@ -199,7 +199,7 @@ def test_a_path_in_collision_is_no_result() -> None:
 def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(
     tmp_path: Path, network: MPiNetsNetwork
 ) -> None:
-    save_baseline("mpinets", network, tmp_path, {})
+    save_network("mpinets", network, tmp_path, {})
     planner = MPiNets(MPiNetsSettings(weights=str(tmp_path), near=0.299))
     q = torch.tensor(LEFT[None], dtype=torch.float32)
     cloud = clouds_of(network, 1)
@@ -218,7 +218,7 @@ def test_missing_weights_name_the_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="train baseline mpinets"):
         MPiNets(MPiNetsSettings(weights=str(tmp_path)))
     with pytest.raises(InputError, match="train baseline mpinets"):
-        load_baseline("mpinets", str(tmp_path), PANDA)
+        load_network("mpinets", str(tmp_path), PANDA)
 
 
 @pytest.mark.parametrize(

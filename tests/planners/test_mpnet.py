@@ -10,10 +10,9 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import path_length
-from robotdiffuse.data.dataset import resample
+from robotdiffuse.data.rows import resample
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.networks.base import JointRanges
-from robotdiffuse.learning.networks.checkpoint import save_baseline
+from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.networks.mpnet import (
     MPNetNetwork,
     MPNetSettings,
@@ -21,6 +20,7 @@ from robotdiffuse.learning.networks.mpnet import (
     arranged,
     squared_slope,
 )
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
@@ -45,19 +45,19 @@ SMALL = MPNetSettings(
 
 def network(settings: MPNetSettings = SMALL, seed: int = 0) -> MPNetNetwork:
     torch.manual_seed(seed)
-    return MPNetNetwork(JointRanges.of(PANDA), settings)
+    return MPNetNetwork(RobotIdentity.of(PANDA), settings)
 
 
-def motions(frames: int = 48) -> TrajectoryData:
+def motions(waypoints: int = 48) -> TrajectoryData:
     """Motions from left to right over walls of several heights, and back; and a straight one."""
     q, scenes = [], []
-    s = np.linspace(0, 1, frames)[:, None]
+    s = np.linspace(0, 1, waypoints)[:, None]
     for i, height in enumerate((0.3, 0.4, 0.5, 0.6)):
         way = (1 - s) * LEFT + s * RIGHT + height * np.sin(np.pi * s) * np.eye(7)[1] * -1.5
         q.append((way if i % 2 else way[::-1]).astype(np.float32))
         scenes.append(Scene([Box([0.5, 0.0, height / 2], [0.3, 0.05, height])]))
     trivial = np.array([False, False, False, True])
-    even = resample(np.stack(q), frames)
+    even = resample(np.stack(q), waypoints)
     return TrajectoryData(even, PackedScenes.pack(scenes, 2), trivial, None, "made", 0)
 
 
@@ -72,7 +72,7 @@ def weights(tmp_path_factory) -> str:
         net.loss(data, 256, step / 80, rng).backward()
         optimizer.step()
     folder = tmp_path_factory.mktemp("mpnet")
-    save_baseline("mpnet", net, folder, {})
+    save_network("mpnet", net, folder, {})
     return str(folder)
 
 

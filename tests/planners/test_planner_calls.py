@@ -1,6 +1,9 @@
 """What a call of a planner notes on the way: shorter and shorter paths, and what the judge refused."""
 
+import time
+
 import numpy as np
+from numba import njit
 
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.shared_tree.planner import SharedTreeRRTStar, SharedTreeSettings
@@ -71,3 +74,14 @@ def test_anytime_planner_reports_its_progress() -> None:
     times, lengths = np.array(result.progress).T
     assert (np.diff(times) > 0).all() and (np.diff(lengths) < 0).all()
     assert lengths[-1] == result.path.length
+
+
+def test_compiling_takes_no_time_of_the_call_and_is_noted() -> None:
+    began = time.perf_counter()
+    call = call_on(Scene([]))
+    before = call.elapsed
+    njit(lambda x: x + 1)(1)
+    waited, counted = time.perf_counter() - began, call.elapsed - before
+    assert counted < 0.5 * waited
+    [note] = call.fail(Status.TIMEOUT, "").notes
+    assert "compiled for" in note and "does not count" in note

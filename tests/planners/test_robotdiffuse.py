@@ -8,15 +8,18 @@ import pytest
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.planners import robotdiffuse as module
-from robotdiffuse.planners.diffusion import bundled_model, encode
+from robotdiffuse.planners.aorrtc.planner import AORRTCSettings
+from robotdiffuse.planners.aorrtc.search import SLICE, AnytimeSearch
+from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.planners.robotdiffuse import (
+    BATCH_WORK,
     RobotDiffuse,
     RobotDiffuseSettings,
     unlearned_starts,
 )
-from robotdiffuse.planners.rrt_connect.planner import RRTConnect
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -39,7 +42,17 @@ def planner():
     return RobotDiffuse()
 
 
-def test_the_network_solves_and_the_judge_agrees(planner):
+@pytest.fixture
+def no_search(monkeypatch):
+    """Search counts its iterations and finds nothing, so that the network's batches are the only help."""
+
+    def idle(self):
+        self.work, self._tried = self.work + SLICE, self._tried + SLICE
+
+    monkeypatch.setattr(AnytimeSearch, "_slice", idle)
+
+
+def test_the_network_solves_and_the_judge_agrees(planner, no_search):
     result = planner.plan(PROBLEM, time_limit=10.0)
     assert result.stage == "network" and result.path is not None and result.trajectory is not None
     assert verify(PROBLEM, result.path).valid and verify_trajectory(PROBLEM, result.trajectory).valid
@@ -64,7 +77,7 @@ def test_same_seed_same_path(planner):
 
 
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_any_sampler_plans(sampler):
+def test_any_sampler_plans(sampler, no_search):
     planner = RobotDiffuse(RobotDiffuseSettings(sampler=sampler, guided_share=1.0, sampling_steps=8))
     result = planner.plan(PROBLEM, time_limit=10.0)
     assert result.stage == "network" and result.path is not None and verify(PROBLEM, result.path).valid
@@ -75,7 +88,7 @@ def test_a_free_straight_line_is_the_answer(planner):
     assert result.stage == "straight_line" and result.path_length == pytest.approx(1.8)
 
 
-def test_a_point_cloud_in_place_of_shapes(planner):
+def test_a_point_cloud_in_place_of_shapes(planner, no_search):
     """What a camera sees: the same ball as points."""
     points = sample_surface(PROBLEM.scene, 4000, np.random.default_rng(0))
     problem = Problem(PANDA, Scene([PointCloud(points, 0.01)]), LEFT, JointGoal(RIGHT[None]))
@@ -100,12 +113,9 @@ def test_search_answers_where_the_network_gives_nothing(planner, monkeypatch):
 
     monkeypatch.setattr(RobotDiffuse, "sample", nothing)
     monkeypatch.setattr(RobotDiffuse, "refine", nothing)
-    for quick in (True, False):
-        if not quick:
-            monkeypatch.setattr(RRTConnect, "first", lambda *_: None)
-        result = planner.plan(PROBLEM, time_limit=10.0)
-        assert result.stage == "rrt_connect" and result.path is not None
-        assert verify(PROBLEM, result.path).valid
+    result = planner.plan(PROBLEM, time_limit=10.0)
+    assert result.stage == "aorrtc" and result.path is not None
+    assert verify(PROBLEM, result.path).valid
 
 
 def test_the_first_path_comes_before_the_network_is_asked(planner, monkeypatch):
@@ -120,10 +130,23 @@ def test_the_first_path_comes_before_the_network_is_asked(planner, monkeypatch):
     planner.plan(PROBLEM, time_limit=10.0)
     monkeypatch.setattr(RobotDiffuse, "sample", late)
     start = time.perf_counter()
-    result = planner.plan(PROBLEM, time_limit=0.2)
+    result = planner.plan(PROBLEM, time_limit=1.0, until="limit")
     assert result.path is not None and verify(PROBLEM, result.path).valid
     (first, longest), *_, (_, shortest) = result.progress
     assert first < began[0] and result.path.length == pytest.approx(shortest) and shortest <= longest
+
+
+def test_batches_have_their_share_of_the_work(monkeypatch):
+    drawn = []
+    sample = RobotDiffuse.sample
+    monkeypatch.setattr(RobotDiffuse, "sample", lambda *arguments: drawn.append(1) or sample(*arguments))
+    counts = {}
+    for share in (0.0, 0.5):
+        drawn.clear()
+        settings = RobotDiffuseSettings(network_share=share, search=AORRTCSettings(patience=40_000))
+        assert RobotDiffuse(settings).plan(PROBLEM, time_limit=60.0).solved
+        counts[share] = len(drawn)
+    assert counts[0.0] == 0 and counts[0.5] >= 40_000 // BATCH_WORK - 1
 
 
 def test_a_candidate_that_the_judge_refuses_is_not_returned(planner, monkeypatch):
@@ -140,9 +163,9 @@ def test_a_candidate_that_the_judge_refuses_is_not_returned(planner, monkeypatch
 
 def test_a_robot_without_weights_is_planned_by_search(planner):
     stranger = replace(PANDA, name="stranger")
-    assert bundled_model("stranger") is None
+    assert planner.model(stranger) is None
     result = planner.plan(Problem(stranger, Scene([BALL]), LEFT, JointGoal(RIGHT[None])), time_limit=10.0)
-    assert result.stage == "rrt_connect" and result.solved
+    assert result.stage == "aorrtc" and result.solved
     assert any("no weights" in note for note in result.notes)
 
 
@@ -154,7 +177,7 @@ def test_invalid_start(planner):
 
 def test_the_code_tells_scenes_apart():
     """z of two clouds of one scene is nearer than z of clouds of two scenes."""
-    model = bundled_model("panda")
+    model = load_model("panda")
     assert model is not None
     rng = np.random.default_rng(0)
     near = CollisionChecker(PANDA, Scene([BALL]))
@@ -172,7 +195,7 @@ def test_unlearned_starts_keep_ends_and_limits():
 
 
 def test_the_guidance_scale_reaches_the_network():
-    checker, model = CollisionChecker(PANDA, PROBLEM.scene), bundled_model("panda")
+    checker, model = CollisionChecker(PANDA, PROBLEM.scene), load_model("panda")
     assert model is not None
     code = encode(model, checker, 320, np.random.default_rng(0))
     plain, same, strong = (

@@ -9,10 +9,10 @@ from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.shortcut import shortcut
+from robotdiffuse.paths.simplify import shortcut
+from robotdiffuse.planners.aorrtc import kernel
 from robotdiffuse.planners.ends import retreat
-from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import RRTConnect, RRTConnectSettings
+from robotdiffuse.planners.rrt_connect import RRTConnect, RRTConnectSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
@@ -88,11 +88,13 @@ def test_shortcuts_keep_ends_and_freedom_and_do_not_lengthen():
     for seed in range(5):
         state = random_state(seed)
         trees = kernel.make_trees(LEFT.astype(np.float32), RIGHT[None].astype(np.float32), 5000)
-        path = kernel.search(space, trees, np.float32(1.0), 100_000, state)
+        path = kernel.connect(space, trees, np.float32(1.0), 100_000, state)
         short = shortcut(space, path, 50, state)
         assert np.array_equal(short[[0, -1]], path[[0, -1]])
         assert path_length(short) <= path_length(path) + 1e-4
         assert motions_free(space, short).all()
+        in_double = shortcut(space, path.astype(np.float64), 0, state)
+        assert np.array_equal(in_double, shortcut(space, path, 0, state))
 
 
 def test_search_can_be_continued():
@@ -100,7 +102,7 @@ def test_search_can_be_continued():
     trees = kernel.make_trees(LEFT.astype(np.float32), RIGHT[None].astype(np.float32), 5000)
     state, sizes = random_state(1), []
     for _ in range(1000):
-        if len(kernel.search(space, trees, np.float32(0.3), 1, state)):
+        if len(kernel.connect(space, trees, np.float32(0.3), 1, state)):
             break
         sizes.append(trees.sizes.sum())
     assert len(sizes) > 1 and (np.diff(sizes) >= 0).all() and sizes[-1] > sizes[0]
@@ -151,7 +153,7 @@ def test_no_way_through_times_out():
 
 @pytest.mark.parametrize(
     ("change", "what"),
-    [({"reach": 0.0}, "reach"), ({"resolution": -1.0}, "resolution"), ({"shortcuts": -1}, "shortcuts")],
+    [({"range": 0.0}, "range"), ({"resolution": -1.0}, "resolution"), ({"shortcuts": -1}, "shortcuts")],
 )
 def test_settings_are_checked(change, what):
     with pytest.raises(InputError, match=f"rrt_connect.{what} is"):

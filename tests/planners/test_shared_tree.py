@@ -17,6 +17,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.planners import load_planner
 from robotdiffuse.planners.shared_tree import kernel
 from robotdiffuse.planners.shared_tree.planner import SharedTreeRRTStar, SharedTreeSearch, SharedTreeSettings
+from robotdiffuse.planners.shared_tree.tree import best_cost, make_tree
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
@@ -87,11 +88,11 @@ def test_rrt_star_alone_converges_to_the_optimum(planar) -> None:
     assert optimum > 1.1 * np.linalg.norm(goal - start), "the straight line must not do"
     space = search_space(checker, 0.01)
     goals = goal[None].astype(np.float32)
-    tree = kernel.make_tree(start.astype(np.float32), goals, 60_000)
+    tree = make_tree(start.astype(np.float32), goals, 60_000)
     state, costs = random_state(0), []
     for iterations in (500, 3_000, 30_000):
         kernel.grow(space, tree, np.float32(0.5), np.float32(0.1), iterations, state)
-        costs.append(float(kernel.best_cost(tree)) / optimum)
+        costs.append(float(best_cost(tree)) / optimum)
     assert costs[0] > costs[1] > costs[2]
     # the grid's own error: 0.4 % of direction, and cells of 0.02 rad at the obstacle's edge
     assert 0.985 < costs[2] < 1.01
@@ -260,7 +261,7 @@ def test_no_way_ends_at_the_time_limit_or_earlier() -> None:
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("reach", 0.0), ("safety_distance", -0.1), ("goal_bias", 1.0), ("patience", 0), ("growth", 0)],
+    [("range", 0.0), ("safety_distance", -0.1), ("goal_bias", 1.0), ("patience", 0), ("growth", 0)],
 )
 def test_bad_settings_are_refused(name: str, value: float) -> None:
     with pytest.raises(InputError, match=f"shared_tree_rrt_star.{name} is {value}"):

@@ -16,16 +16,16 @@ from torch import Tensor
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import load_network, save_network
 from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
-from robotdiffuse.learning.networks.base import JointRanges
-from robotdiffuse.learning.networks.checkpoint import load_baseline, save_baseline
 from robotdiffuse.learning.networks.trajectory_prior import (
     TrajectoryPrior,
     TrajectoryPriorSettings,
     exponential_levels,
     quadratic_levels,
 )
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.planners.edmp import EDMP, ENSEMBLE, EDMPSettings, GuideSettings
 from robotdiffuse.planners.guided_prior import collision_gradient, shared_out
@@ -39,29 +39,29 @@ from robotdiffuse.types import Status
 from robotdiffuse.verify import verify, verify_trajectory
 
 PANDA = load_robot("panda")
-RANGES = JointRanges.of(PANDA)
+RANGES = RobotIdentity.of(PANDA)
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
 PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
 CHECKER = CollisionChecker(PANDA, PROBLEM.scene)
 SMALL = TrajectoryPriorSettings(unet=UNetSettings(width=16, multiples=(1, 2), condition_width=16))
-FRAMES = 48
+WAYPOINTS = 48
 
 
-def bumps(frames: int) -> Float[ndarray, "inner inner"]:
-    """Covariance of smooth bumps over the inner frames, in normalised joint values."""
-    t = np.linspace(0, 1, frames)[1:-1, None]
+def bumps(waypoints: int) -> Float[ndarray, "inner inner"]:
+    """Covariance of smooth bumps over the inner waypoints, in normalised joint values."""
+    t = np.linspace(0, 1, waypoints)[1:-1, None]
     waves = np.concatenate([0.25 / k * np.sin(np.pi * k * t) for k in (1, 2, 3)], 1)
-    return waves @ waves.T + 1e-6 * np.eye(frames - 2)
+    return waves @ waves.T + 1e-6 * np.eye(waypoints - 2)
 
 
 class Gaussian(TrajectoryPrior):
     """The exact denoiser of straight lines with such bumps."""
 
     def forward(
-        self, x: Float[Tensor, "batch frames dof"], level: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch frames dof"]:
+        self, x: Float[Tensor, "batch waypoints dof"], level: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch waypoints dof"]:
         at = round(float(level[0]) * self.schedule.steps)
         signal, noise = float(self.schedule.signal[at]), float(self.schedule.noise[at])
         inner, t = x[:, 1:-1].numpy().astype(np.float64), np.linspace(0, 1, x.shape[1])[1:-1, None]
@@ -76,10 +76,10 @@ def gaussian() -> Gaussian:
     return Gaussian(RANGES, SMALL)
 
 
-def data_of(count: int, frames: int = FRAMES) -> TrajectoryData:
+def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
     """Lines with bumps, a third of them called trivial, around one ball."""
     rng = np.random.default_rng(1)
-    t = np.linspace(0, 1, frames)[:, None]
+    t = np.linspace(0, 1, waypoints)[:, None]
     middle, half = (PANDA.lower + PANDA.upper) / 2, (PANDA.upper - PANDA.lower) / 2
     ends = middle + half * rng.uniform(-0.6, 0.6, (2, count, 1, PANDA.dof))
     q = (1 - t) * ends[0] + t * ends[1] + 0.3 * np.sin(np.pi * t) * rng.normal(size=(count, 1, PANDA.dof))
@@ -120,7 +120,7 @@ def test_success_needs_motions_that_are_not_trivial() -> None:
 
 
 def test_other_frames_are_refused() -> None:
-    with pytest.raises(InputError, match=r"32 frames and trajectory_prior.frames is 48"):
+    with pytest.raises(InputError, match=r"32 waypoints and trajectory_prior.waypoints is 48"):
         TrajectoryPrior(RANGES, SMALL).loss(data_of(4, 32), 4, 0.0, np.random.default_rng(0))
 
 
@@ -130,14 +130,14 @@ def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> N
     levels = gaussian.schedule.sampling_levels(100)[:-1]
     q = gaussian.sample(starts, goals, levels, np.random.default_rng(0))
     assert q is not None
-    x = gaussian.normalized(q.astype(np.float64))
-    t = np.linspace(0, 1, FRAMES)[:, None]
+    x = gaussian.normalizer.to_unit(q.astype(np.float64))
+    t = np.linspace(0, 1, WAYPOINTS)[:, None]
     bump = x - ((1 - t) * x[:, :1] + t * x[:, -1:])
     # joints whose bumps the limits cut off tell nothing about the sampler
     whole = np.abs(x).max((0, 1)) < 0.99
     assert whole.sum() >= 2
     bump = bump[:, 1:-1, whole]
-    variance = np.diag(bumps(FRAMES))
+    variance = np.diag(bumps(WAYPOINTS))
     assert np.abs(bump.mean((0, 2))).max() < 4 * np.sqrt(variance.max() / (300 * whole.sum()))
     assert bump.var((0, 2)).mean() == pytest.approx(variance.mean(), rel=0.1)
 
@@ -151,7 +151,7 @@ def test_samples_hold_their_ends_exactly() -> None:
         return q + np.float32(0.1 * (left < 2))
 
     q = network.sample(starts, goals, np.array([255, 100, 20, 1]), rng, guide)
-    assert q is not None and q.dtype == np.float32 and q.shape == (3, FRAMES, PANDA.dof)
+    assert q is not None and q.dtype == np.float32 and q.shape == (3, WAYPOINTS, PANDA.dof)
     assert np.array_equal(q[:, 0], starts) and np.array_equal(q[:, -1], goals)
     assert np.all(q >= PANDA.lower - 1e-5) and np.all(q <= PANDA.upper + 1e-5)
 
@@ -201,20 +201,20 @@ def test_the_process_is_that_of_natural_splines() -> None:
 
 def test_the_precision_is_that_of_the_process() -> None:
     """Against the covariance of the process propagated from a vague first state."""
-    frames, vague = 8, 1e3 * np.eye(2)
+    waypoints, vague = 8, 1e3 * np.eye(2)
     transition, noise = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
-    covariance = np.zeros((2 * frames, 2 * frames))
+    covariance = np.zeros((2 * waypoints, 2 * waypoints))
     covariance[:2, :2] = vague
-    for i in range(1, frames):
+    for i in range(1, waypoints):
         here, before = slice(2 * i, 2 * i + 2), slice(2 * i - 2, 2 * i)
         covariance[here, : 2 * i] = transition @ covariance[before, : 2 * i]
         covariance[: 2 * i, here] = covariance[here, : 2 * i].T
         covariance[here, here] = transition @ covariance[before, before] @ transition.T + noise
     states = np.linalg.inv(covariance)
     states[:2, :2] -= np.linalg.inv(vague)
-    assert state_precision(frames) == pytest.approx(states, abs=1e-4)
+    assert state_precision(waypoints) == pytest.approx(states, abs=1e-4)
     positions = np.linalg.inv(covariance[::2, ::2])
-    assert gaussian_process(frames).precision == pytest.approx(positions, abs=0.01)
+    assert gaussian_process(waypoints).precision == pytest.approx(positions, abs=0.01)
 
 
 def test_gradient_of_the_process() -> None:
@@ -235,9 +235,9 @@ def test_implicit_step_of_the_process() -> None:
     assert np.all(process.costs(x) < process.costs(q))
 
 
-def lines(count: int) -> Float[ndarray, "count frames dof"]:
+def lines(count: int) -> Float[ndarray, "count waypoints dof"]:
     """From left to right through the ball, with small bumps."""
-    t = np.linspace(0, 1, FRAMES)[:, None]
+    t = np.linspace(0, 1, WAYPOINTS)[:, None]
     bump = np.sin(np.pi * t) * np.random.default_rng(3).normal(0, 0.1, (count, 1, PANDA.dof))
     return ((1 - t) * LEFT + t * RIGHT + bump).astype(np.float32)
 
@@ -300,7 +300,7 @@ def test_goals_take_turns() -> None:
 @pytest.fixture(params=["mpd", "edmp"])
 def planner(request: pytest.FixtureRequest, gaussian: Gaussian, monkeypatch: pytest.MonkeyPatch):
     made = MPD() if request.param == "mpd" else EDMP()
-    monkeypatch.setattr(made, "prior", lambda _robot: gaussian)
+    monkeypatch.setattr(made, "network", lambda _robot: gaussian)
     return made
 
 
@@ -342,19 +342,19 @@ def test_weights_survive_a_file(tmp_path) -> None:
     torch.manual_seed(0)
     network = TrajectoryPrior(RANGES, SMALL)
     torch.nn.init.normal_(network.denoiser.out.weight, std=0.1)
-    save_baseline("trajectory_prior", network, tmp_path, {})
-    loaded = load_baseline("trajectory_prior", str(tmp_path), PANDA)
+    save_network("trajectory_prior", network, tmp_path, {})
+    loaded = load_network("trajectory_prior", str(tmp_path), PANDA)
     assert isinstance(loaded, TrajectoryPrior) and loaded.settings == SMALL
-    x, level = torch.randn(2, FRAMES, PANDA.dof), torch.full((2,), 0.3)
+    x, level = torch.randn(2, WAYPOINTS, PANDA.dof), torch.full((2,), 0.3)
     with torch.no_grad():
         assert torch.allclose(loaded(x, level), network(x, level), atol=0.05)
-    assert MPD(MPDSettings(weights=str(tmp_path))).prior(PANDA) is loaded
+    assert MPD(MPDSettings(weights=str(tmp_path))).network(PANDA) is loaded
 
 
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: TrajectoryPriorSettings(frames=2), r"frames is 2; it must be at least 3"),
+        (lambda: TrajectoryPriorSettings(waypoints=2), r"waypoints is 2; it must be at least 3"),
         (lambda: TrajectoryPriorSettings(trivial_share=1.5), r"trivial_share is 1.5"),
         (lambda: MPDSettings(samples=0), r"mpd.samples is 0"),
         (lambda: MPDSettings(sampling_steps=1), r"mpd.sampling_steps is 1"),
@@ -362,7 +362,7 @@ def test_weights_survive_a_file(tmp_path) -> None:
         (lambda: MPDSettings(margin=-0.1), r"mpd.margin is -0.1"),
         (lambda: MPDSettings(push=0.0), r"mpd.push is 0.0"),
         (lambda: EDMPSettings(samples=11), r"edmp.samples is 11 and guides are 12"),
-        (lambda: EDMPSettings(guides=()), r"edmp.guides is empty"),
+        (lambda: EDMPSettings(guides=()), r"edmp.guides is \(\)"),
         (lambda: EDMPSettings(sampling_steps=1), r"edmp.sampling_steps is 1"),
         (lambda: EDMPSettings(self_margin=-1.0), r"edmp.self_margin is -1.0"),
         (lambda: EDMPSettings(push=-1.0), r"edmp.push is -1.0"),

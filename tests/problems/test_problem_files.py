@@ -181,7 +181,7 @@ WRONG: dict[str, tuple[object, str]] = {
     "empty": (None, "problem is None"),
     "unknown field": (
         GOOD | {"strat": []},
-        "unknown field of problem: 'strat'; known: goal, locked, robot, scene, start",
+        "unknown field of problem: 'strat'; known: clearance, goal, locked, robot, scene, start",
     ),
     "field not a text": (GOOD | {1: 2}, "unknown field of problem: '?1'?"),
     "no start": (without("start"), "problem has no start"),

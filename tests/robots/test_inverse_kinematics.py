@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from helpers.example_robots import TIPS, example_robot, planar_arm
 from robotdiffuse.errors import InputError
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
-from robotdiffuse.robots.kinematics import ForwardKinematics, link_pose
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.transforms import rotation_angle, transform
 

@@ -8,7 +8,8 @@ import torch
 
 from helpers.example_robots import TIPS, example_robot, planar_arm, urdf_file
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots.kinematics import ForwardKinematics, link_pose
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
 
 
@@ -121,6 +122,8 @@ def test_frames_links_and_single_poses_agree(name: str) -> None:
         T = frames[robot.link_frame(link)].numpy() @ robot.T_frame_link(link)
         for same in (links[k], fk.link(q, link), link_pose(robot, q.numpy(), link)):
             np.testing.assert_allclose(same, T, rtol=0, atol=1e-12)
+        origins = link_origins(robot, q.numpy()[None], link)
+        np.testing.assert_allclose(origins, T[None, :3, 3], rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("batch", [(), (0,), (1,), (2, 3)])

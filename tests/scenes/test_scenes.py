@@ -15,7 +15,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_mesh, read_scene, read_yaml, scene_entries
 from robotdiffuse.scenes.point_cloud import crop, read_points, voxel_thin
-from robotdiffuse.scenes.sampling import SAMPLERS, VisibleRegion, sample_surface
+from robotdiffuse.scenes.sampling import DRAWS, VisibleRegion, sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 
@@ -34,7 +34,7 @@ EVERYWHERE = VisibleRegion(floor=-10.0, reach=100.0)
 
 
 def surface_distance(shape: Shape, points: ndarray) -> ndarray:
-    """How far points are from the surface, by another form than the samplers'."""
+    """How far points are from the surface, by another form than those that draw."""
     if isinstance(shape, PointCloud):
         return np.abs(points[:, None] - shape.points).max(axis=2).min(axis=1)
     if isinstance(shape, Mesh):
@@ -54,14 +54,14 @@ def surface_distance(shape: Shape, points: ndarray) -> ndarray:
     return np.abs(np.hypot(radial, np.maximum(0, along)) - shape.radius)
 
 
-def test_every_shape_has_a_sampler() -> None:
-    assert {*KINDS.values()} == {*SAMPLERS} == {type(shape) for shape in SHAPES.values()}
+def test_points_are_drawn_on_every_shape() -> None:
+    assert {*KINDS.values()} == {*DRAWS} == {type(shape) for shape in SHAPES.values()}
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_samples_lie_on_the_surface_and_in_the_bounds(name: str) -> None:
     shape = SHAPES[name]
-    points = SAMPLERS[type(shape)](shape, 2000, np.random.default_rng(1))
+    points = DRAWS[type(shape)](shape, 2000, np.random.default_rng(1))
     assert points.shape == (2000, 3)
     assert surface_distance(shape, points).max() < 1e-9
     low, high = shape.bounds
@@ -85,7 +85,7 @@ def test_samples_lie_on_the_surface_and_in_the_bounds(name: str) -> None:
 )
 def test_samples_are_uniform_by_area(name: str, part: Callable[[ndarray], ndarray], share: float) -> None:
     shape = SHAPES[name]
-    points = SAMPLERS[type(shape)](shape, 40000, np.random.default_rng(2)) - shape.center  # type: ignore[attr-defined]
+    points = DRAWS[type(shape)](shape, 40000, np.random.default_rng(2)) - shape.center  # type: ignore[attr-defined]
     found = part(points if name == "sphere" else points @ shape.rotation).mean()  # type: ignore[attr-defined]
     # Five standard deviations of a share among 40,000 draws.
     assert abs(found - share) < 5 * np.sqrt(share * (1 - share) / 40000)

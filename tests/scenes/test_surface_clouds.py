@@ -109,7 +109,7 @@ def test_uniform_by_area():
     np.testing.assert_allclose(heights.T @ heights / len(heights), np.eye(3) / 3, atol=0.015)
 
 
-def test_agrees_with_the_sampler_of_single_scenes():
+def test_agrees_with_the_clouds_of_single_scenes():
     scenes, _ = some_scenes(20, 5, 3)
     n, rng = 4000, np.random.default_rng(0)
     ours = surface_clouds(scenes, n, seeded(), region=PANDA_REGION).numpy()

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from helpers.visual_bundles import visual_meshes, write_visual
 from robotdiffuse.errors import InputError
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
-from robotdiffuse.robots.visual import VisualMesh, load_visual, visual_meshes, write_visual
+from robotdiffuse.robots.visual import VisualMesh, load_visual
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 from robotdiffuse.transforms import transform

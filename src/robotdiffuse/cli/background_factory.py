@@ -8,11 +8,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.processes import end, interrupts_not_passed_on, prepare_worker
 
 if TYPE_CHECKING:
     from robotdiffuse.generation import GenerationSettings
@@ -36,8 +36,6 @@ def filled_meanwhile(folder: str, workers: int, robot: str) -> Iterator[None]:
             time.sleep(POLL)
         yield
         return
-    from robotdiffuse.generation.workers import interrupts_not_passed_on
-
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     factory = context.Process(target=_fill, args=(folder, workers, robot, theirs))
@@ -49,7 +47,7 @@ def filled_meanwhile(folder: str, workers: int, robot: str) -> Iterator[None]:
         _wait_for_shard(folder, ours)
         yield
     finally:
-        _end(factory)
+        end([factory], signal.SIGINT, PATIENCE)
     error = _message(ours)
     if error:
         print(f"robotdiffuse: the data factory ended early: {error}", file=sys.stderr)
@@ -85,15 +83,6 @@ def _message(connection: Connection) -> str | None:
         return None
 
 
-def _end(factory: SpawnProcess) -> None:
-    if factory.pid is not None and factory.is_alive():
-        os.kill(factory.pid, signal.SIGINT)
-        factory.join(PATIENCE)
-    if factory.is_alive():
-        factory.kill()
-    factory.join()
-
-
 def _fill(folder: str, workers: int, robot: str, connection: Connection) -> None:
     """The factory's process: tells that it began, or its error; ends on SIGINT, and with its parent."""
     os.setpgrp()  # the terminal's Ctrl-C does not reach it
@@ -110,7 +99,6 @@ def _fill(folder: str, workers: int, robot: str, connection: Connection) -> None
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         from robotdiffuse.generation import generate
-        from robotdiffuse.generation.workers import prepare_worker
 
         prepare_worker()
         generate(_settings(folder, robot), Path(folder), workers, progress=tell)
@@ -123,15 +111,7 @@ def _fill(folder: str, workers: int, robot: str, connection: Connection) -> None
 def _settings(folder: str, robot: str) -> "GenerationSettings":
     from robotdiffuse.data.manifest import MANIFEST, read_manifest
     from robotdiffuse.generation import GenerationSettings
-    from robotdiffuse.planners.shared_tree.planner import SharedTreeSettings
 
     if not (Path(folder) / MANIFEST).exists():
         return GenerationSettings(robot=robot)
-    found = read_manifest(folder).settings
-    try:
-        values: dict[str, Any] = found | {"search": SharedTreeSettings(**found["search"])}
-        return GenerationSettings(**values)
-    except (KeyError, TypeError) as error:
-        raise InputError(
-            f"{folder}/{MANIFEST} has settings that are not of this version's data factory: {error}"
-        ) from None
+    return GenerationSettings.from_json(read_manifest(folder).settings, f"{folder}/{MANIFEST}: settings")

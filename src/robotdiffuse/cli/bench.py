@@ -28,8 +28,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--planners",
         required=True,
         metavar="NAME,...",
-        help="see `robotdiffuse planners`, or all; with settings, NAME:SETTING=VALUE:SETTING=VALUE, or with "
-        "weights of its own, NAME@FOLDER",
+        help="see `robotdiffuse planners`, or all; with settings, NAME:SETTING=VALUE:SETTING=VALUE, among "
+        "them until=first|short|limit and clearance=M of its calls, or with weights of its own, NAME@FOLDER",
     )
     run.add_argument(
         "--problems",
@@ -87,6 +87,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--encoder-samples", type=count, metavar="N", help="clouds for the frozen encoder (300000)"
     )
     ablation.add_argument("--problems", type=count, metavar="N", help="held-out problems (500)")
+    ablation.add_argument("--family", metavar="NAME", help="family of these problems (rop)")
     ablation.add_argument("--rows", metavar="NAME,...", help="some of the rows (default: all ten)")
     ablation.add_argument(
         "--workers", type=count, default=os.cpu_count() or 1, metavar="N", help="processes (all cores)"
@@ -228,7 +229,7 @@ def run_ablation(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation import ablation
     from robotdiffuse.evaluation.tables import show
 
-    names = ("data", "out", "samples", "encoder_samples", "problems")
+    names = ("data", "out", "samples", "encoder_samples", "problems", "family")
     given = {name: getattr(arguments, name) for name in names if getattr(arguments, name) is not None}
     settings = ablation.AblationSettings(**given)
     rows = list(ablation.ROWS) if arguments.rows is None else arguments.rows.split(",")

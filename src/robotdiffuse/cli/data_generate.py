@@ -32,9 +32,11 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
     )
     parser.add_argument("--target", metavar="KIND", help="position (default) or pose of the tip")
     parser.add_argument("--goals", type=count, metavar="N", help="most goals of a target (default: 10)")
-    parser.add_argument("--frames", type=count, metavar="N", help="frames of a motion (default: 254)")
     parser.add_argument(
-        "--timing", metavar="KIND", help="frames even in arc length (arc, default) or in time"
+        "--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion (default: 254)"
+    )
+    parser.add_argument(
+        "--timing", metavar="KIND", help="waypoints even in arc length (arc, default) or in time"
     )
     parser.add_argument(
         "--safety-distance", type=not_negative, metavar="M", help="to obstacles [m] (default: 0.05)"
@@ -58,7 +60,7 @@ SETTINGS = (
     "trivial_share",
     "target",
     "goals",
-    "frames",
+    "waypoints",
     "timing",
     "shard",
 )
@@ -105,5 +107,5 @@ def run_generate(arguments: argparse.Namespace) -> int:
 
         workers = arguments.workers or os.cpu_count() or 1
         made = generate(settings, Path(arguments.out), workers, arguments.cluster, show)
-    print(f"{made:,} trajectories of {settings.frames} frames in {arguments.out}")
+    print(f"{made:,} trajectories of {settings.waypoints} waypoints in {arguments.out}")
     return 0

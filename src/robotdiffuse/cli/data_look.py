@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from rich.progress import Progress
 
-    from robotdiffuse.evaluation.data.check import DataCheck
-    from robotdiffuse.evaluation.data.report import DataSummary, Spread
     from robotdiffuse.robots.robot import Robot
     from robotdiffuse.viewer.gallery import Exhibit
 
@@ -121,72 +119,18 @@ def _bar() -> "Progress":
 
 def run_info(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation.data.page import write_page
+    from robotdiffuse.evaluation.data.report import tables
+    from robotdiffuse.evaluation.tables import show
 
     page = Path(arguments.page or Path(arguments.folder) / "report.html")
-    print_summary(write_page(arguments.folder, page, _robot(arguments.robot)))
+    show(*tables(write_page(arguments.folder, page, _robot(arguments.robot))))
     print(f"wrote {page}")
     return 0
 
 
-def print_summary(summary: "DataSummary") -> None:
-    """The figures, as tables."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    from robotdiffuse.evaluation.data.page import size_in_words
-
-    console, counts = Console(), summary.counts
-    made = f"{summary.trajectories:,}"
-    if summary.trajectories < summary.planned:
-        made += f" of {summary.planned:,} planned"
-    lost = ", ".join(f"{counts.get(name, 0):,} {name}" for name in ("unsolved", "refused", "thinned"))
-    table = Table(show_header=False, title=f"{escape(summary.robot)}: {made} motions", title_justify="left")
-    spacing = "length" if summary.timing == "arc" else "time"
-    table.add_row("frames", f"{summary.frames:,}, evenly spaced in {spacing}")
-    table.add_row("on disk", f"{size_in_words(summary.bytes)} in {summary.shards:,} shards")
-    table.add_row("splits", ", ".join(f"{name} {n:,}" for name, n in summary.splits.items()))
-    table.add_row(
-        "problems tried", f"{counts.get('tried', 0):,}: {100 * summary.success:.1f} % solved; {lost}"
-    )
-    safety = (
-        f"{100 * summary.safety_distance:.3g} cm, or what start and goal have, kept by "
-        f"{100 * summary.kept:.1f} %; where both have it, by {100 * summary.kept_throughout:.1f} %"
-    )
-    table.add_row("safety distance", safety)
-    table.add_row("goals reached", f"{summary.goals_reached:.1f} per problem")
-    console.print(table)
-
-    units = (escape("length [rad]"), "detour", escape("clearance [cm]"))
-    families = Table("medians of", "motions", "trivial", *units)
-    for name, family in summary.families.items():
-        families.add_row(
-            escape(name),
-            f"{family.trajectories:,}",
-            f"{100 * family.trivial:.1f} %",
-            _median(family.length),
-            _median(family.detour),
-            _median(family.clearance, 100.0),
-        )
-    console.print(families)
-
-    spreads = Table("", "mean", "least", "5 %", "median", "95 %", "most")
-    parts = ((summary.length, 1.0), (summary.detour, 1.0), (summary.clearance, 100.0))
-    for name, (spread, scale) in zip(units, parts, strict=True):
-        spreads.add_row(name, *(_rounded(scale * value) for value in (spread.mean, *spread.quantiles)))
-    console.print(spreads)
-
-
-def _median(spread: "Spread", scale: float = 1.0) -> str:
-    return _rounded(scale * spread.quantiles[2])
-
-
-def _rounded(value: float) -> str:
-    return f"{round(value, 3) + 0.0:.3f}"  # no negative zero
-
-
 def run_check(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation.data.check import check_data
+    from robotdiffuse.evaluation.tables import show
 
     with _bar() as bar:
         task = bar.add_task("motions", total=None)
@@ -199,35 +143,8 @@ def run_check(arguments: argparse.Namespace) -> int:
             not arguments.no_pybullet,
             lambda done, total: bar.update(task, completed=done, total=total),
         )
-    print_check(check)
+    show(*check.tables)
     return CLEAN if check.clean else VIOLATIONS
-
-
-def print_check(check: "DataCheck") -> None:
-    """What was found, as a table, with the first examples of each kind below."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
-    from robotdiffuse.evaluation.data.check import KINDS
-
-    console = Console()
-    title = f"{check.robot}: {'clean' if check.clean else 'violations found'}"
-    table = Table(show_header=False, title=escape(title), title_justify="left")
-    made = f"{check.motions:,}" + (f" of {check.planned:,} planned" if check.motions < check.planned else "")
-    table.add_row("shards, motions", f"{check.shards:,}, {made}")
-    rate = check.checked / max(check.seconds, 1e-9)
-    table.add_row("judged", f"{check.checked:,} in {check.seconds:.1f} s ({rate:.0f}/s)")
-    for kind, name in KINDS.items():
-        left_out = kind == "pybullet" and not check.pybullet
-        table.add_row(name, "not asked" if left_out else f"{check.counts[kind]:,}")
-    table.add_row("least clearance recorded", f"{_rounded(1e3 * check.least_clearance)} mm")
-    console.print(table)
-    if check.examples:
-        examples = Table("first examples", "where", "what")
-        for finding in check.examples:
-            examples.add_row(finding.kind, finding.where, escape(finding.message))
-        console.print(examples)
 
 
 def run_view(arguments: argparse.Namespace) -> int:

@@ -3,11 +3,12 @@
 import argparse
 from importlib.resources import as_file, files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from robotdiffuse.cli.arguments import natural, positive
+from robotdiffuse.cli.arguments import natural, not_negative, positive, share
 from robotdiffuse.cli.console import print_result
 from robotdiffuse.cli.draw import ENDINGS, draw, show
+from robotdiffuse.types import SHORT, UNTIL
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
 DEMO = "shelf.yaml"
 DEMO_TIME_LIMIT = 5.0
 """[s]"""
-WARM_UP = 0.001
-"""Time limit of the call that loads the compiled code [s]."""
 
 
 def add_plan(commands: argparse._SubParsersAction) -> None:
@@ -50,6 +49,26 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--time-limit", type=positive, default=1.0, metavar="S", help="wall time for planning (default: 1 s)"
     )
+    parser.add_argument(
+        "--until",
+        choices=UNTIL,
+        default=SHORT,
+        help="end with the first motion, when more time stops paying (default), or with the time limit",
+    )
+    parser.add_argument(
+        "--clearance",
+        type=not_negative,
+        metavar="M",
+        help="distance to keep to obstacles where it can be kept (default: the problem's, or 0.01 m)",
+    )
+    for what in ("velocity", "acceleration"):
+        parser.add_argument(
+            f"--{what}-scaling",
+            type=share,
+            default=1.0,
+            metavar="X",
+            help=f"share of the robot's {what} limits that is used, above 0 and at most 1 (default: 1)",
+        )
     parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
     parser.add_argument(
         "--out",
@@ -83,7 +102,18 @@ def run_plan(arguments: argparse.Namespace) -> int:
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
     problem = load_problem(arguments.problem, arguments.index)
-    result = solve(problem, name, arguments.time_limit, arguments.seed, settings, arguments.weights)
+    result = solve(
+        problem,
+        name,
+        settings,
+        arguments.weights,
+        time_limit=arguments.time_limit,
+        seed=arguments.seed,
+        until=arguments.until,
+        clearance=arguments.clearance,
+        velocity_scaling=arguments.velocity_scaling,
+        acceleration_scaling=arguments.acceleration_scaling,
+    )
     print_result(result)
     for file in outputs:
         if file.suffix.lower() == ".json":
@@ -108,7 +138,7 @@ def run_demo(arguments: argparse.Namespace) -> int:
     outputs = [check_output(file, ENDINGS) for file in ("demo.png", "demo.html")]
     with as_file(files("robotdiffuse") / "examples" / DEMO) as file:
         problem = load_problem(file)
-    result = solve(problem, DEFAULT_PLANNER, DEMO_TIME_LIMIT, seed=0)
+    result = solve(problem, DEFAULT_PLANNER, time_limit=DEMO_TIME_LIMIT)
     print_result(result)
     if result.trajectory is None:
         return 1
@@ -121,15 +151,14 @@ def run_demo(arguments: argparse.Namespace) -> int:
 def solve(
     problem: "Problem",
     planner: str,
-    time_limit: float,
-    seed: int,
     settings: "Settings | None" = None,
     weights: str | None = None,
+    **request: Any,
 ) -> "PlanResult":
-    """Load the planner, with settings or weights of its own, and plan, behind a spinner.
+    """Load the planner, with settings or weights of its own, and plan as the request says (the arguments of
+    `Planner.plan`), behind a spinner.
 
-    A first call, whose result is dropped, loads the compiled code, or compiles it on a new machine, which
-    would otherwise use up the time limit.
+    The compiled code is loaded before, or compiled on a new machine, which would otherwise use up the limit.
     """
     from rich.console import Console
 
@@ -138,6 +167,6 @@ def solve(
     console = Console(stderr=True)
     with console.status("loading compiled code (a new machine compiles it first, for about a minute)"):
         loaded = load_planner(planner, settings, weights)
-        loaded.plan(problem, time_limit=WARM_UP, seed=seed)
+        loaded.warm_up(problem)
     with console.status(f"planning with {planner}"):
-        return loaded.plan(problem, time_limit=time_limit, seed=seed)
+        return loaded.plan(problem, **request)

@@ -10,7 +10,7 @@ from robotdiffuse.errors import InputError
 SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
 PARTS = (
     *("denoiser", "objective", "sampler", "sampling_steps", "parametrization", "rows", "target"),
-    *("condition_drop", "frames"),
+    *("condition_drop", "waypoints"),
 )
 """Of the planner's config."""
 
@@ -73,13 +73,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     parts.add_argument(
         "--sampling-steps", type=count, metavar="N", help="for planning: calls of the denoiser for a batch"
     )
-    parts.add_argument("--parametrization", metavar="NAME", help="of motions: frames or b_spline")
+    parts.add_argument("--parametrization", metavar="NAME", help="of motions: waypoints or b_spline")
     parts.add_argument("--rows", type=count, metavar="N", help="control points of b_spline")
     parts.add_argument("--target", metavar="NAME", help="residual, to the straight line, or absolute")
     parts.add_argument(
         "--condition-drop", type=share, metavar="P", help="share without condition, for its guidance"
     )
-    parts.add_argument("--frames", type=count, metavar="N", help="frames of a motion")
+    parts.add_argument("--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion")
     planner.set_defaults(run=run_planner)
 
     baseline = kinds.add_parser(
@@ -131,7 +131,7 @@ def run_encoder(arguments: argparse.Namespace) -> int:
 
 def run_planner(arguments: argparse.Namespace) -> int:
     from robotdiffuse.cli.background_factory import filled_meanwhile
-    from robotdiffuse.learning.denoisers import PAPER_SIZE
+    from robotdiffuse.learning.denoisers import DENOISERS
     from robotdiffuse.learning.diffusion import ScheduleSettings
     from robotdiffuse.learning.training.configs import CONFIGS, planner_training
     from robotdiffuse.learning.training.planner import train_planner
@@ -142,7 +142,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
     given = _given(arguments, ("data", "encoder", "robot", "device", *SHARED, *PARTS))
     if "denoiser" in given and CONFIGS[arguments.config].changes.get("denoiser_settings") is not None:
         # the config's are of its own denoiser; those of another of the same size
-        given["denoiser_settings"] = PAPER_SIZE.get(arguments.denoiser)
+        given["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
     if arguments.schedule is not None:
         given["schedule"] = ScheduleSettings(kind=arguments.schedule)
     settings = planner_training(arguments.config, given)
@@ -156,7 +156,7 @@ def run_planner(arguments: argparse.Namespace) -> int:
 
 
 def run_baseline(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.learning.networks.training import baseline_training, train_baseline
+    from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
 
     given = _given(arguments, ("data", "robot", *SHARED))
     settings = baseline_training(arguments.name, given)

@@ -3,6 +3,7 @@
 The arrays of a scene have the same types whatever the scene holds, so that no obstacle causes a compilation.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.near_pairs import no_tables, tabulate
 from robotdiffuse.collision.points import EMPTY, build_grid, cover, thin
-from robotdiffuse.robots.reach import motion_radii
+from robotdiffuse.robots.lever_arms import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated, pose
@@ -121,8 +122,10 @@ def _bounding_sphere(spheres: ndarray) -> ndarray:
     return np.append(centre, reach.max() + 1e-6)
 
 
+@lru_cache(maxsize=8)
 def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
-    """The arrays of a scene as far as the robot can get near it."""
+    """The arrays of a scene as far as the robot can get near it; those of the last few scenes are kept, since
+    a search and the judge ask for the same."""
     largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
     return compile_scene(scene, reach(robot), largest)
 

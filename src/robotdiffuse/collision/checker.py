@@ -63,11 +63,6 @@ class CollisionChecker:
         """Distance between the links of each checked pair [m], at most 1 m."""
         return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), distance.CAP)
 
-    def clearance(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n"]:
-        """Least distance to the scene and between links [m], at most 1 m; negative in collision."""
-        every = [self.link_clearances(q), self.pair_clearances(q), np.full((len(q), 1), distance.CAP)]
-        return np.concatenate(every, axis=1).min(axis=1)
-
     def cost_gradients(
         self, q: Float[ndarray, "n dof"], margin: float, self_margin: float = 0.01
     ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from robotdiffuse.collision.kernels import mesh_bounds as kernel
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
@@ -76,19 +77,7 @@ class _Obstacle(NamedTuple):
 
 def forward_frames(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n frames 4 4"]:
     """T_base_frame of frames 0 to dof, in float64 and independent of the PyTorch kinematics."""
-    frames = np.empty((len(q), robot.dof + 1, 4, 4))
-    frames[:, 0] = np.eye(4)
-    motion = np.tile(np.eye(4), (len(q), 1, 1))
-    for j, (offset, prismatic) in enumerate(zip(robot.frame_offsets, robot.prismatic, strict=True)):
-        if prismatic:
-            motion[:] = np.eye(4)
-            motion[:, 2, 3] = q[:, j]
-        else:
-            cosine, sine = np.cos(q[:, j]), np.sin(q[:, j])
-            motion[:, 0, 0], motion[:, 0, 1], motion[:, 1, 0], motion[:, 1, 1] = cosine, -sine, sine, cosine
-            motion[:, 2, 3] = 0.0
-        frames[:, j + 1] = frames[:, j] @ (offset @ motion)
-    return frames
+    return kernel.forward(robot.frame_offsets, np.array(robot.prismatic), np.asarray(q, np.float64))
 
 
 def _convex(vertices: ndarray, faces: ndarray) -> coal.Convex:
@@ -128,6 +117,29 @@ def _pieces(robot: Robot) -> dict[str, tuple[_Piece, ...]]:
         if parts:
             pieces[link] = tuple(parts)
     return pieces
+
+
+@once_per_robot
+def _balls(robot: Robot) -> dict[str, tuple[int, ndarray, ndarray]]:
+    """Of the pieces of each link: its frame, and the centres [k, 3] and radii [k] of balls around them."""
+    return {
+        link: (parts[0].frame, np.stack([p.center for p in parts]), np.array([p.radius for p in parts]))
+        for link, parts in _pieces(robot).items()
+    }
+
+
+@once_per_robot
+def _checks(robot: Robot) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
+    """The moving links, and the pairs of links that may not collide."""
+    links = list(_pieces(robot))
+    moving = tuple(link for link in links if robot.link_frame(link) > 0)
+    pairs = tuple(
+        (a, b)
+        for i, a in enumerate(links)
+        for b in links[i + 1 :]
+        if robot.link_frame(a) != robot.link_frame(b) and frozenset((a, b)) not in robot.allowed_collisions
+    )
+    return moving, pairs
 
 
 def _transform3(T: ndarray) -> coal.Transform3s:
@@ -202,15 +214,7 @@ class ExactCollision:
         self.robot = robot
         self._pieces = _pieces(robot)
         self._obstacles = _obstacles(scene)
-        links = list(self._pieces)
-        self.links = tuple(link for link in links if robot.link_frame(link) > 0)
-        self.pairs = tuple(
-            (a, b)
-            for i, a in enumerate(links)
-            for b in links[i + 1 :]
-            if robot.link_frame(a) != robot.link_frame(b)
-            and frozenset((a, b)) not in robot.allowed_collisions
-        )
+        self.links, self.pairs = _checks(robot)
         self.checks = (*(Check(link, None) for link in self.links), *(Check(a, b) for a, b in self.pairs))
         self._request = coal.DistanceRequest()
         self._request.enable_signed_distance = True
@@ -225,8 +229,8 @@ class ExactCollision:
         T = np.stack([o.T_base_box for o in self._obstacles])
         half = np.stack([o.half for o in self._obstacles])
         return (
-            np.swapaxes(T[:, :3, :3], 1, 2),
-            T[:, :3, 3],
+            np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),
+            np.ascontiguousarray(T[:, :3, 3]),
             half,
             np.array([o.round for o in self._obstacles]),
         )
@@ -237,36 +241,16 @@ class ExactCollision:
 
     def _candidates_of(self, check: Check) -> _Candidates:
         firsts = self._pieces[check.link]
-        centers, radii = np.stack([p.center for p in firsts]), np.array([p.radius for p in firsts])
-
-        def centers_in_base(frames: ndarray, pieces: tuple[_Piece, ...], centers: ndarray) -> ndarray:
-            T = frames[:, pieces[0].frame]
-            return centers @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-
+        balls = _balls(self.robot)[check.link]
         if check.other is not None:
-            others = self._pieces[check.other]
-            other_centers = np.stack([p.center for p in others])
-            reach = radii[:, None] + np.array([p.radius for p in others])
-
-            def lower_pair(frames: ndarray) -> ndarray:
-                a = centers_in_base(frames, firsts, centers)
-                b = centers_in_base(frames, others, other_centers)
-                gap = np.linalg.norm(a[:, :, None] - b[:, None], axis=-1) - reach
-                return gap.reshape(len(frames), len(firsts) * len(others))
-
-            return _Candidates(firsts, others, lower_pair)
-
+            others, other_balls = self._pieces[check.other], _balls(self.robot)[check.other]
+            return _Candidates(
+                firsts, others, lambda frames: kernel.pair_bounds(frames, *balls, *other_balls)
+            )
         if not self._obstacles:
             return _Candidates(firsts, (), lambda frames: np.zeros((len(frames), 0)))
-        rotation, middle, half, rounding = self._boxes
-
-        def lower_scene(frames: ndarray) -> ndarray:
-            x = centers_in_base(frames, firsts, centers)[:, :, None] - middle
-            outside = np.abs(np.einsum("oij,npoj->npoi", rotation, x)) - half
-            gap = np.linalg.norm(np.maximum(outside, 0), axis=-1) + np.minimum(outside.max(axis=-1), 0)
-            return (gap - rounding - radii[:, None]).reshape(len(frames), len(firsts) * len(middle))
-
-        return _Candidates(firsts, self._obstacles, lower_scene)
+        boxes = self._boxes
+        return _Candidates(firsts, self._obstacles, lambda frames: kernel.scene_bounds(frames, *balls, boxes))
 
     def _place(self, piece: _Piece, frames: ndarray) -> coal.Transform3s:
         T = frames[piece.frame]
@@ -311,17 +295,12 @@ class ExactCollision:
         the name of the nearest obstacle or link, None beyond the cutoff.
         """
         frames = forward_frames(self.robot, q)
-        bounds: list[ndarray] = [np.empty(0)] * len(q)
-        for check in np.unique(checks).tolist():
-            rows = np.flatnonzero(checks == check)
-            for row, lower in zip(rows.tolist(), self._candidates[check].lower(frames[rows]), strict=True):
-                bounds[row] = lower
         distances = np.full(len(q), np.nan)
         names: list[str | None] = [None] * len(q)
         for i, (check, best) in enumerate(zip(checks.tolist(), cutoffs.tolist(), strict=True)):
-            lower, candidates = bounds[i], self._candidates[check]
-            near = np.flatnonzero(lower < best)
-            for candidate in near[np.argsort(lower[near])].tolist():
+            candidates = self._candidates[check]
+            lower = candidates.lower(frames[i : i + 1])[0]
+            for candidate in lower.argsort().tolist():
                 if lower[candidate] >= best or best <= stop:
                     break
                 piece, other = candidates.pair(candidate)

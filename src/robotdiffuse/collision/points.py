@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Float32, Int32
 from numpy import ndarray
-from scipy.ndimage import distance_transform_edt
 
 from robotdiffuse.collision.kernels.point_grid import KEEP, splat
 
@@ -121,6 +120,8 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     points = np.ascontiguousarray(cloud[order])
     first = np.asarray(np.searchsorted(where[order], np.arange(int(np.prod(cells)) + 1)), np.int32)
     squares, nearest = splat(points, low, voxel, tuple(shape.tolist()), np.float32(band))
+    from scipy.ndimage import distance_transform_edt  # which takes long to import, and only clouds need
+
     # Beyond the band: the way to the nearest voxel that is within it, less what voxels blur, and the band.
     steps = np.asarray(distance_transform_edt((nearest < 0).reshape(shape))).ravel()
     beyond = np.maximum(band, (steps - np.sqrt(3)) * voxel + band)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from robotdiffuse.collision.arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels.point_grid import KEEP
-from robotdiffuse.robots.kinematics import ForwardKinematics
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 

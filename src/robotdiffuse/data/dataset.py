@@ -10,23 +10,16 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int8
+from jaxtyping import Float32, Int8
 from numpy import ndarray
 from torch import Tensor
 from torch.utils.data import Dataset, get_worker_info
 
 from robotdiffuse.data.manifest import read_manifest
+from robotdiffuse.data.rows import read_rows
 from robotdiffuse.data.shards import (
     SPLITS,
-    Shard,
-    check_shapes,
-    check_shard,
-    existing_shards,
-    read_shard,
-    scenes_of,
-    split_of,
 )
-from robotdiffuse.data.turns import turned
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.robots.robot import Robot
@@ -47,96 +40,18 @@ CAMERA_ELEVATION = (0.1, 1.2)
 """Above the horizontal [rad]."""
 ABOVE_FLOOR = VisibleRegion(floor=0.0, reach=10.0)
 """What a camera can see: nothing below the plane that the robot stands on."""
-NAMES = ("trajectories", "target_pose", "obstacle_kinds", "obstacle_params", "family")
-"""Arrays that `RopDataset` reads."""
-
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """The rows of a shard, or copies of them turned about the vertical."""
-
-    shard: Shard
-    """Where the other columns are; they are of the rows as they were before the turn."""
-    turn: int
-    """Number of the copy; 0: the rows themselves."""
-    q: Float32[ndarray, "n frames dof"]
-    """[rad]"""
-    scenes: PackedScenes
-    """With their floors."""
-    split: Int8[ndarray, "n"]
-    """Index into SPLITS; -1 for a copy that must not be used."""
-
-
-def read_rows(
-    folder: str | FilePath, robot: Robot | None = None, frames: int | None = None, turns: int = 0
-) -> Iterator[Rows]:
-    """The rows of all shards, one shard after the other, each followed by its turned copies.
-
-    robot: the one that the data are used for. frames: so many, evenly spaced along each path, in memory, of
-    shards that are checked throughout; None: those that are stored, mapped, of which the shapes are checked.
-    turns: copies, see `turned`, of the rows for training; `frames` and a robot must be given.
-
-    Raises InputError, naming the shard, if there are no data, they are damaged or of another robot.
-    """
-    manifest = read_manifest(folder)
-    if robot is not None:
-        manifest.check_robot(robot)
-    for index in existing_shards(folder):
-        if frames is None:
-            shard = read_shard(folder, index, NAMES)
-            check_shapes(folder, shard, manifest)
-        else:
-            shard = check_shard(folder, index, manifest)
-        stored, scenes = shard["trajectories"].view(ndarray), scenes_of(manifest, shard)
-        split = split_of(scenes)
-        yield Rows(shard, 0, stored if frames is None else resample(stored, frames), scenes, split)
-        for turn in range(1, turns + 1):
-            assert robot is not None and frames is not None
-            rng = np.random.default_rng([int(shard.fingerprint, 16), turn])
-            q, around, clear = turned(robot, stored, scenes, rng)
-            usable = (split == SPLITS.index("train")) & clear
-            even = np.zeros((len(q), frames, q.shape[2]), np.float32)
-            even[usable] = resample(q[usable], frames)
-            yield Rows(shard, turn, even, around, np.where(usable, split, -1).astype(np.int8))
-
-
-def resample(
-    q: Float[ndarray, "n stored dof"], frames: int, exact: bool = False
-) -> Float[ndarray, "n {frames} dof"]:
-    """Each motion at `frames` places, evenly spaced in joint-space length; the ends are kept exactly.
-
-    exact: whether what lies between two stored frames is reckoned in double precision, as `numpy.interp` has
-    it, and then rounded: what is stored is made so; what is read is made faster.
-    """
-    n, stored = q.shape[:2]
-    steps = np.linalg.norm(np.diff(q, axis=1), axis=2)
-    at = np.concatenate([np.zeros((n, 1)), np.cumsum(steps, axis=1, dtype=np.float64)], axis=1)
-    wanted = np.linspace(0.0, at[:, -1], frames, axis=1)
-    # rows one after the other, far apart, are one rising list
-    row = 2.0 * at.max(initial=0.0) * np.arange(n)[:, None]
-    after = np.searchsorted((at + row).reshape(-1), (wanted + row).reshape(-1), side="right")
-    after = np.clip(after.reshape(n, frames) - np.arange(n)[:, None] * stored, 1, stored - 1)
-    low, high = (np.take_along_axis(at, i, 1)[..., None] for i in (after - 1, after))
-    below, above = (np.take_along_axis(q, i[..., None], 1) for i in (after - 1, after))
-    into, long = wanted[..., None] - low, np.maximum(high - low, np.finfo(np.float64).tiny)
-    if exact:
-        even = ((above.astype(np.float64) - below) / long * into + below).astype(q.dtype)
-    else:
-        even = below + (into / long).clip(0, 1).astype(q.dtype) * (above - below)
-    even[:, 0], even[:, -1] = q[:, 0], q[:, -1]
-    return even
 
 
 @dataclass(frozen=True, eq=False)
 class RopBatch:
     """Rows of the data set, on its device."""
 
-    trajectories: Float32[Tensor, "n frames dof"]
+    trajectories: Float32[Tensor, "n waypoints dof"]
     """In [-1, 1]: the robot's limits are -1 and 1."""
     start: Float32[Tensor, "n dof"]
-    """The first frame, scaled too."""
+    """The first waypoint, scaled too."""
     goal: Float32[Tensor, "n dof"]
-    """The goal that was reached: the last frame, scaled too."""
+    """The goal that was reached: the last waypoint, scaled too."""
     target_pose: Float32[Tensor, "n 7"]
     """Of the robot's tip in the base frame, wxyz_xyz."""
     obstacle_kinds: Int8[Tensor, "n slots"]
@@ -166,12 +81,12 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         device: str | torch.device = "cpu",
         seed: int = 0,
         robot: Robot | None = None,
-        frames: int | None = None,
+        waypoints: int | None = None,
     ) -> None:
         """split: train, validation or test; scenes of one are in no other. points: of each cloud.
         sort_points: by x, then y, then z. view: "full", all around the obstacles, or "partial", what a camera
         sees from a random place. seed: of clouds and order. robot: the one that you will use the data for.
-        frames: so many, evenly spaced along each path, held in memory; None: those that are stored.
+        waypoints: so many, evenly spaced along each path, held in memory; None: those that are stored.
 
         Raises InputError for unknown names, a folder without data or with damaged shards, and data of
         another robot.
@@ -182,23 +97,26 @@ class RopDataset(Dataset[dict[str, Tensor]]):
             raise unknown_name("view", view, VIEWS)
         if points < 1:
             raise InputError(f"points is {points}; it must be at least 1")
-        if frames is not None and frames < 2:
-            raise InputError(f"frames is {frames}; it must be at least 2")
-        self._arguments = (folder, split, points, sort_points, view, device, seed, robot, frames)
+        if waypoints is not None and waypoints < 2:
+            raise InputError(f"waypoints is {waypoints}; it must be at least 2")
+        self._arguments = (folder, split, points, sort_points, view, device, seed, robot, waypoints)
         self.manifest = read_manifest(folder)
-        self.frames = frames or self.manifest.frames
+        self.waypoints = waypoints or self.manifest.waypoints
         self.points, self.sort_points, self.view = points, sort_points, view
         self.device, self.seed = torch.device(device), seed
         self._generators: dict[int, torch.Generator] = {}
         self.normalizer = JointNormalizer(np.array(self.manifest.lower), np.array(self.manifest.upper))
+        middle, half_range = (
+            a.astype(np.float32) for a in (self.normalizer.middle, self.normalizer.half_range)
+        )
         # over whole trajectories: to broadcast along seven joints is slow
         self._scale, self._shift = (
-            torch.from_numpy(np.tile(a, self.frames)).to(self.device)
-            for a in (1 / self.normalizer.half_range, -self.normalizer.middle / self.normalizer.half_range)
+            torch.from_numpy(np.tile(a, self.waypoints)).to(self.device)
+            for a in (1 / half_range, -middle / half_range)
         )
         self._trajectories: list[ndarray] = []
         places, poses, scenes = [], [], []
-        for i, rows in enumerate(read_rows(folder, robot, frames)):
+        for i, rows in enumerate(read_rows(folder, robot, waypoints)):
             mine = np.flatnonzero(rows.split == SPLITS.index(split))
             self._trajectories.append(rows.q)
             places.append(np.stack([np.full(len(mine), i), mine], axis=1))
@@ -283,13 +201,13 @@ class RopDataset(Dataset[dict[str, Tensor]]):
 
     def _batch(self, indices: ndarray, generator: torch.Generator) -> RopBatch:
         shard, row = self._places[indices].T
-        frames, dof = self.frames, self.manifest.dof
-        q = np.empty((len(indices), frames, dof), np.float32)
+        waypoints, dof = self.waypoints, self.manifest.dof
+        q = np.empty((len(indices), waypoints, dof), np.float32)
         for s in np.unique(shard):
             mine = np.flatnonzero(shard == s)
             q[mine] = self._trajectories[s][row[mine]]
-        raw = torch.from_numpy(q).to(self.device).view(-1, frames * dof)
-        scaled = torch.addcmul(self._shift, raw, self._scale).view(-1, frames, dof)
+        raw = torch.from_numpy(q).to(self.device).view(-1, waypoints * dof)
+        scaled = torch.addcmul(self._shift, raw, self._scale).view(-1, waypoints, dof)
         scenes = self._scenes[indices]
         pose, kinds, params = (
             torch.from_numpy(a).to(self.device) for a in (self._poses[indices], scenes.kinds, scenes.params)

@@ -27,9 +27,9 @@ class Manifest:
     lower: tuple[float, ...]
     """Limits [rad]."""
     upper: tuple[float, ...]
-    frames: int
+    waypoints: int
     timing: str
-    """How frames are spaced: "arc", evenly in joint-space length, or "time"."""
+    """How waypoints are spaced: "arc", evenly in joint-space length, or "time"."""
     families: dict[str, dict[str, Any]]
     """Settings of the scenes by name, in the order of the numbers in `family`."""
     floors: dict[str, dict[str, list[float]] | None]
@@ -109,6 +109,9 @@ def read_manifest(folder: str | FilePath) -> Manifest:
         data.pop("dof")
         for name in ("joint_names", "lower", "upper"):
             data[name] = tuple(data[name])
+        if "frames" in data:  # as waypoints were called once
+            data["waypoints"] = data.pop("frames")
+            data["settings"] = {"waypoints": data["waypoints"]} | data["settings"]
         return Manifest(**_with_floors(data))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} is damaged: {error}") from None

@@ -31,13 +31,13 @@ from robotdiffuse.scenes.packed import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
 
-FRAMES, DOF, NUMBERS = 254, 7, 23
+WAYPOINTS, DOF, NUMBERS = 254, 7, 23
 ROWS = 500
 """Of a shard."""
 RADIUS = 0.25
 """Of the spheres [m]: what the authors' planner sees; their loader and viewer show 0.2, a margin of 5 cm."""
 SAME = 1e-4
-"""Start and goal may differ by this from the first and last frame [rad]."""
+"""Start and goal may differ by this from the first and last waypoint [rad]."""
 RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of the straight line [m]."""
 NAMES = ("trajectories", "start", "target_pose", "obstacle_kinds", "obstacle_params")
@@ -46,16 +46,16 @@ NAMES = ("trajectories", "start", "target_pose", "obstacle_kinds", "obstacle_par
 def export_npz(folder: str | FilePath, file: str | FilePath) -> int:
     """Write the trajectories of all scenes of exactly two spheres, whole or not at all; returns their number.
 
-    Raises InputError if there is no data set, it has no such scene or other frames or joints, or the file
+    Raises InputError if there is no data set, it has no such scene or other waypoints or joints, or the file
     cannot be written.
     """
     manifest, file = read_manifest(folder), FilePath(file)
-    if (manifest.frames, manifest.dof) != (FRAMES, DOF):
+    if (manifest.waypoints, manifest.dof) != (WAYPOINTS, DOF):
         raise InputError(
-            f"{folder} has {manifest.frames} frames of {manifest.dof} joints; "
-            f"robot.npz holds {FRAMES} frames of {DOF} joints"
+            f"{folder} has {manifest.waypoints} waypoints of {manifest.dof} joints; "
+            f"robot.npz holds {WAYPOINTS} waypoints of {DOF} joints"
         )
-    x, y = [np.zeros((0, FRAMES, DOF), np.float32)], [np.zeros((0, NUMBERS), np.float32)]
+    x, y = [np.zeros((0, WAYPOINTS, DOF), np.float32)], [np.zeros((0, NUMBERS), np.float32)]
     for index in shard_indices(folder):
         shard = read_shard(folder, index, NAMES)
         check_shapes(folder, shard, manifest)
@@ -91,8 +91,8 @@ def import_npz(
 
     The scenes are two spheres of this radius [m] on ROP's floor. Nothing is judged: that is for
     `robotdiffuse data check`. What the file does not say is measured (clearances, lengths, whether the
-    straight line is free) or follows from the motion: the target is where the last frame has the robot's tip,
-    for the target in the file is that of the authors' arm, which has no hand. The safety distance is
+    straight line is free) or follows from the motion: the target is where the last waypoint has the robot's
+    tip, for the target in the file is that of the authors' arm, which has no hand. The safety distance is
     not known, and 0. `progress` is called with the numbers of motions that are done and of all.
 
     Raises InputError if the file is no such file, or the folder holds data or cannot be written.
@@ -109,7 +109,7 @@ def import_npz(
         joint_names=arm.joint_names,
         lower=tuple(arm.lower.tolist()),
         upper=tuple(arm.upper.tolist()),
-        frames=FRAMES,
+        waypoints=WAYPOINTS,
         timing="arc",
         families={"rop": {"kinds": ["sphere"], "sphere_radius": [radius, radius]}},
         floors={"rop": floor_record(load_family("rop").floor)},
@@ -136,7 +136,7 @@ def import_npz(
 def _row(
     robot: Robot,
     manifest: Manifest,
-    q: Float32[ndarray, "frames dof"],
+    q: Float32[ndarray, "waypoints dof"],
     centers: Float32[ndarray, "2 3"],
     radius: float,
     number: int,
@@ -166,7 +166,7 @@ def _row(
 
 def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[ndarray, "n 2 3"]]:
     """Motions, and centres of the two spheres of each."""
-    wanted = {"x_train": (FRAMES, DOF), "y_train": (NUMBERS,)}
+    wanted = {"x_train": (WAYPOINTS, DOF), "y_train": (NUMBERS,)}
     try:
         with np.load(file, allow_pickle=False) as stored:
             x, y = (np.asarray(stored[name], np.float32) for name in wanted)
@@ -185,7 +185,7 @@ def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[nd
         if off.max() > SAME:
             end = "first" if name == "start" else "last"
             raise InputError(
-                f"{file}: row {off.argmax()} has a {name} that differs from its {end} frame by "
+                f"{file}: row {off.argmax()} has a {name} that differs from its {end} waypoint by "
                 f"{off.max():.3g} rad; they must be the same"
             )
     return x, y[:, 2 * DOF : 2 * DOF + 6].reshape(-1, 2, 3)

@@ -38,8 +38,8 @@ SPLITS = ("train", "validation", "test")
 SPLIT_PERCENT = (90, 5, 5)
 
 ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
-    "trajectories": ("<f4", ("frames", "dof")),
-    "times": ("<f4", ("frames",)),
+    "trajectories": ("<f4", ("waypoints", "dof")),
+    "times": ("<f4", ("waypoints",)),
     "start": ("<f4", ("dof",)),
     "goals": ("<f4", ("goals", "dof")),
     "goal_costs": ("<f4", ("goals",)),
@@ -314,8 +314,8 @@ Row = dict[str, ndarray | np.generic]
 
 def row_of(
     scene: PackedScenes,
-    q: Float32[ndarray, "frames dof"],
-    clearances: Float[ndarray, "frames"],
+    q: Float32[ndarray, "waypoints dof"],
+    clearances: Float[ndarray, "waypoints"],
     goals: Float[ndarray, "k dof"],
     goal_costs: Float[ndarray, "k"],
     goal_index: int,
@@ -326,9 +326,9 @@ def row_of(
     line_free: bool,
     seed: int,
     most_goals: int,
-    times: Float[ndarray, "frames"] | None = None,
+    times: Float[ndarray, "waypoints"] | None = None,
 ) -> Row:
-    """The row of a motion q in a packed scene of its own, with these `clearances` at its frames [m].
+    """The row of a motion q in a packed scene of its own, with these `clearances` at its waypoints [m].
 
     T_base_tip: the target. most_goals: rows for goals. The others are as the columns of their names, ARRAYS.
     """
@@ -384,12 +384,12 @@ def problem_of(manifest: Manifest, robot: Robot, shard: Shard, row: int) -> Prob
 
 
 def path_of(robot: Robot, shard: Shard, row: int) -> Path:
-    """The frames of a row as a path."""
+    """The waypoints of a row as a path."""
     return Path(robot.joint_names, np.asarray(shard["trajectories"][row], np.float64))
 
 
 def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
-    """The frames of a row as they move: timed, with rates by differences, where the data have times."""
+    """The waypoints of a row as they move: timed, with rates by differences, where the data have times."""
     path = path_of(robot, shard, row)
     times = np.asarray(shard.arrays.get("times", ()), np.float64)
     if not len(times) or not (np.diff(times[row]) > 0).all():

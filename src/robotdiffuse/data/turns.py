@@ -24,10 +24,10 @@ def turns_about_vertical(robot: Robot) -> bool:
 
 def turned(
     robot: Robot,
-    q: Float32[ndarray, "n frames dof"],
+    q: Float32[ndarray, "n waypoints dof"],
     scenes: PackedScenes,
     rng: np.random.Generator,
-) -> tuple[Float32[ndarray, "n frames dof"], PackedScenes, Bool[ndarray, "n"]]:
+) -> tuple[Float32[ndarray, "n waypoints dof"], PackedScenes, Bool[ndarray, "n"]]:
     """Each motion and its scene turned by an angle, uniform among those that the first joint's limits
     allow; and which of the turned motions keep clear of the base.
 

@@ -6,9 +6,7 @@ by trying it without guidance, and by a control: guidance of trajectories that n
 
 import hashlib
 import json
-import multiprocessing
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, NamedTuple
@@ -27,14 +25,15 @@ from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.tables import Column, Table
 from robotdiffuse.evaluation.trial import tried
 from robotdiffuse.files import alone_in
-from robotdiffuse.generation.workers import prepare_worker, stop_pool
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.held_out import Case
+from robotdiffuse.processes import Workers
 from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"
@@ -81,6 +80,8 @@ class AblationSettings:
     """Clouds that the frozen encoder is trained on first."""
     problems: int = 500
     """Held-out problems that the straight line does not solve and search does."""
+    family: str = "rop"
+    """What family they are of: a name in `problems.families`."""
     candidates: int = 16
     """Trajectories sampled for each problem."""
 
@@ -88,6 +89,7 @@ class AblationSettings:
         for name in ("samples", "encoder_samples", "problems", "candidates"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}; it must be at least 1")
+        load_family(self.family)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,22 +158,17 @@ def _run(
     _check_budget(encoder / "encoder.json", "encoder_samples", settings.encoder_samples)
     configs = list(dict.fromkeys(ROWS[name].config for name in rows))
     found: dict[tuple[str | None, bool], Tried] = {}
-    # fresh interpreters: forked ones could inherit locks of running threads
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, initializer=prepare_worker)
-    try:
-        for config in _done(pool, _train, [(settings, config) for config in configs]):
+    with Workers(workers, PATIENCE) as pool:
+        for _, config in pool.each(_train, [(settings, config) for config in configs]):
             _check_budget(FilePath(settings.out) / config / "model.json", "samples", settings.samples)
             report(f"trained {config}")
         _check_same_data(settings, configs)
-        cases = hard_cases("rop", settings.problems, FilePath(settings.out) / "problems", report)
+        cases = hard_cases(settings.family, settings.problems, FilePath(settings.out) / "problems", report)
         todo = [(settings, config, guided, cases) for config in (*configs, None) for guided in (False, True)]
-        for config, guided, result in _done(pool, _try, todo):
+        for _, (config, guided, result) in pool.each(_try, todo):
             found[config, guided] = result
             how = "with" if guided else "without"
             report(f"tried {config or CONTROL} {how} guidance: {100 * result.single.mean():.1f} % of samples")
-    finally:
-        stop_pool(pool, PATIENCE)
     results = [
         RowResult(name, *(found[ROWS[name].config, guided] for guided in (False, True))) for name in rows
     ]
@@ -198,11 +195,6 @@ def _check_same_data(settings: AblationSettings, configs: list[str]) -> None:
     if len(set(seen.values())) > 1:
         found = ", ".join(f"{config} {digest}" for config, digest in seen.items())
         raise InputError(f"{settings.out} holds networks of different data: {found}; use another folder")
-
-
-def _done(pool: ProcessPoolExecutor, work: Callable, arguments: list[tuple]) -> Iterator:
-    for job in as_completed([pool.submit(work, *each) for each in arguments]):
-        yield job.result()
 
 
 def _train(settings: AblationSettings, config: str) -> str:
@@ -236,7 +228,7 @@ def _planner_settings(settings: AblationSettings, config: str | None, guided: bo
     if config is None:
         return alone
     weights = str(FilePath(settings.out) / config)
-    points = load_model(weights, load_robot("panda")).config.encoder_settings.cloud
+    points = load_model(weights, load_robot("panda")).settings.encoder_settings.cloud
     return replace(alone, weights=weights, points=points)
 
 
@@ -252,7 +244,7 @@ def table(settings: AblationSettings, results: list[RowResult]) -> Table:
     """Table 2, the paper's figures beside."""
     known = asdict(settings)
     budget = ("samples", "encoder_samples", "problems", "candidates")
-    title = f"Table 2: {', '.join(f'{name} {known[name]:,}' for name in budget)}"
+    title = f"Table 2 on {settings.family}: {', '.join(f'{name} {known[name]:,}' for name in budget)}"
     shares = Column("single", "%", ".1f", "more", scale=100.0), Column("95 %", dim=True)
     columns = (
         "row",

@@ -1,16 +1,18 @@
-"""The look that the pages on data sets and benches share: their style sheet, and plots as SVG.
+"""What the pages on data sets and benches share: their frame and style sheet, and plots as SVG.
 
 Plots need matplotlib, which the core install lacks.
 """
 
+import html
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from robotdiffuse.errors import InputError
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 INK, SOFT, LINE, FAINT = "#222b38", "#6b7684", "#d9dde2", "#eef0f3"
@@ -61,6 +63,41 @@ td.dim { color: var(--soft); }
 footer { margin-top: 20px; color: var(--soft); font-size: 12px; }
 @media (max-width: 900px) { .w4, .w6 { grid-column: span 12; } }
 """
+
+
+def page(
+    name: str,
+    about: Sequence[str],
+    facts: Sequence[tuple[str, str]],
+    content: str,
+    own: str = "",
+    end: str = "",
+) -> str:
+    """A page: its name, lines on what it is about, figures and what they are, and what follows.
+
+    own: style sheet; end: of the body, as scripts.
+    """
+    tiles = "".join(
+        f'<div class="tile"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'
+        for value, what in facts
+    )
+    lines = (
+        '<!doctype html>\n<html lang="en">\n<head><meta charset="utf-8">',
+        f"<title>{html.escape(name)}</title>",
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        f"<style>{STYLE}{own}</style></head>\n<body><main>",
+        f"<h1>{html.escape(name)}</h1>",
+        f'<div class="about">{"<br>".join(html.escape(line) for line in about)}</div>',
+        f'<div class="tiles">{tiles}</div>',
+        content,
+        f"</main>{end}</body></html>\n",
+    )
+    return "\n".join(lines)
+
+
+def card(title: str, width: int, text: str, content: str) -> str:
+    """A part of a page, as wide as so many of its 12 columns."""
+    return f'<section class="card w{width}"><h2>{title}</h2><p>{text}</p>{content}</section>'
 
 
 @contextmanager
@@ -116,3 +153,12 @@ def as_svg(figure: "Figure") -> str:
     figure.savefig(buffer, format="svg", transparent=True, dpi=220, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     return text[text.index("<svg") :]
+
+
+def percent_axis(axes: "Axes") -> None:
+    """Of the values, which are percentages."""
+    from matplotlib.ticker import FuncFormatter
+
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} %"))
+    axes.grid(axis="y", color=FAINT, linewidth=0.8)
+    axes.spines[["left"]].set_visible(False)

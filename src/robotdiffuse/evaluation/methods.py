@@ -1,12 +1,13 @@
-"""What can be tried: planners, samplers of trajectories, and searches that go on. Each gives its trials'
+"""What can be tried: planners, networks that sample, and searches that go on. Each gives its trials'
 records, with the verdict of the judge, whose time is not counted unless it is part of a planner's call."""
 
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import ceil
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,27 +42,32 @@ measure_of = lru_cache(maxsize=8)(Measure)
 # Planners
 
 
-def planned(planner: Planner, restarts: bool = False) -> Method:
-    """A planner in this process; with `restarts` a second record, see `planner_calls`."""
+def planned(planner: Planner, **request: Any) -> Method:
+    """A planner in this process; `request` are further arguments of its `plan`."""
 
     def call(trial: Trial) -> Iterator[Fields]:
-        yield from planner_calls(planner, trial.problem, trial.seed, trial.limit, restarts)
+        yield from planner_calls(planner, trial.problem, trial.seed, trial.limit, False, request)
 
     return call
 
 
 def planner_calls(
-    planner: Planner, problem: Problem, seed: int, limit: float, restarts: bool
+    planner: Planner,
+    problem: Problem,
+    seed: int,
+    limit: float,
+    restarts: bool,
+    request: Mapping[str, Any] = MappingProxyType({}),
 ) -> Iterator[Fields]:
-    """The record of a call; if there are to be restarts and it ended by itself, that of `restarted` too. An
-    exception is a record."""
+    """The record of a call, with further arguments; if there are to be restarts and it ended by itself, that
+    of `restarted` too. An exception is a record."""
     measure, began = measure_of(problem.robot), time.perf_counter()
     try:
         with Clock() as clock:
-            result = planner.plan(problem, time_limit=limit, seed=seed)
+            result = planner.plan(problem, time_limit=limit, seed=seed, **request)
         yield {"cpu": round(clock.cpu, 6), **fields_of(result, measure)}
         if restarts and result.status.value in RESTARTABLE and result.planning_time < ENDED * limit:
-            again, result = restarted(planner, problem, seed, limit, result)
+            again, result = restarted(planner, problem, seed, limit, result, request)
             yield {"restarts": again, **fields_of(result, measure)}
     except Exception as error:
         traceback.print_exc()
@@ -70,7 +76,12 @@ def planner_calls(
 
 
 def restarted(
-    planner: Planner, problem: Problem, seed: int, limit: float, first: PlanResult
+    planner: Planner,
+    problem: Problem,
+    seed: int,
+    limit: float,
+    first: PlanResult,
+    request: Mapping[str, Any] = MappingProxyType({}),
 ) -> tuple[int, PlanResult]:
     """How often a planner is called again, with fresh seeds, until its calls have used up the time limit
     together; and the shortest path of all of them, with the times at which paths were found.
@@ -83,7 +94,7 @@ def restarted(
     while limit - spent > least and (best.path_length or np.inf) > SHORTEST * straight:
         again += 1
         fresh = int(np.random.SeedSequence([seed, again]).generate_state(1)[0])
-        result = planner.plan(problem, time_limit=limit - spent, seed=fresh)
+        result = planner.plan(problem, time_limit=limit - spent, seed=fresh, **request)
         for at, length in result.progress:
             if not progress or length < progress[-1][1]:
                 progress.append((spent + at, length))
@@ -116,11 +127,11 @@ def fields_of(result: PlanResult, measure: Measure) -> Fields:
     return found
 
 
-# Samplers of trajectories
+# Sampled trajectories
 
 
 Draw = Callable[[Trial, CollisionChecker], ndarray]
-"""A batch of trajectories [count, frames, dof] for a trial."""
+"""A batch of trajectories [count, waypoints, dof] for a trial."""
 
 
 class Judged(NamedTuple):
@@ -132,18 +143,18 @@ class Judged(NamedTuple):
     reports: list[Report]
 
 
-def judged(problem: Problem, q: Float[ndarray, "n frames dof"]) -> Judged:
+def judged(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Judged:
     """Of trajectories as they are, but for their ends, which are made exact."""
     judge, reports = verifier(problem, VerifySettings()), []
-    for frames in q.astype(np.float64):
-        frames[0], frames[-1] = problem.start, goal_of(problem)
-        reports.append(judge.path(Path(problem.robot.joint_names, frames)))
+    for waypoints in q.astype(np.float64):
+        waypoints[0], waypoints[-1] = problem.start, goal_of(problem)
+        reports.append(judge.path(Path(problem.robot.joint_names, waypoints)))
     kinds = ["" if report.violation is None else report.violation.kind for report in reports]
     passed, hit = [not kind for kind in kinds], [kind.endswith("collision") for kind in kinds]
     return Judged(np.array(passed), np.array(hit), reports)
 
 
-def path_lengths(q: Float[ndarray, "n frames dof"]) -> Float[ndarray, "n"]:
+def path_lengths(q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
     """In joint space [rad]."""
     return np.linalg.norm(np.diff(q, axis=1), axis=2).sum(axis=1)
 
@@ -195,17 +206,17 @@ def from_network(
 
 def nothing_near(model: MotionModel) -> ClearanceFn:
     """What a model is told of the obstacles where there are none."""
-    links, width = len(model.config.links), model.dof if model.config.sees_gradients else 0
+    links, width = len(model.robot.links), model.dof if model.settings.sees_gradients else 0
 
     def clearances(q: ndarray) -> ndarray:
         told = np.zeros((*q.shape[:2], links + width), np.float32)
-        told[..., :links] = model.config.clearance_high
+        told[..., :links] = model.settings.clearance_high
         return told
 
     return clearances
 
 
-def without_network(settings: RobotDiffuseSettings, frames: int) -> Draw:
+def without_network(settings: RobotDiffuseSettings, waypoints: int) -> Draw:
     """The control: the line and random bumps, and as many gradient steps as a network's samples take, all of
     them one after the other."""
     sampling_steps = settings.sampling_steps
@@ -215,7 +226,7 @@ def without_network(settings: RobotDiffuseSettings, frames: int) -> Draw:
     def draw(trial: Trial, checker: CollisionChecker) -> ndarray:
         problem = trial.problem
         ends = problem.start, goal_of(problem)
-        q = unlearned_starts(*ends, settings.samples, frames, problem.robot, trial.rng())
+        q = unlearned_starts(*ends, settings.samples, waypoints, problem.robot, trial.rng())
         return CollisionGuidance(checker, settings.guidance)(q, steps)[0] if steps else q
 
     return draw

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.results import PlanResult
-from robotdiffuse.robots.kinematics import ForwardKinematics
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, Trajectory
 from robotdiffuse.verify import Report
@@ -42,14 +42,14 @@ class Kinematics:
         self._kinematics, self._tip = ForwardKinematics(robot, torch.float64), robot.tip
         self._links = [i for i, link in enumerate(robot.link_names) if robot.link_frame(link) > 0]
 
-    def link_length(self, q: Float[ndarray, "n frames dof"]) -> Float[ndarray, "n"]:
+    def link_length(self, q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
         """The paper's path length: the sum over all moving links of the way that the origin travels [m]."""
         with torch.inference_mode():
             T = self._kinematics.links(torch.from_numpy(np.asarray(q, np.float64)))
         at = T[..., self._links, :3, 3].numpy()
         return np.linalg.norm(np.diff(at, axis=-3), axis=-1).sum(axis=(-2, -1))
 
-    def tip_length(self, q: Float[ndarray, "frames dof"]) -> float:
+    def tip_length(self, q: Float[ndarray, "waypoints dof"]) -> float:
         """The way of the origin of the robot's tip [m]."""
         with torch.inference_mode():
             tip = self._kinematics.link(torch.from_numpy(q), self._tip)[:, :3, 3].numpy()

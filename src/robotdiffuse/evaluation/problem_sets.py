@@ -1,23 +1,14 @@
 """Problems by name: held-out ones of the families, and those of files and folders; judged once and kept."""
 
 import itertools
-import time
 from dataclasses import replace
 from pathlib import Path as FilePath
 
-import numpy as np
-
-from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernels.compiled import random_state
-from robotdiffuse.collision.kernels.motions import path_length
-from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.shortcut import shortcut
-from robotdiffuse.planners.rrt_connect import kernel
-from robotdiffuse.planners.rrt_connect.planner import RRTConnect
+from robotdiffuse.planners.aorrtc.planner import AORRTC, AORRTCSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import load_problems
-from robotdiffuse.problems.held_out import SEED, Case, CaseFile, Report, goal_of, line_length
+from robotdiffuse.problems.held_out import Case, CaseFile, Report, line_length
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.types import Path
 from robotdiffuse.verify import VerifySettings, verifier
@@ -26,8 +17,8 @@ NONTRIVIAL = "_nontrivial"
 """Suffix of a family's name: only problems that the straight line does not solve and search does."""
 SEARCH_TIME = 10.0
 """Problems that this much search does not solve count as unsolvable [s]."""
-RUNS = 16
-"""RRT-Connect runs after the one that decides; the shortest path of all is the reference length."""
+PATIENCE = 20_000
+"""Iterations that the search for the reference length takes at least."""
 
 
 def judge(problem: Problem, path: Path) -> bool:
@@ -36,19 +27,9 @@ def judge(problem: Problem, path: Path) -> bool:
 
 
 def search(problem: Problem) -> float | None:
-    """Length of the shortest of some RRT-Connect runs with shortcutting [rad]; None: not solved in time."""
-    found = RRTConnect().plan(problem, SEARCH_TIME, seed=1)
-    if found.path_length is None:
-        return None
-    space = search_space(CollisionChecker(problem.robot, problem.scene), 0.02)
-    start, goals = problem.start.astype(np.float32), goal_of(problem)[None].astype(np.float32)
-    lengths, state, until = [found.path_length], random_state(SEED), time.perf_counter() + SEARCH_TIME
-    while len(lengths) <= RUNS and time.perf_counter() < until:
-        trees = kernel.make_trees(start, goals, 20_000)
-        path = kernel.search(space, trees, np.float32(1.5), 1_000_000, state)
-        if len(path):
-            lengths.append(float(path_length(shortcut(space, path, 120, state))))
-    return min(lengths)
+    """Length of a short path, the reference of a problem [rad]; None: not solved in time."""
+    planner = AORRTC(AORRTCSettings(gain=0.001, patience=PATIENCE))
+    return planner.plan(problem, SEARCH_TIME, seed=1, clearance=0.0).path_length
 
 
 def case_file(folder: FilePath | None, name: str) -> CaseFile:

@@ -59,9 +59,7 @@ LENGTH = Summary(Column("length*", "", ".3f", "less"), _ratio)
 CPU = Summary(Column("CPU ms median / p95", better="less"), _cpu)
 
 
-def summary(
-    title: str, of: Mapping[str, Sequence[Record]], figures: Sequence[Summary], notes: Sequence[str] = ()
-) -> Table:
+def summary(title: str, of: Mapping[str, Sequence[Record]], figures: Sequence[Summary]) -> Table:
     """Of each method's records."""
     rows = [(name, *(figure.of(records) for figure in figures)) for name, records in of.items()]
-    return Table.of(title, [Column(""), *(figure.column for figure in figures)], rows, notes)
+    return Table.of(title, [Column(""), *(figure.column for figure in figures)], rows)

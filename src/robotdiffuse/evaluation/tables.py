@@ -117,7 +117,7 @@ def _text(cell: Cell, column: Column) -> str:
     if cell is None or cell != cell:
         return NONE
     text = f"{cell:,}" if isinstance(cell, int) else format(column.scale * cell, column.format or "g")
-    return text.replace("-", "−")
+    return text.replace("-", "−") if text.strip("-0.") else text.removeprefix("-")
 
 
 def terminal(table: Table) -> "RichTable":

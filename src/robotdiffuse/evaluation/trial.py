@@ -1,7 +1,7 @@
 """The one loop of all that is measured: every case by every method with every seed, judged, and kept.
 
 A method is called with a trial and gives the fields of a record, with the judge's verdict; `methods` has
-those for planners, samplers and searches. An executor calls them: in this process, one after the other
+those for planners, networks and searches. An executor calls them: in this process, one after the other
 (`in_turn`), or in the processes of a bench. What is kept is not made again.
 """
 

@@ -1,22 +1,26 @@
 """From settings to a folder of shards: what is there is kept, what is missing is made, here or on Ray."""
 
 import json
-import signal
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
-from dataclasses import asdict
+import platform
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from robotdiffuse import __version__
 from robotdiffuse.data.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
 from robotdiffuse.data.shards import remove_leftovers, shard_indices, write_shard
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.files import alone_in
 from robotdiffuse.generation.settings import GenerationSettings
-from robotdiffuse.generation.workers import CLUSTERS, on_this_machine, versions
+from robotdiffuse.generation.shard_maker import Arrays, Counts, make_shard
+from robotdiffuse.processes import CLUSTERS, interrupts_afterwards, on_this_machine
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
+
+PACKAGES = ("numpy", "numba", "zarr")
 
 
 def generate(
@@ -68,33 +72,49 @@ def _fill(
     if not missing:
         return settings.trajectories
     if cluster is None:
-        made = on_this_machine(settings, missing, workers)
+        made = on_this_machine(make_shard, [(settings, index) for index in missing], workers)
     else:
-        made = CLUSTERS[cluster](settings, missing)
+        there_too = _as_absolute(settings)
+        here = _bearings(there_too)
+        made = CLUSTERS[cluster](_make_on_node, [(there_too, index, here) for index in missing])
     # closed at once, so that nobody works on when this is interrupted
     with closing(made):
-        for index, (arrays, counts) in made:
-            with _interrupts_afterwards():
+        for number, (arrays, counts) in made:
+            index = missing[number]
+            # zarr's threads would go on writing what was tidied up
+            with interrupts_afterwards():
                 write_shard(out, index, arrays, counts)
             done += settings.rows(index)
             progress(done, settings.trajectories)
     return settings.trajectories
 
 
-@contextmanager
-def _interrupts_afterwards() -> Iterator[None]:
-    """Ctrl-C takes effect afterwards: zarr's threads would go on writing what was tidied up."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    caught: list[int] = []
-    before = signal.signal(signal.SIGINT, lambda number, _frame: caught.append(number))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
-    if caught:
-        signal.raise_signal(signal.SIGINT)
+def _as_absolute(settings: GenerationSettings) -> GenerationSettings:
+    """The same on nodes, which have other working folders."""
+    file = Path(settings.robot)
+    return replace(settings, robot=str(file.resolve())) if file.exists() else settings
+
+
+def _make_on_node(settings: GenerationSettings, index: int, wanted: dict[str, str]) -> tuple[Arrays, Counts]:
+    for name, found in _bearings(settings).items():
+        if found != wanted[name]:
+            raise InputError(
+                f"a node of the Ray cluster has {name} {found}, this machine {wanted[name]}; their data may "
+                "differ: install the same on all"
+            )
+    return make_shard(settings, index)
+
+
+def _bearings(settings: GenerationSettings) -> dict[str, str]:
+    """What two machines must have in common to make the same data."""
+    return versions() | {f"robot {settings.robot}": robot_fingerprint(load_robot(settings.robot))}
+
+
+def versions() -> dict[str, str]:
+    """What the data may differ by, besides the settings and the robot."""
+    return {"robotdiffuse": __version__, "python": platform.python_version()} | {
+        name: version(name) for name in PACKAGES
+    }
 
 
 def manifest_of(settings: GenerationSettings) -> Manifest:
@@ -106,7 +126,7 @@ def manifest_of(settings: GenerationSettings) -> Manifest:
         joint_names=robot.joint_names,
         lower=tuple(robot.lower.tolist()),
         upper=tuple(robot.upper.tolist()),
-        frames=settings.frames,
+        waypoints=settings.waypoints,
         timing=settings.timing,
         families={name: asdict(family) for name, family in settings.families.items()},
         floors={name: floor_record(family.floor) for name, family in settings.families.items()},

@@ -32,10 +32,10 @@ class GenerationSettings(Settings):
     furniture it is always the pose, with the fingers in a compartment, say."""
     goals: Annotated[int, Bound(least=1.0, most=127.0)] = 10
     """Most goal configurations of a target, found by inverse kinematics (the paper's k)."""
-    frames: Annotated[int, Bound(least=2.0)] = 254
-    """Frames of a trajectory (the authors' number)."""
+    waypoints: Annotated[int, Bound(least=2.0)] = 254
+    """Waypoints of a trajectory (the authors' number)."""
     timing: Annotated[str, OneOf(TIMINGS)] = "arc"
-    """How frames are spaced: evenly in joint-space length (arc), or in time by toppra (time)."""
+    """How waypoints are spaced: evenly in joint-space length (arc), or in time by toppra (time)."""
     shard: Count = 500
     """Trajectories in a shard: what an interruption may lose."""
     search: SharedTreeSettings = field(

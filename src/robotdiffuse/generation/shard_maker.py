@@ -8,7 +8,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motion import search_space
-from robotdiffuse.data.dataset import resample
+from robotdiffuse.data.rows import resample
 from robotdiffuse.data.shards import Row, row_of
 from robotdiffuse.errors import InputError
 from robotdiffuse.generation.settings import GenerationSettings
@@ -121,10 +121,10 @@ def _line_is_free(
 
 def _frames(
     settings: GenerationSettings, robot: Robot, path: Float32[ndarray, "n dof"], judge: Verifier
-) -> tuple[ndarray, Float32[ndarray, "frames dof"]] | None:
-    """Times and joint values of the frames; None if the timed motion does not pass the judge."""
+) -> tuple[ndarray, Float32[ndarray, "waypoints dof"]] | None:
+    """Times and joint values of the waypoints; None if the timed motion does not pass the judge."""
     if settings.timing == "arc":
-        return np.zeros(0), resample(path[None], settings.frames, exact=True)[0]
+        return np.zeros(0), resample(path[None], settings.waypoints, exact=True)[0]
     waypoints = Path(robot.joint_names, path.astype(np.float64))
     if not judge.path(waypoints).valid:
         return None
@@ -133,6 +133,6 @@ def _frames(
     )
     if not judge.trajectory(timed).valid:
         return None
-    times = np.linspace(0.0, timed.duration, settings.frames)
+    times = np.linspace(0.0, timed.duration, settings.waypoints)
     rows = [np.interp(times, timed.times, timed.positions[:, j]) for j in range(robot.dof)]
     return times, np.stack(rows, axis=1).astype(np.float32)

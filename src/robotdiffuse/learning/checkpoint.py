@@ -1,8 +1,15 @@
-"""Files: tensors as safetensors, everything else as JSON; written whole or not at all."""
+"""Trained networks in files: NAME.safetensors and NAME.json, all that planning needs; whole or not at all.
+
+Every network is written and read the same way: the diffusion model, those of the baselines, and the encoder
+that is trained alone, which is of no robot.
+"""
 
 import hashlib
 import json
 import struct
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -11,16 +18,29 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.errors import InputError
 from robotdiffuse.files import write_atomically
-from robotdiffuse.learning.encoders import ENCODERS, Encoder, encoder_name, make_encoder
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
-from robotdiffuse.learning.settings import settings_from_json, settings_to_json
+from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
+from robotdiffuse.learning.encoders.base import Encoder
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.network import Network
+from robotdiffuse.learning.networks import NETWORKS
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.weights_at_hand import BUNDLED, check_weights, untrained
+from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.settings import Settings
 
-FORMAT = 1
-BUNDLED = FilePath(__file__).parent / "weights"
-"""Weights that come with the package, one folder per robot."""
+FORMAT = 2
+
+
+def versions() -> dict[str, str]:
+    """What a checkpoint was made with: versions of this package and of PyTorch, and the day."""
+    try:
+        own = version("robotdiffuse")
+    except PackageNotFoundError:
+        own = "from source"
+    return {"robotdiffuse": own, "torch": torch.__version__, "made": datetime.now(UTC).strftime("%Y-%m-%d")}
 
 
 def write_tensors(file: FilePath, tensors: dict[str, Tensor], notes: dict[str, Any]) -> str:
@@ -57,15 +77,15 @@ def _pack(module: nn.Module) -> dict[str, Tensor]:
     return {name: t.half() if name in half else t for name, t in module.state_dict().items()}
 
 
-def save_module(module: nn.Module, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
+def _save(module: nn.Module, folder: FilePath, stem: str, about: dict[str, Any]) -> None:
     """Write STEM.safetensors and, with the SHA-256 of it, STEM.json."""
     digest = write_tensors(folder / f"{stem}.safetensors", _pack(module), {})
     about = {"format": FORMAT, **about, "weights_sha256": digest}
     write_atomically(folder / f"{stem}.json", json.dumps(about, indent=1) + "\n", make_folder=True)
 
 
-def load_tensors(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Weights and description of `save_module`. Raises InputError if they are missing or damaged."""
+def _read(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Weights and description of `_save`. Raises InputError if they are missing or damaged."""
     file = folder / f"{stem}.json"
     try:
         about = json.loads(file.read_text(encoding="utf-8"))
@@ -73,6 +93,10 @@ def load_tensors(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[s
         raise InputError(f"{folder} holds no trained model: {file.name} is missing") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is damaged: {error}") from None
+    if isinstance(about, dict) and about.get("format") == 1:
+        about = _of_format_1(about)
+    if isinstance(about, dict) and isinstance(about.get("settings"), dict):
+        about["settings"] = renamed(about["settings"])
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise InputError(f"{file} is not a model description of format {FORMAT}")
     weights = folder / f"{stem}.safetensors"
@@ -85,7 +109,31 @@ def load_tensors(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[s
     return read_tensors(weights)[0], about
 
 
-def fill(module: nn.Module, tensors: dict[str, Tensor], file: FilePath) -> None:
+def renamed(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings in which waypoints were called frames, as they are called now."""
+    found = {"waypoints" if name == "frames" else name: value for name, value in settings.items()}
+    return found | ({"parametrization": "waypoints"} if found.get("parametrization") == "frames" else {})
+
+
+def _of_format_1(about: dict[str, Any]) -> dict[str, Any]:
+    """A description in which models had their robot among their settings, and baselines its limits alone."""
+    found: dict[str, Any] = about | {"format": FORMAT}
+    if "encoder" in about:
+        found["network"] = found.pop("encoder")
+    elif "model" in about:
+        settings = dict(found.pop("model"))
+        robot = {name: settings.pop(name, None) for name in ("joint_names", "lower", "upper")}
+        robot |= {name: settings.pop(name, None) for name in ("frame_offsets", "links")}
+        found |= {"network": "model", "robot": robot | {"source": settings.pop("robot", None)}}
+        found["settings"] = settings
+    else:
+        robot = dict(about.get("robot") or {})
+        source = str(robot.pop("robot", ""))
+        found["robot"] = RobotIdentity.of(load_robot(source)).to_json() | robot
+    return found
+
+
+def _fill(module: nn.Module, tensors: dict[str, Tensor], file: FilePath) -> None:
     """Give a module its weights. Raises InputError, naming the file, if they are another's."""
     try:
         module.load_state_dict(tensors)
@@ -97,49 +145,79 @@ def fill(module: nn.Module, tensors: dict[str, Tensor], file: FilePath) -> None:
 def save_encoder(encoder: Encoder, folder: str | FilePath, training: dict[str, Any]) -> None:
     """Write encoder.safetensors and encoder.json. `training`: how it was trained, for the reader."""
     about = {
-        "encoder": encoder_name(encoder),
-        "settings": settings_to_json(encoder.settings),
+        "network": encoder_name(encoder),
+        "settings": encoder.settings.to_json(),
         "training": training,
     }
-    save_module(encoder, FilePath(folder), "encoder", about)
+    _save(encoder, FilePath(folder), "encoder", about)
 
 
 def load_encoder(folder: str | FilePath) -> Encoder:
     """The trained encoder of a folder, frozen. Raises InputError if it is missing or damaged."""
-    tensors, about = load_tensors(FilePath(folder), "encoder")
+    tensors, about = _read(FilePath(folder), "encoder")
     where = str(FilePath(folder) / "encoder.json")
-    if about.get("encoder") not in ENCODERS:
-        raise unknown_name(f"encoder in {where}:", about.get("encoder"), ENCODERS)
-    settings = ENCODERS[about["encoder"]][1]
-    encoder = make_encoder(
-        about["encoder"], settings_from_json(settings, about.get("settings"), f"{where}: settings")
-    )
-    fill(encoder, tensors, FilePath(folder) / "encoder.safetensors")
+    kind: Any = ENCODERS.settings(about.get("network", ""))
+    encoder = make_encoder(about["network"], kind.from_json(about.get("settings"), f"{where}: settings"))
+    _fill(encoder, tensors, FilePath(folder) / "encoder.safetensors")
     return encoder.requires_grad_(False).eval()
 
 
-def save_model(model: MotionModel, folder: str | FilePath, training: dict[str, Any]) -> None:
-    """Write model.safetensors and model.json, all that planning needs.
+def save_network(name: str, network: Network, folder: str | FilePath, training: dict[str, Any]) -> None:
+    """Write NAME.safetensors and NAME.json; `name` as in NETWORKS.
 
     `training`: the data's fingerprint, the number of samples and so on, for the reader.
     """
-    about = {"model": settings_to_json(model.config), "training": training}
-    save_module(model, FilePath(folder), "model", about)
+    about = {
+        "network": name,
+        "robot": network.robot.to_json(),
+        "settings": network.settings.to_json(),
+        "training": training,
+    }
+    _save(network, FilePath(folder), name, about)
+
+
+def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
+    """The trained network of a folder, or the one that comes with the package for the robot, ready to use.
+
+    Raises InputError if there is none, naming the command that trains it, and for files that are damaged or
+    made for another robot.
+    """
+    check_weights(name, folder)
+    place = BUNDLED / robot.name if folder is None else FilePath(folder)
+    if not (place / f"{name}.json").is_file():
+        raise untrained(name, f"no weights of the network {name} come with the package for {robot.name}")
+    network = _loaded(name, place)
+    network.robot.check(robot, str(place / f"{name}.json"))
+    return network
+
+
+@cache
+def _loaded(name: str, folder: FilePath) -> Network:
+    return _load(name, folder)
+
+
+def _load(name: str, folder: FilePath) -> Network:
+    tensors, about = _read(folder, name)
+    where, settings = str(folder / f"{name}.json"), NETWORKS.settings(name)
+    assert settings is not None and issubclass(settings, Settings)
+    network: Network = NETWORKS.load(name)(
+        RobotIdentity.from_json(about.get("robot"), f"{where}: robot"),
+        settings.from_json(about.get("settings"), f"{where}: settings"),
+    )
+    _fill(network, tensors, folder / f"{name}.safetensors")
+    return network.for_inference()
 
 
 def load_model(folder: str | FilePath, robot: Robot | None = None) -> MotionModel:
-    """The trained model of a folder, or of a bundled robot's name, ready for sampling.
+    """The diffusion model of a folder, or of a bundled robot's name, ready for sampling.
 
     Raises InputError, naming the file, if it is missing, damaged, or made for another robot than `robot`.
     """
     folder = FilePath(folder)
     if not folder.is_dir() and (BUNDLED / folder.name).is_dir():
         folder = BUNDLED / folder.name
-    tensors, about = load_tensors(folder, "model")
-    where = f"{folder / 'model.json'}: model"
-    config = settings_from_json(MotionModelConfig, about.get("model"), where)
+    model = _load("model", folder)
+    assert isinstance(model, MotionModel)
     if robot is not None:
-        config.check_robot(robot, str(folder / "model.json"))
-    model = MotionModel(config)
-    fill(model, tensors, folder / "model.safetensors")
-    return model.for_inference()
+        model.robot.check(robot, str(folder / "model.json"))
+    return model

@@ -8,7 +8,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.arrays import compile_robot
 from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
-from robotdiffuse.learning.motion_model import ClearanceFn, MotionModelConfig
+from robotdiffuse.learning.motion_model import ClearanceFn, MotionModelSettings
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import PackedScenes
 
@@ -16,28 +16,28 @@ PackedClearanceFn = Callable[[PackedScenes, ndarray], ndarray]
 """A scene for each trajectory and joint values [n, rows, dof] to what `ClearanceFn` gives."""
 
 
-def link_clearances(checker: CollisionChecker, config: MotionModelConfig) -> ClearanceFn:
-    """What a model of this config is told of the obstacles."""
-    limit = config.clearance_high
+def link_clearances(checker: CollisionChecker, settings: MotionModelSettings) -> ClearanceFn:
+    """What a model of these settings is told of the obstacles."""
+    limit = settings.clearance_high
 
     def clearances(q: ndarray) -> ndarray:
         rows = q.reshape(-1, q.shape[-1])
-        if config.sees_gradients:
-            told = checker.clearances_and_gradients(rows, limit, config.gradient_margin)
+        if settings.sees_gradients:
+            told = checker.clearances_and_gradients(rows, limit, settings.gradient_margin)
             return np.concatenate(told, axis=-1).reshape(*q.shape[:2], -1)
         return checker.link_clearances(rows, limit).reshape(*q.shape[:2], -1)
 
     return clearances
 
 
-def packed_clearances(robot: Robot, config: MotionModelConfig) -> PackedClearanceFn:
+def packed_clearances(robot: Robot, settings: MotionModelSettings) -> PackedClearanceFn:
     """The same for training, each trajectory in a scene of its own."""
     arrays = compile_robot(robot)
 
     def clearances(scenes: PackedScenes, q: ndarray) -> ndarray:
-        given = arrays, scenes, q, config.clearance_high
-        if config.sees_gradients:
-            told = packed_clearances_and_gradients(*given, config.gradient_margin)
+        given = arrays, scenes, q, settings.clearance_high
+        if settings.sees_gradients:
+            told = packed_clearances_and_gradients(*given, settings.gradient_margin)
             return np.concatenate(told, axis=-1)
         return packed_link_clearances(*given)
 

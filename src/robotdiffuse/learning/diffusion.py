@@ -4,48 +4,23 @@ A schedule gives signal and noise of the levels t = 0 .. T. For `cosine` and `li
 sqrt(alpha_bar_t) and sqrt(1 - alpha_bar_t), so that unit variance stays; `flow` is the straight line from the
 data to the noise.
 
-The noise may be white over the frames (the paper's identity covariance) or have the covariance of the
-training trajectories over the frames. A trajectory is smooth, so white noise hides its low frequencies only
-at the very end of the schedule, and noisy trajectories look like none that a robot follows; with the data's
-covariance every frequency is hidden at the same rate, and clearances of noisy trajectories mean something.
+The noise may be white over the waypoints (the paper's identity covariance) or have the covariance of the
+training trajectories over the waypoints. A trajectory is smooth, so white noise hides its low frequencies
+only at the very end of the schedule, and noisy trajectories look like none that a robot follows; with the
+data's covariance every frequency is hidden at the same rate, and clearances of noisy trajectories mean
+something.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, unknown_name
-
-
-@dataclass(frozen=True)
-class ScheduleSettings:
-    steps: int = 200
-    """T, the number of noise levels (paper: 200)."""
-    offset: float = 0.008
-    """s of the cosine schedule (Nichol and Dhariwal 2021, eq. 17): the first levels are not too small."""
-    floor: float = 1e-4
-    """Least alpha_bar of the cosine schedule: the last level is noise but for this share of the variance."""
-    kind: str = "cosine"
-    """Name in SCHEDULES."""
-
-    def __post_init__(self) -> None:
-        if self.kind not in SCHEDULES:
-            raise unknown_name("schedule.kind", self.kind, SCHEDULES)
-        if self.steps < 2:
-            raise InputError(f"schedule.steps is {self.steps}; it must be at least 2")
-        if self.kind == "linear" and self.steps <= LINEAR_STEPS * LINEAR_BETAS[1]:
-            raise InputError(
-                f"schedule.steps is {self.steps}; the linear schedule needs more than "
-                f"{LINEAR_STEPS * LINEAR_BETAS[1]:.0f}, or its last step would leave no signal"
-            )
-        if not self.offset >= 0:
-            raise InputError(f"schedule.offset is {self.offset}; it must be 0 or more")
-        if not 0 < self.floor < 1:
-            raise InputError(f"schedule.floor is {self.floor}; it must be between 0 and 1")
-
+from robotdiffuse.errors import InputError
+from robotdiffuse.settings import Bound, NotNegative, OneOf, Settings
 
 Levels = tuple[Float[ndarray, "levels"], Float[ndarray, "levels"]]
 """Signal and noise of the levels 0 .. T."""
@@ -55,7 +30,7 @@ LINEAR_BETAS = (1e-4, 0.02)
 LINEAR_STEPS = 1000
 
 
-def cosine(settings: ScheduleSettings) -> Levels:
+def cosine(settings: "ScheduleSettings") -> Levels:
     """Nichol and Dhariwal 2021, eq. 17."""
     t = np.arange(settings.steps + 1) / settings.steps
     curve = np.cos((t + settings.offset) / (1 + settings.offset) * np.pi / 2) ** 2
@@ -63,25 +38,44 @@ def cosine(settings: ScheduleSettings) -> Levels:
     return np.sqrt(alpha_bar), np.sqrt(1 - alpha_bar)
 
 
-def linear(settings: ScheduleSettings) -> Levels:
+def linear(settings: "ScheduleSettings") -> Levels:
     """Betas that grow evenly (Ho et al. 2020), scaled by 1000 / T so that any T ends at as little signal."""
     betas = np.linspace(*LINEAR_BETAS, settings.steps) * (LINEAR_STEPS / settings.steps)
     alpha_bar = np.concatenate([[1.0], np.cumprod(1 - betas)])
     return np.sqrt(alpha_bar), np.sqrt(1 - alpha_bar)
 
 
-def flow(settings: ScheduleSettings) -> Levels:
+def flow(settings: "ScheduleSettings") -> Levels:
     """x_t = (1 - t/T) x_0 + t/T n: rectified flow, flow matching (Lipman et al. 2023; Liu et al. 2023)."""
     t = np.arange(settings.steps + 1) / settings.steps
     return 1 - t, t
 
 
-SCHEDULES: dict[str, Callable[[ScheduleSettings], Levels]] = {
+SCHEDULES: dict[str, Callable[["ScheduleSettings"], Levels]] = {
     "cosine": cosine,
     "linear": linear,
     "flow": flow,
 }
 """Name in ScheduleSettings.kind: function."""
+
+
+@dataclass(frozen=True)
+class ScheduleSettings(Settings, name="schedule"):
+    steps: Annotated[int, Bound(least=2.0)] = 200
+    """T, the number of noise levels (paper: 200)."""
+    offset: NotNegative = 0.008
+    """s of the cosine schedule (Nichol and Dhariwal 2021, eq. 17): the first levels are not too small."""
+    floor: Annotated[float, Bound(above=0.0, below=1.0)] = 1e-4
+    """Least alpha_bar of the cosine schedule: the last level is noise but for this share of the variance."""
+    kind: Annotated[str, OneOf(SCHEDULES)] = "cosine"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.kind == "linear" and self.steps <= LINEAR_STEPS * LINEAR_BETAS[1]:
+            raise InputError(
+                f"schedule.steps is {self.steps}; the linear schedule needs more than "
+                f"{LINEAR_STEPS * LINEAR_BETAS[1]:.0f}, or its last step would leave no signal"
+            )
 
 
 class NoiseSchedule:
@@ -119,21 +113,24 @@ class NoiseSchedule:
         return np.linspace(self.steps, 0, steps + 1).round().astype(np.int64)
 
 
-def noise_factor(residuals: Float[ndarray, "n frames dof"], smooth: bool) -> Float[ndarray, "frames frames"]:
-    """L such that noise L e, with e white, is zero on the first and last frame, of mean variance 1 between.
+def noise_factor(
+    residuals: Float[ndarray, "n waypoints dof"], smooth: bool
+) -> Float[ndarray, "waypoints waypoints"]:
+    """L such that noise L e, with e white, is zero on the first and last waypoint, of mean variance 1
+    between.
 
-    `residuals` are scaled to unit variance; for `smooth`, L Lᵀ is their covariance over the frames, with a
+    `residuals` are scaled to unit variance; for `smooth`, L Lᵀ is their covariance over the waypoints, with a
     little white noise so that no direction is left without noise.
     """
-    frames = residuals.shape[1]
-    inner = np.ones(frames)
+    waypoints = residuals.shape[1]
+    inner = np.ones(waypoints)
     inner[[0, -1]] = 0.0
     if not smooth:
         return np.diag(inner)
-    rows = np.moveaxis(residuals, 1, 2).reshape(-1, frames).astype(np.float64)
+    rows = np.moveaxis(residuals, 1, 2).reshape(-1, waypoints).astype(np.float64)
     covariance = rows.T @ rows / len(rows)
     mean_variance = np.trace(covariance) / inner.sum()
-    covariance = covariance / mean_variance + 1e-4 * np.eye(frames)
+    covariance = covariance / mean_variance + 1e-4 * np.eye(waypoints)
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     return inner[:, None] * root

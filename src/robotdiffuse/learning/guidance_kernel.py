@@ -31,20 +31,21 @@ class Steps(NamedTuple):
     limit_margin: np.float32
     """[rad], or OFF."""
     push: np.float32
-    kernel: Float[ndarray, "frames frames"]
-    """Weights by which pushes spread over neighbouring frames."""
+    kernel: Float[ndarray, "waypoints waypoints"]
+    """Weights by which pushes spread over neighbouring waypoints."""
     smoothness: np.float32
     length: np.float32
 
 
 @njit(cache=True, nogil=True)
 def descend(robot, scene, q, lower, upper, steps, prefix, suffix, count):
-    """Moves trajectories q[batch, frames, dof] by `count` rounds, in place; the first `prefix` and the last
-    `suffix` frames, at least one each, stay. Returns the margins' costs [batch] that the last round met.
+    """Moves trajectories q[batch, waypoints, dof] by `count` rounds, in place; the first `prefix` and the
+    last `suffix` waypoints, at least one each, stay. Returns the margins' costs [batch] that the last round
+    met.
 
-    Each frame within a margin is pushed out of it, the pushes are spread over its neighbours, then the steps
-    of smoothness and length follow. A trajectory of which no frame is within a margin is left as it is,
-    unless no margin is on.
+    Each waypoint within a margin is pushed out of it, the pushes are spread over its neighbours, then the
+    steps of smoothness and length follow. A trajectory of which no waypoint is within a margin is left as it
+    is, unless no margin is on.
     """
     batch, n, dof = q.shape
     first, last = prefix, n - suffix
@@ -129,7 +130,8 @@ def _push_inside(q, lower, upper, margin, push, pushed):
 
 @allocation_free(fastmath=True)
 def _spread(q, first, last, pushes, active, kernel, lower, upper):
-    """Each frame takes a weighted mean of the pushes of its neighbours, falling off where none is pushed."""
+    """Each waypoint takes a weighted mean of the pushes of its neighbours, falling off where none is
+    pushed."""
     dof = q.shape[1]
     for i in range(first, last):
         weight = _ZERO
@@ -149,8 +151,8 @@ def _spread(q, first, last, pushes, active, kernel, lower, upper):
 
 @allocation_free(fastmath=True)
 def _smooth(q, first, last, share, lower, upper):
-    """Each frame by a share of the way to where the accelerations that it is part of are smallest: Newton's
-    step in that frame alone. Every third frame at a time, for these do not meet."""
+    """Each waypoint by a share of the way to where the accelerations that it is part of are smallest:
+    Newton's step in that waypoint alone. Every third waypoint at a time, for these do not meet."""
     n, dof = q.shape
     for offset in range(3):
         for i in range(first + offset, last, 3):
@@ -169,8 +171,8 @@ def _smooth(q, first, last, share, lower, upper):
 
 @allocation_free(fastmath=True)
 def _shorten(q, first, last, share):
-    """Each frame by a share of the way to the middle of its neighbours, where the two steps that it is part
-    of are shortest: Newton's step in that frame alone. Every second frame at a time."""
+    """Each waypoint by a share of the way to the middle of its neighbours, where the two steps that it is
+    part of are shortest: Newton's step in that waypoint alone. Every second waypoint at a time."""
     dof = q.shape[1]
     for parity in range(2):
         for i in range(first + parity, last, 2):

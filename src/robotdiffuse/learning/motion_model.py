@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import ceil
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -11,32 +12,38 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.denoisers import DENOISERS, DenoiserSettings, TransformerSettings
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.denoisers.base import Denoiser, DenoiserSettings
 from robotdiffuse.learning.denoisers.layers import Linear
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
-from robotdiffuse.learning.encoders import ENCODERS, EncoderSettings, PointAutoencoderSettings, make_encoder
-from robotdiffuse.learning.objectives import objective_for
-from robotdiffuse.learning.parametrization import parametrization
-from robotdiffuse.learning.representation import Between, TrajectoryRows
+from robotdiffuse.learning.encoders import ENCODERS, make_encoder
+from robotdiffuse.learning.encoders.base import EncoderSettings
+from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
+from robotdiffuse.learning.network import Network
+from robotdiffuse.learning.objectives import OBJECTIVES, objective_for
+from robotdiffuse.learning.parametrization import PARAMETRIZATIONS, parametrization
+from robotdiffuse.learning.representation import TARGETS, Between, TrajectoryRows
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.settings import check_kind, of_kind
-from robotdiffuse.robots.normalizer import JointNormalizer
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.learning.samplers.sampler import Sampler
+from robotdiffuse.settings import Bound, Count, OneOf, Positive, Settings, SettingsOf
 
 MAX_POINTS = 2048
 """Larger clouds are thinned to this many points by chance before they are encoded; to as many as an encoder
 is for, if it is not for clouds of any size."""
 
 BLEND = 1 / 6
-"""Share of a trajectory over which predictions blend into known frames. Over all of it, small errors of the
-network at these grow into detours; over less, the path turns at once where they end."""
+"""Share of a trajectory over which predictions blend into known waypoints. Over all of it, small errors of
+the network at these grow into detours; over less, the path turns at once where they end."""
 
 ClearanceFn = Callable[[ndarray], ndarray]
 """Joint values [count, rows, dof] (float32) to clearances of the links, [count, rows, links] [m]; for a model
 that sees gradients, to [count, rows, links + dof], see `CollisionChecker.clearances_and_gradients`."""
 GuideFn = Callable[[ndarray, float], ndarray]
-"""Predicted joint values [count, frames, dof] (float32), noise level in (0, 1]; to improved joint values."""
+"""Predicted joint values [count, waypoints, dof] (float32), noise level in (0, 1]; to improved joint
+values."""
 
 
 def check_gradients(sees_gradients: bool, sees_clearances: bool) -> None:
@@ -46,100 +53,77 @@ def check_gradients(sees_gradients: bool, sees_clearances: bool) -> None:
 
 
 @dataclass(frozen=True)
-class MotionModelConfig:
-    """What a checkpoint says about its model."""
+class MotionModelSettings(Settings, name="model"):
+    """What the model is made of, and how it is sampled unless something else is asked for."""
 
-    robot: str
-    joint_names: tuple[str, ...]
-    lower: tuple[float, ...]
-    """Limits that the joint values are normalised by [rad]."""
-    upper: tuple[float, ...]
-    frame_offsets: tuple[tuple[tuple[float, ...], ...], ...]
-    """`Robot.frame_offsets`, to recognise a robot of the same name but other measures."""
-    links: tuple[str, ...]
-    """The links whose clearances the denoiser sees, in order."""
-    frames: int = 48
-    """Frames of a trajectory, evenly spaced along it (joint-space length)."""
+    waypoints: Annotated[int, Bound(least=3.0)] = 48
+    """Waypoints of a trajectory, evenly spaced along it (joint-space length)."""
     clearance_low: float = -0.1
     """Clearances are clipped to this range before the denoiser sees them [m]."""
     clearance_high: float = 0.4
-    encoder: str = "point_autoencoder"
-    encoder_settings: EncoderSettings = field(
-        default_factory=PointAutoencoderSettings, metadata=of_kind("encoder", ENCODERS)
+    encoder: Annotated[str, OneOf(ENCODERS)] = "point_autoencoder"
+    encoder_settings: Annotated[EncoderSettings, SettingsOf("encoder", ENCODERS)] = field(
+        default_factory=PointAutoencoderSettings
     )
-    denoiser: str = "transformer"
-    denoiser_settings: DenoiserSettings = field(
-        default_factory=TransformerSettings, metadata=of_kind("denoiser", DENOISERS)
+    denoiser: Annotated[str, OneOf(DENOISERS)] = "transformer"
+    denoiser_settings: Annotated[DenoiserSettings, SettingsOf("denoiser", DENOISERS)] = field(
+        default_factory=TransformerSettings
     )
     null_condition: bool = False
     """Whether the model has a learned stand-in for a dropped condition, for classifier-free guidance."""
-    sampler: str = "ddim"
-    sampling_steps: int | None = 6
+    sampler: Annotated[str, OneOf(SAMPLERS)] = "ddim"
+    sampling_steps: Count | None = 6
     """Calls of the denoiser for a batch; None: all levels of the schedule."""
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
-    parametrization: str = "frames"
-    """What the rows are that are diffused: frames, or b_spline control points."""
-    rows: int | None = None
-    """As many; None: as there are frames."""
-    target: str = "residual"
+    parametrization: Annotated[str, OneOf(PARAMETRIZATIONS)] = "waypoints"
+    """What the rows are that are diffused: waypoints, or b_spline control points."""
+    rows: Count | None = None
+    """As many; None: as there are waypoints."""
+    target: Annotated[str, OneOf(TARGETS)] = "residual"
     """What rows are relative to: the straight line from start to goal (residual), or nothing (absolute)."""
-    objective: str = "clean"
+    objective: Annotated[str, OneOf(OBJECTIVES)] = "clean"
     """What the network predicts: clean, noise or velocity."""
     sees_clearances: bool = True
     """Whether the denoiser is told the clearances of the links along the noisy trajectory."""
     sees_gradients: bool = False
     """Whether it is told too which way the joints would take the arm too close to obstacles, see
     `CollisionChecker.clearances_and_gradients`."""
-    gradient_margin: float = 0.1
+    gradient_margin: Positive = 0.1
     """Closer than this is too close [m]."""
-    gradient_unit: float = 2.0
+    gradient_unit: Positive = 2.0
     """Such gradients are told as 1, and larger ones too [m/rad]."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_gradients(self.sees_gradients, self.sees_clearances)
-        check_kind("encoder", self.encoder, self.encoder_settings, ENCODERS)
-        if self.sampler not in SAMPLERS:
-            raise unknown_name("sampler", self.sampler, SAMPLERS)
-        check_kind("denoiser", self.denoiser, self.denoiser_settings, DENOISERS)
-
-    def check_robot(self, robot: Robot, where: str) -> None:
-        """Raises InputError unless the model was trained for this robot. `where` names the model."""
-        if robot.joint_names != self.joint_names:
-            raise InputError(
-                f"{where} was trained for {self.robot} with joints {', '.join(self.joint_names)}; "
-                f"the robot {robot.name} has {', '.join(robot.joint_names)}"
-            )
-        if not np.allclose(robot.frame_offsets, np.array(self.frame_offsets), atol=1e-3):
-            raise InputError(
-                f"{where} was trained for {self.robot}; the robot {robot.name} has other dimensions"
-            )
 
 
-class MotionModel(TrajectoryRows):
+class MotionModel(TrajectoryRows, Network):
     """The diffusion model over trajectories, which are rows of numbers as in `TrajectoryRows`."""
 
+    settings: MotionModelSettings
     null_condition: nn.Parameter | None
 
-    def __init__(self, config: MotionModelConfig) -> None:
-        rows = parametrization(config.parametrization, config.frames, config.rows or config.frames)
-        normalizer = JointNormalizer(np.array(config.lower), np.array(config.upper))
-        super().__init__(normalizer, rows, config.target, config.frames)
-        self.config = config
-        self.schedule = NoiseSchedule(config.schedule)
-        self.objective = objective_for(config.objective, self.schedule)
-        self.encoder = make_encoder(config.encoder, config.encoder_settings)
-        condition = config.encoder_settings.code + 2 * self.dof
-        features = 2 * self.dof + (len(config.links) if config.sees_clearances else 0)
-        features += self.dof if config.sees_gradients else 0
-        self.denoiser = DENOISERS[config.denoiser][0](
-            config.denoiser_settings, self.rows, self.dof, features, condition
+    def __init__(self, robot: RobotIdentity, settings: MotionModelSettings) -> None:
+        waypoints = settings.waypoints
+        rows = parametrization(settings.parametrization, waypoints, settings.rows or waypoints)
+        super().__init__(robot.normalizer(), rows, settings.target, waypoints)
+        self.robot, self.settings = robot, settings
+        self.schedule = NoiseSchedule(settings.schedule)
+        self.objective = objective_for(settings.objective, self.schedule)
+        self.encoder = make_encoder(settings.encoder, settings.encoder_settings)
+        condition = settings.encoder_settings.code + 2 * self.dof
+        features = 2 * self.dof + (len(robot.links) if settings.sees_clearances else 0)
+        features += self.dof if settings.sees_gradients else 0
+        self.denoiser: Denoiser = DENOISERS.load(settings.denoiser)(
+            settings.denoiser_settings, self.rows, self.dof, features, condition
         )
-        null = nn.Parameter(torch.zeros(condition)) if config.null_condition else None
+        null = nn.Parameter(torch.zeros(condition)) if settings.null_condition else None
         self.register_parameter("null_condition", null)
 
     def for_inference(self) -> "MotionModel":
         """Freeze, and keep the denoiser's matrices in bf16 where the CPU multiplies it fast. Returns self."""
-        self.requires_grad_(False).eval()
+        super().for_inference()
         if torch.cpu._is_avx512_bf16_supported():
             for module in self.denoiser.modules():
                 if isinstance(module, Linear):
@@ -151,8 +135,8 @@ class MotionModel(TrajectoryRows):
     ) -> Float[ndarray, "code"]:
         """z of a point cloud of the obstacles' surfaces (base frame, [m]); no point at all is a scene too."""
         points = np.asarray(points, np.float32).reshape(-1, 3)
-        points = points[self.config.encoder_settings.region.holds(points)]
-        most = MAX_POINTS if self.encoder.any_size else self.config.encoder_settings.cloud
+        points = points[self.settings.encoder_settings.region.holds(points)]
+        most = MAX_POINTS if self.encoder.any_size else self.settings.encoder_settings.cloud
         if len(points) > most:
             rng = np.random.default_rng(0) if rng is None else rng
             points = points[rng.choice(len(points), most, replace=False)]
@@ -165,15 +149,15 @@ class MotionModel(TrajectoryRows):
         """The denoiser's input for noisy rows: the rows, normalised joint values, clearances of the links and
         gradients, each as far as it sees them."""
         unit = self.at_sites(x, between)
-        if not self.config.sees_clearances:
+        if not self.settings.sees_clearances:
             return np.concatenate([x, unit], axis=-1)
-        low, high = self.config.clearance_low, self.config.clearance_high
+        low, high = self.settings.clearance_low, self.settings.clearance_high
         told = clearances(self.normalizer.from_unit(unit))
-        near = np.clip(told[..., : len(self.config.links)], low, high)
+        near = np.clip(told[..., : len(self.robot.links)], low, high)
         near = (near - (low + high) / 2) * (2 / (high - low))
         parts = [x, unit, near.astype(np.float32, copy=False)]
-        if self.config.sees_gradients:
-            parts.append(np.clip(told[..., -self.dof :] / np.float32(self.config.gradient_unit), -1, 1))
+        if self.settings.sees_gradients:
+            parts.append(np.clip(told[..., -self.dof :] / np.float32(self.settings.gradient_unit), -1, 1))
         return np.concatenate(parts, axis=-1)
 
     def condition(
@@ -196,7 +180,7 @@ class MotionModel(TrajectoryRows):
         """What the denoiser predicts.
 
         dropped: samples whose condition is hidden from it (Ho and Salimans 2022; paper: C is randomly
-            masked). What the features say of ends and clearances stays. Needs `config.null_condition`.
+            masked). What the features say of ends and clearances stays. Needs `settings.null_condition`.
         """
         if dropped is not None:
             if self.null_condition is None:
@@ -238,30 +222,31 @@ class MotionModel(TrajectoryRows):
         guided_share: float = 0.5,
         prefix: Float[ndarray, "k dof"] | None = None,
         suffix: Float[ndarray, "m dof"] | None = None,
-    ) -> Float[ndarray, "count frames dof"]:
+    ) -> Float[ndarray, "count waypoints dof"]:
         """Trajectories from start to goal [rad] (float64, the ends exact), of a model from `load_model`.
 
         code: z of the scene, from `encode`.
         clearances: see ClearanceFn.
         steps: calls of the denoiser; None: as many as the checkpoint names.
         guide: improves the predicted clean trajectories in some of the steps (paper, section Motion Guided
-            Generation). It need not keep the ends, but should keep more known frames, and move away from
+            Generation). It need not keep the ends, but should keep more known waypoints, and move away from
             them smoothly.
         eta: share of fresh noise per step, see `ddim`.
         guidance_scale: of classifier-free guidance, see `denoise_guided`; only 1 for a model that was trained
             without dropping its condition.
         sampler: name in SAMPLERS; None: the one that the checkpoint names.
         guided_share: share of the steps that are guided, the last ones: 0 none, 1 all.
-        prefix: known first frames [rad], from the start on; None: the start alone.
-        suffix: known last frames [rad], up to the goal; None: the goal alone.
+        prefix: known first waypoints [rad], from the start on; None: the start alone.
+        suffix: known last waypoints [rad], up to the goal; None: the goal alone.
 
-        Known frames are in the result as they are. Like the ends, they are written over the noisy and the
+        Known waypoints are in the result as they are. Like the ends, they are written over the noisy and the
         predicted trajectories, and what is unknown moves along by `regression`, so that with smooth noise the
-        result goes on from them in a step like its others: with the Panda's weights and 8 known frames at
+        result goes on from them in a step like its others: with the Panda's weights and 8 known waypoints at
         most 1.8 times as long as the last known one or the median of the others (10.7 times where they are
         written over, no more). With white noise, the paper's, nothing is promised. Training knew the ends
-        alone, so known frames should be such as the model would have sampled: of a path like its own, about
-        as far apart. An arm that plans anew while it moves follows what it is committed to, and goes on:
+        alone, so known waypoints should be such as the model would have sampled: of a path like its own,
+        about as far apart. An arm that plans anew while it moves follows what it is committed to, and goes
+        on:
 
             prefix = moving[i : i + 6]
             q = model.sample(
@@ -269,22 +254,24 @@ class MotionModel(TrajectoryRows):
                 guide=lambda q, level: guidance(q, 4, prefix=6)[0],
             )
         """
-        if guidance_scale != 1.0 and not self.config.null_condition:
+        if guidance_scale != 1.0 and not self.settings.null_condition:
             raise InputError(
                 f"guidance_scale is {guidance_scale}; it must be 1, for this model was trained with "
                 "condition_drop 0 and knows no motions without a condition"
             )
-        sampler = self.config.sampler if sampler is None else sampler
-        if sampler not in SAMPLERS:
-            raise unknown_name("sampler", sampler, SAMPLERS)
+        sampler = self.settings.sampler if sampler is None else sampler
+        draw: Sampler = SAMPLERS.load(sampler)
         if not 0 <= guided_share <= 1:
             raise InputError(f"guided_share is {guided_share}; it must be between 0 and 1")
-        steps = steps or self.config.sampling_steps or self.schedule.steps
-        prefix, suffix = known_frames("prefix", prefix, start, 0), known_frames("suffix", suffix, goal, -1)
+        steps = steps or self.settings.sampling_steps or self.schedule.steps
+        prefix, suffix = (
+            known_waypoints("prefix", prefix, start, 0),
+            known_waypoints("suffix", suffix, goal, -1),
+        )
         between = self.around(prefix, suffix)
         far, near = self.regression(between), self.regression(between, BLEND * self.rows)
         condition = torch.from_numpy(self.condition(code, start, goal)).expand(count, -1)
-        levels = self.config.schedule.steps
+        levels = self.settings.schedule.steps
         signal, noise = (a.astype(np.float32) for a in (self.schedule.signal, self.schedule.noise))
         unguided = steps - ceil(guided_share * steps - 1e-9)
         guided: Int[ndarray, "n"] = self.schedule.sampling_levels(steps)[unguided:-1]
@@ -309,24 +296,25 @@ class MotionModel(TrajectoryRows):
             return clean
 
         with torch.inference_mode(), one_thread():
-            x = SAMPLERS[sampler](predict, self.schedule, draw_noise, steps, eta)
+            x = draw(predict, self.schedule, draw_noise, steps, eta)
         q = self.joints(x, between).astype(np.float64)
-        np.clip(q, self.config.lower, self.config.upper, out=q)
+        np.clip(q, self.robot.lower, self.robot.upper, out=q)
         q[:, : len(prefix)], q[:, len(q[0]) - len(suffix) :] = prefix, suffix
         return q
 
 
-def known_frames(
-    name: str, frames: Float[ndarray, "k dof"] | None, end: Float[ndarray, "dof"], at: int
+def known_waypoints(
+    name: str, waypoints: Float[ndarray, "k dof"] | None, end: Float[ndarray, "dof"], at: int
 ) -> Float[ndarray, "k dof"]:
-    """Known frames, or the end alone for None. Raises InputError unless frame `at` of them is the end."""
-    if frames is None:
+    """Known waypoints, or the end alone for None. Raises InputError unless waypoint `at` of them is the
+    end."""
+    if waypoints is None:
         return end[None]
-    if not len(frames) or not np.array_equal(frames[at], end):
+    if not len(waypoints) or not np.array_equal(waypoints[at], end):
         raise InputError(
-            f"{name} must have the {'start' if at == 0 else 'goal'} as frame {at}, {end.tolist()}"
+            f"{name} must have the {'start' if at == 0 else 'goal'} as waypoint {at}, {end.tolist()}"
         )
-    return frames
+    return waypoints
 
 
 @contextmanager

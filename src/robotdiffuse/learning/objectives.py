@@ -13,11 +13,13 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.errors import InputError
 from robotdiffuse.learning.diffusion import NoiseSchedule
+from robotdiffuse.registry import Entry, Registry
 
 Array = TypeVar("Array", ndarray, Tensor)
-"""Clean, noise, noisy trajectories and network outputs are all of one kind and shape, [..., frames, dof]."""
+"""Clean, noise, noisy trajectories and network outputs are all of one kind and shape, [..., waypoints,
+dof]."""
 
 
 class Objective(ABC):
@@ -88,21 +90,24 @@ class VelocityObjective(Objective):
         return -noise_level / (signal + noise_level)
 
 
-OBJECTIVES: dict[str, Objective] = {
-    "clean": CleanObjective(),
-    "noise": NoiseObjective(),
-    "velocity": VelocityObjective(),
-}
-"""Name in settings: objective."""
+_HERE = "robotdiffuse.learning.objectives:"
+OBJECTIVES = Registry(
+    "objective",
+    {
+        "clean": Entry(_HERE + "CleanObjective", "the clean trajectory, the paper's"),
+        "noise": Entry(_HERE + "NoiseObjective", "the noise"),
+        "velocity": Entry(_HERE + "VelocityObjective", "the noise less the clean trajectory"),
+    },
+)
+"""By the name in settings. A new one is a class and a line here."""
 
 
 def objective_for(name: str, schedule: NoiseSchedule) -> Objective:
     """The objective of this name. Raises InputError if it is unknown or cannot be used with the schedule."""
-    if name not in OBJECTIVES:
-        raise unknown_name("objective", name, OBJECTIVES)
+    objective: Objective = OBJECTIVES.make(name)
     if name == "noise" and schedule.signal[-1] == 0:
         raise InputError(
             f"objective is 'noise' and schedule.kind is {schedule.settings.kind!r}, whose last level "
             "has no signal to tell from the noise; choose 'clean' or 'velocity', or another schedule"
         )
-    return OBJECTIVES[name]
+    return objective

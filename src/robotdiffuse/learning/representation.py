@@ -1,10 +1,10 @@
 """Trajectories as the rows of numbers that are diffused: normalised, relative to a base, scaled.
 
-A trajectory is rows x of a parametrization (frames or spline control points), in units of the training data's
-standard deviation, relative to a base: the straight line from start to goal (target `residual`), or the mean
-of the data (target `absolute`, the paper's). The first and the last row are start and goal and are held: the
-paper's noise interpolation, which writes them over the ends at every step. More frames at either end may be
-held, its prefix and suffix frames.
+A trajectory is rows x of a parametrization (waypoints or spline control points), in units of the training
+data's standard deviation, relative to a base: the straight line from start to goal (target `residual`), or
+the mean of the data (target `absolute`, the paper's). The first and the last row are start and goal and are
+held: the paper's noise interpolation, which writes them over the ends at every step. More waypoints at
+either end may be held, its prefix and suffix waypoints.
 """
 
 from typing import NamedTuple
@@ -42,7 +42,7 @@ class TrajectoryRows(nn.Module):
     noise_factor: Tensor
 
     def __init__(
-        self, normalizer: JointNormalizer, parametrization: Parametrization, target: str, frames: int
+        self, normalizer: JointNormalizer, parametrization: Parametrization, target: str, waypoints: int
     ) -> None:
         super().__init__()
         if target not in TARGETS:
@@ -52,9 +52,9 @@ class TrajectoryRows(nn.Module):
         self.register_buffer("residual_scale", torch.ones(self.dof))
         self.register_buffer("residual_mean", torch.zeros(self.dof), persistent=target == "absolute")
         self.register_buffer("noise_factor", torch.eye(self.rows))
-        self._share = np.linspace(0.0, 1.0, frames, dtype=np.float32)[:, None]
+        self._share = np.linspace(0.0, 1.0, waypoints, dtype=np.float32)[:, None]
 
-    def fit_statistics(self, q: Float[ndarray, "n frames dof"], smooth_noise: bool) -> None:
+    def fit_statistics(self, q: Float[ndarray, "n waypoints dof"], smooth_noise: bool) -> None:
         """Set scale, mean, and the covariance of the noise, from trajectories [rad]."""
         self.residual_scale.fill_(1.0)
         self.residual_mean.fill_(0.0)
@@ -82,18 +82,19 @@ class TrajectoryRows(nn.Module):
         return Between(base, (a - mean) / self._scale, (b - mean) / self._scale)
 
     def around(self, prefix: Float[ndarray, "k dof"], suffix: Float[ndarray, "m dof"]) -> Between:
-        """Base and held rows, a batch of one, of trajectories whose first and last frames are known [rad].
+        """Base and held rows, a batch of one, of trajectories whose first and last waypoints are known [rad].
 
-        Raises InputError where more than start and goal are known but rows are not frames, or none is left.
+        Raises InputError where more than start and goal are known but rows are not waypoints, or none is
+        left.
         """
         k, m = len(prefix), len(suffix)
         if k + m > 2 and not self.parametrization.themselves:
             raise InputError(
-                f"prefix and suffix have {k} and {m} frames; control points can hold 1 and 1 only"
+                f"prefix and suffix have {k} and {m} waypoints; control points can hold 1 and 1 only"
             )
         if k + m >= self.rows:
             raise InputError(
-                f"prefix and suffix have {k} and {m} frames; they must leave some of {self.rows} unknown"
+                f"prefix and suffix have {k} and {m} waypoints; they must leave some of {self.rows} unknown"
             )
         ends = self.between(prefix[None, 0], suffix[None, -1])
         first, last = (self.normalizer.to_unit(q[None].astype(np.float32)) for q in (prefix[1:], suffix[:-1]))
@@ -106,7 +107,7 @@ class TrajectoryRows(nn.Module):
         )
 
     def to_rows(
-        self, q: Float[ndarray, "*batch frames dof"], between: Between
+        self, q: Float[ndarray, "*batch waypoints dof"], between: Between
     ) -> Float[ndarray, "*batch rows dof"]:
         """Rows of trajectories [rad], their ends those of `between`."""
         unit = self.parametrization.to_rows(self.normalizer.to_unit(q.astype(np.float32, copy=False)))
@@ -114,9 +115,9 @@ class TrajectoryRows(nn.Module):
 
     def joints(
         self, x: Float[ndarray, "*batch rows dof"], between: Between
-    ) -> Float[ndarray, "*batch frames dof"]:
-        """Joint values of the frames of rows [rad]."""
-        return self.normalizer.from_unit(self.parametrization.to_frames(between.base + x * self._scale))
+    ) -> Float[ndarray, "*batch waypoints dof"]:
+        """Joint values of the waypoints of rows [rad]."""
+        return self.normalizer.from_unit(self.parametrization.to_waypoints(between.base + x * self._scale))
 
     def at_sites(
         self, x: Float[ndarray, "*batch rows dof"], between: Between
@@ -155,12 +156,8 @@ class TrajectoryRows(nn.Module):
         return self.noise_factor.numpy() @ rng.standard_normal((count, self.rows, self.dof), dtype=np.float32)
 
     def joints_at(
-        self, x: Float[Tensor, "n rows dof"], base: Float[Tensor, "n rows dof"], frames: list[int]
-    ) -> Float[Tensor, "n {len(frames)} dof"]:
-        """Joint values [rad] of some of the frames, differentiable in the rows."""
-        evaluate = torch.from_numpy(self.parametrization.evaluate[frames]).to(x.device)
-        unit = evaluate @ (base + x * self.residual_scale)
-        middle, half_range = (
-            torch.from_numpy(a).to(x.device) for a in (self.normalizer.middle, self.normalizer.half_range)
-        )
-        return unit * half_range + middle
+        self, x: Float[Tensor, "n rows dof"], base: Float[Tensor, "n rows dof"], waypoints: list[int]
+    ) -> Float[Tensor, "n {len(waypoints)} dof"]:
+        """Joint values [rad] of some of the waypoints, differentiable in the rows."""
+        evaluate = torch.from_numpy(self.parametrization.evaluate[waypoints]).to(x.device)
+        return self.normalizer.from_unit(evaluate @ (base + x * self.residual_scale))

@@ -1,8 +1,9 @@
-"""Time-optimal timing of a path within velocity and acceleration limits, by toppra."""
+"""Time-optimal timing of a path within velocity and acceleration limits."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -10,40 +11,36 @@ from numpy import ndarray
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.blending import BlendedPolyline, half_widths
+from robotdiffuse.paths.time_optimal import fastest, sampled, slowdown
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.settings import Bound, Count, NotNegative, OneOf, Settings
 from robotdiffuse.types import Path, Trajectory
 
+COMPILED, TOPPRA = "compiled", "toppra"
 SHRINKS = (0.25, 0.25, 0.0)
 """Factors on the deviation of a corner each time that its rounding is refused; 0: the motion stops there."""
-PARTS = 16
-"""Places in a grid interval where rates are looked at; at 4, a reversal was 1.8 % too fast between them."""
+CORNER_PLACES = 17
+"""Configurations of a rounded corner that are looked at."""
 SAME = 1e-6
 """Waypoints nearer to each other than this are one [rad]."""
 
 
 @dataclass(frozen=True)
-class TimingSettings:
-    sample_time: float = 0.01
+class TimingSettings(Settings, name="timing"):
+    sample_time: Annotated[float, Bound(least=1e-4, most=1.0)] = 0.01
     """Time between the rows of a trajectory [s]; the step before a stop may be 0.1 to 1.1 times as long."""
-    velocity_scale: float = 1.0
-    """Share of the robot's velocity limits that is used, in (0, 1]."""
-    acceleration_scale: float = 1.0
-    """Share of the robot's acceleration limits that is used, in (0, 1]."""
-    corner_deviation: float = 0.1
+    velocity_scale: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
+    """Share of the robot's velocity limits that is used."""
+    acceleration_scale: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
+    """Share of the robot's acceleration limits that is used."""
+    corner_deviation: NotNegative = 0.1
     """How far a rounded corner may leave the path, if it stays valid there [rad, joint-space L2]."""
-    corner_intervals: int = 8
+    corner_intervals: Count = 8
     """Grid intervals in a rounded corner; more follow the limits closer and take longer."""
-    line_intervals: int = 64
+    solver: Annotated[str, OneOf((COMPILED, TOPPRA))] = COMPILED
+    """What finds the speeds: this package's compiled code, or toppra."""
+    line_intervals: Count = 64
     """Grid intervals that straight parts share, by their lengths."""
-
-    def __post_init__(self) -> None:
-        for name in ("velocity_scale", "acceleration_scale"):
-            if not 0 < getattr(self, name) <= 1:
-                raise InputError(f"timing.{name} is {getattr(self, name)}; it must lie in (0, 1]")
-        if not 1e-4 <= self.sample_time <= 1:
-            raise InputError(f"timing.sample_time is {self.sample_time}; it must lie in [0.0001, 1] s")
-        if self.corner_deviation < 0:
-            raise InputError(f"timing.corner_deviation is {self.corner_deviation}; it must not be negative")
 
 
 DEFAULT = TimingSettings()
@@ -55,6 +52,7 @@ def time_parameterize(
     valid: Callable[[Trajectory], bool],
     free: Callable[[Path], bool],
     settings: TimingSettings = DEFAULT,
+    keeps: Callable[[ndarray], bool] = lambda _: True,
 ) -> Trajectory:
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
 
@@ -62,6 +60,9 @@ def time_parameterize(
     Where it refuses, `free` is asked about the corners, one by one, and those that fail are rounded less; in
     the end the motion stops at them. With stops at all corners the rows lie on the path itself, so that a
     path that is free always has a trajectory; that one is returned without asking.
+
+    `keeps` says of configurations [n, dof] along a rounded corner whether they keep what the path does, a
+    clearance say; corners that do not are rounded less from the start.
 
     Times start at 0 and strictly increase; the first and last rows are the first and last waypoint exactly.
     A path of length zero becomes two equal rows at rest.
@@ -73,6 +74,12 @@ def time_parameterize(
     if len(waypoints) == 1:
         return _at_rest(path, settings)
     deviations = np.full(len(waypoints) - 2, settings.corner_deviation)
+    for shrink in SHRINKS:
+        corners = zip(deviations, _corners(waypoints, deviations), strict=True)
+        bad = [deviation > 0 and not keeps(corner) for deviation, corner in corners]
+        if not any(bad):
+            break
+        deviations = np.where(bad, shrink * deviations, deviations)
     for shrink in SHRINKS:
         trajectory = _timed(robot, path, waypoints, deviations, settings)
         if not deviations.any() or valid(trajectory):
@@ -109,6 +116,18 @@ def _at_rest(path: Path, settings: TimingSettings) -> Trajectory:
     return Trajectory(path.joint_names, np.array([0.0, settings.sample_time]), positions, still, still)
 
 
+def _corners(
+    waypoints: Float[ndarray, "n dof"], deviations: Float[ndarray, "corners"]
+) -> list[Float[ndarray, "k dof"]]:
+    """Configurations along each rounded corner; of those that are not rounded, the corner."""
+    widths = half_widths(waypoints, deviations)
+    line, u = BlendedPolyline(waypoints, widths), np.linspace(-1, 1, CORNER_PLACES)
+    return [
+        line(line.knots[i + 1] + d * u, 0) if d > 0 else waypoints[i + 1 : i + 2]
+        for i, d in enumerate(widths)
+    ]
+
+
 def _bad_corners(
     path: Path,
     waypoints: Float[ndarray, "n dof"],
@@ -116,16 +135,8 @@ def _bad_corners(
     free: Callable[[Path], bool],
 ) -> Bool[ndarray, "corners"]:
     """The corners that are not free on their own; all of them, if each is."""
-    widths = half_widths(waypoints, deviations)
-    line = BlendedPolyline(waypoints, widths)
-    u = np.linspace(-1, 1, 17)
-    bad = np.array(
-        [
-            d > 0 and not free(replace(path, positions=line(line.knots[i + 1] + d * u, 0)))
-            for i, d in enumerate(widths)
-        ],
-        dtype=bool,
-    )
+    corners = zip(deviations, _corners(waypoints, deviations), strict=True)
+    bad = np.array([d > 0 and not free(replace(path, positions=corner)) for d, corner in corners], dtype=bool)
     return bad if bad.any() else np.ones(len(bad), dtype=bool)
 
 
@@ -175,16 +186,19 @@ def _grid(line: BlendedPolyline, settings: TimingSettings) -> Float[ndarray, "m"
     return joined
 
 
-def _path_velocities(
-    robot: Robot, line: BlendedPolyline, grid: Float[ndarray, "m"], settings: TimingSettings
+def _speeds_by_toppra(
+    line: BlendedPolyline,
+    grid: Float[ndarray, "m"],
+    velocity: Float[ndarray, "dof"],
+    acceleration: Float[ndarray, "dof"],
 ) -> Float[ndarray, "m"]:
-    """ṡ at each value of s in the grid, by toppra; zero at both ends."""
+    """ṡ at each value of s in the grid; zero at both ends."""
     import toppra
 
     class Geometry(toppra.interpolator.AbstractGeometricPath):
         @property
         def dof(self) -> int:
-            return robot.dof
+            return len(velocity)
 
         @property
         def path_interval(self) -> ndarray:
@@ -193,70 +207,31 @@ def _path_velocities(
         def __call__(self, path_positions: ndarray | float, order: int = 0) -> ndarray:
             return line(np.atleast_1d(np.asarray(path_positions, dtype=np.float64)), order)
 
-    velocity = toppra.constraint.JointVelocityConstraint(settings.velocity_scale * robot.velocity)
-    acceleration = toppra.constraint.JointAccelerationConstraint(
-        settings.acceleration_scale * robot.acceleration,
-        discretization_scheme=toppra.constraint.DiscretizationType.Interpolation,
-    )
-    algorithm = toppra.algorithm.TOPPRA(
-        [velocity, acceleration], Geometry(), gridpoints=grid, solver_wrapper="seidel"
-    )
+    constraints = [
+        toppra.constraint.JointVelocityConstraint(velocity),
+        toppra.constraint.JointAccelerationConstraint(
+            acceleration, discretization_scheme=toppra.constraint.DiscretizationType.Interpolation
+        ),
+    ]
+    algorithm = toppra.algorithm.TOPPRA(constraints, Geometry(), gridpoints=grid, solver_wrapper="seidel")
     speeds = algorithm.compute_parameterization(0.0, 0.0)[1]
-    if speeds is None or np.isnan(speeds).any() or (speeds[1:-1] <= 0).any():
-        raise RuntimeError("toppra found no timing; every path has one, so this is a numerical failure")
-    return speeds
+    return np.full(len(grid), np.nan) if speeds is None else speeds
 
 
 def _piece(
     robot: Robot, line: BlendedPolyline, settings: TimingSettings
 ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
     """Times, positions, velocities and accelerations of a motion from rest to rest."""
-    grid = _grid(line, settings)
-    speeds = _path_velocities(robot, line, grid, settings)
-    speeds = speeds / _excess(robot, line, grid, speeds, settings)
-    steps = 2 * np.diff(grid) / (speeds[:-1] + speeds[1:])
-    knots = np.concatenate([[0.0], np.cumsum(steps)])
-    times = _sample_times(float(knots[-1]), settings.sample_time)
-    interval = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(steps) - 1)
-    pull = (speeds[1:] - speeds[:-1]) / steps
-    ago = times - knots[interval]
-    s = np.minimum(grid[interval] + (speeds[interval] + 0.5 * pull[interval] * ago) * ago, line.length)
-    velocities, accelerations = _motion(line, s, speeds[interval] + pull[interval] * ago, pull[interval])
-    positions = line(s, 0)
-    positions[0], positions[-1] = line.waypoints[0], line.waypoints[-1]
-    velocities[0] = velocities[-1] = 0.0
-    return times, positions, velocities, accelerations
+    grid, limits = _grid(line, settings), _limits(robot, settings)
+    if settings.solver == TOPPRA:
+        speeds = _speeds_by_toppra(line, grid, *limits)
+    else:
+        speeds = fastest(line(grid, 1), line(grid, 2), grid, *limits)
+    if not (speeds[1:-1] > 0).all():
+        raise RuntimeError("no timing was found; every path has one, so this is a numerical failure")
+    speeds = speeds / slowdown(line.arrays, grid, speeds, *limits)
+    return sampled(line.arrays, grid, speeds, settings.sample_time)
 
 
-def _motion(
-    line: BlendedPolyline, s: Float[ndarray, "n"], speed: Float[ndarray, "n"], pull: Float[ndarray, "n"]
-) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
-    """q̇ = q' ṡ and q̈ = q' s̈ + q'' ṡ²."""
-    first = line(s, 1)
-    return first * speed[:, None], first * pull[:, None] + line(s, 2) * (speed**2)[:, None]
-
-
-def _excess(
-    robot: Robot,
-    line: BlendedPolyline,
-    grid: Float[ndarray, "m"],
-    speeds: Float[ndarray, "m"],
-    settings: TimingSettings,
-) -> float:
-    """How many times slower the motion must be (at least 1) to keep the limits between grid points too."""
-    pull = np.diff(speeds**2) / (2 * np.diff(grid))
-    worst = 1.0
-    for part in np.linspace(0.0, 1.0, PARTS + 1):
-        s = grid[:-1] + part * np.diff(grid)
-        speed = np.sqrt(np.maximum(speeds[:-1] ** 2 + 2 * pull * part * np.diff(grid), 0))
-        velocities, accelerations = _motion(line, s, speed, pull)
-        v = np.abs(velocities) / (settings.velocity_scale * robot.velocity)
-        a = np.abs(accelerations) / (settings.acceleration_scale * robot.acceleration)
-        worst = max(worst, float(v.max()), float(np.sqrt(a.max())))
-    return worst
-
-
-def _sample_times(duration: float, sample_time: float) -> Float[ndarray, "n"]:
-    """Multiples of the sample time, then the duration, no nearer than a tenth of the sample time."""
-    count = max(1, int(np.ceil(duration / sample_time - 0.1)))
-    return np.concatenate([sample_time * np.arange(count), [duration]])
+def _limits(robot: Robot, settings: TimingSettings) -> tuple[ndarray, ndarray]:
+    return settings.velocity_scale * robot.velocity, settings.acceleration_scale * robot.acceleration

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from robotdiffuse.errors import InputError
 from robotdiffuse.registry import Entry, Registry
 from robotdiffuse.settings import Settings
+from robotdiffuse.types import SHORT
 
 if TYPE_CHECKING:
     from robotdiffuse.planners.base import Planner
@@ -41,11 +42,17 @@ PLANNERS = Registry(
             LEARNED,
             "the paper's method alone: encoder, sampling, guidance; no search, nothing shortened",
         ),
+        "aorrtc": _entry(
+            "aorrtc.planner:AORRTC",
+            "AORRTCSettings",
+            SEARCH,
+            "two trees below a bound that falls: the shortest paths for the time",
+        ),
         "rrt_connect": _entry(
-            "rrt_connect.planner:RRTConnect",
+            "rrt_connect:RRTConnect",
             "RRTConnectSettings",
             SEARCH,
-            "two trees grown towards each other, then shortcuts",
+            "two trees grown towards each other, then simplification; restarts while time is left",
         ),
         "shared_tree_rrt_star": _entry(
             "shared_tree.planner:SharedTreeRRTStar",
@@ -113,7 +120,7 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
 
 
 def planner_settings(name: str, assignments: Iterable[str]) -> Settings:
-    """The settings of a planner with some replaced: "reach=0.5", "guidance.margin=0.02".
+    """The settings of a planner with some replaced: "range=0.5", "guidance.margin=0.02".
 
     Raises InputError for an unknown planner, a setting that it does not have and a value that it cannot be.
     """
@@ -128,9 +135,19 @@ def _default() -> "Planner":
     return load_planner(DEFAULT_PLANNER)
 
 
-def plan(problem: "Problem", time_limit: float = 1.0, seed: int = 0) -> "PlanResult":
-    """Plan with the default planner, which is loaded once.
+def plan(
+    problem: "Problem",
+    time_limit: float = 1.0,
+    seed: int = 0,
+    until: str = SHORT,
+    clearance: float | None = None,
+    velocity_scaling: float = 1.0,
+    acceleration_scaling: float = 1.0,
+) -> "PlanResult":
+    """Plan with the default planner, which is loaded once; the arguments are those of
+    `planners.base.Planner.plan`.
 
-    `time_limit` is wall time [s]. The result holds a verified motion or a status that says why there is none.
+    The result holds a verified motion or a status that says why there is none.
     """
-    return _default().plan(problem, time_limit=time_limit, seed=seed)
+    scaling = velocity_scaling, acceleration_scaling
+    return _default().plan(problem, time_limit, seed, until, clearance, *scaling)

@@ -6,14 +6,18 @@ from dataclasses import replace
 from typing import ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motion import finer
-from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.call import Call, Request
 from robotdiffuse.planners.ends import Ends, usable_ends
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.settings import Settings
+from robotdiffuse.types import FIRST, SHORT
 
 Own = TypeVar("Own", bound=Settings)
+WARM_UP, SLIGHT = 0.5, 1e-3
+"""Limits of the calls of `warm_up`: a motion without obstacles, and the beginning of a search [s]."""
 
 
 class Planner(ABC, Generic[Own]):
@@ -25,18 +29,42 @@ class Planner(ABC, Generic[Own]):
     def __init__(self, settings: Own | None = None) -> None:
         self.settings = self.settings_class() if settings is None else settings
 
-    def plan(self, problem: Problem, time_limit: float = 1.0, seed: int = 0) -> PlanResult:
-        """Plan a motion within `time_limit` [s] of wall time, less what verifying and timing it take.
+    def plan(
+        self,
+        problem: Problem,
+        time_limit: float = 1.0,
+        seed: int = 0,
+        until: str = SHORT,
+        clearance: float | None = None,
+        velocity_scaling: float = 1.0,
+        acceleration_scaling: float = 1.0,
+    ) -> PlanResult:
+        """Plan a motion within `time_limit` [s] of wall time.
 
         The same seed gives the same path, as long as time does not run out. A result with status SOLVED holds
         a path and a trajectory that passed `verify`; any other status comes with a reason.
 
-        Raises InputError for a time limit or seed that is none, and where `prepare` does.
+        until: "first" ends with the first verified motion, "short" when more time stops paying, "limit" when
+            time runs out; planners that cannot improve a path always end with their first.
+        clearance: distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
+            and passages allow it [m]; where they do not, less, and a note says so. None: what the problem
+            says, or 1 cm. The other planners have settings for it, or keep what their motions have.
+        velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses.
+
+        Raises InputError for arguments that are none of these, and where `prepare` does.
         """
         self.prepare(problem.robot)
-        call = Call(self.name, problem, time_limit, seed)
+        request = Request(until, clearance, velocity_scaling, acceleration_scaling)
+        call = Call(self.name, problem, time_limit, seed, request)
         ends = usable_ends(call)
         return ends if isinstance(ends, PlanResult) else self.solve(call, ends)
+
+    def warm_up(self, problem: Problem) -> None:
+        """Load the compiled code that calls on such a problem need, or compile it on a new machine, which
+        takes about a minute; else the first call's time limit would have to do."""
+        clear = Problem(problem.robot, Scene(), problem.start, problem.goal)
+        for easy, seconds in ((clear, WARM_UP), (problem, SLIGHT)):
+            self.plan(easy, time_limit=seconds, until=FIRST)
 
     def prepare(self, robot: Robot) -> None:
         """What is done before the clock starts: a learned planner loads its weights for the robot, and raises

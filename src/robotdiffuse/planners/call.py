@@ -1,31 +1,73 @@
 """One call of a planner: its clock, its random numbers, and the results that it can end with."""
 
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.timing import time_parameterize
+from robotdiffuse.paths.timing import TimingSettings, time_parameterize
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
-from robotdiffuse.types import Path, Status, Trajectory
-from robotdiffuse.verify import Report, Verifier, VerifySettings, Violation, verifier
+from robotdiffuse.settings import Bound, NotNegative, OneOf, Settings
+from robotdiffuse.types import SHORT, UNTIL, Path, Status, Trajectory
+from robotdiffuse.verify import Report, Verifier, Violation, verifier
+
+CLEARANCE = 0.01
+"""What neither call nor problem says [m]."""
+
+
+AMPLE = 5.0
+"""Times that a path could be judged and timed in the time left, where the first one found is at once."""
+MOST_RESERVED = 0.5
+"""Share of the time limit that is kept back at most before a path is judged."""
+_finishing: dict[str, float] = {}
+"""What judging and timing took of late, by robot [s]: so much of a call's time is kept back for it."""
+
+
+@dataclass(frozen=True)
+class Request(Settings):
+    """What a call may ask for beyond its time limit and seed; see `planners.base.Planner.plan`."""
+
+    until: Annotated[str, OneOf(UNTIL)] = SHORT
+    clearance: NotNegative | None = None
+    velocity_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
+    acceleration_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
 
 
 class Call:
     """One call of plan(); see the head of this file."""
 
-    def __init__(self, planner: str, problem: Problem, time_limit: float, seed: int) -> None:
+    def __init__(
+        self,
+        planner: str,
+        problem: Problem,
+        time_limit: float,
+        seed: int,
+        request: Request = Request(),
+    ) -> None:
         """Starts the clock. Raises InputError for a time limit that is not positive or a negative seed."""
-        self.started = time.perf_counter()
+        self.started, self._compiled = time.perf_counter(), compile_seconds()
         if not 0 < time_limit < float("inf"):
             raise InputError(f"time_limit is {time_limit}; it must be a positive number of seconds")
         if seed < 0:
             raise InputError(f"seed is {seed}; it must be at least 0")
         self.planner, self.problem, self.time_limit, self.seed = planner, problem, time_limit, seed
+        self.until = request.until
+        wanted = (request.clearance, problem.clearance, CLEARANCE)
+        self.clearance = next(value for value in wanted if value is not None)
+        """Distance to obstacles that is to be kept where it can be [m]."""
+        self._timing = TimingSettings(
+            velocity_scale=request.velocity_scaling, acceleration_scale=request.acceleration_scaling
+        )
+        self._reserved = min(_finishing.get(problem.robot.name, 0.0), MOST_RESERVED * time_limit)
         self.rng = np.random.default_rng(seed)
+        self.judge = verifier(problem)
         self.notes = list(problem.notes)
         """What the result will say was changed or ignored; planners may add to it."""
         self._progress: list[tuple[float, float]] = []
@@ -38,13 +80,35 @@ class Call:
 
     @property
     def elapsed(self) -> float:
-        """Wall time since the call began [s]."""
-        return time.perf_counter() - self.started
+        """Wall time since the call began, less what compiling took, once on a machine [s]."""
+        return time.perf_counter() - self.started - self._compiling
+
+    @property
+    def _compiling(self) -> float:
+        return compile_seconds() - self._compiled
+
+    @property
+    def _all_notes(self) -> tuple[str, ...]:
+        """With what was not counted."""
+        if self._compiling == 0:
+            return tuple(self.notes)
+        spent = f"compiled for {self._compiling:.1f} s, once on this machine, which does not count as time"
+        return (*self.notes, spent)
+
+    @property
+    def search_until(self) -> float:
+        """When searching must end so that there is time left for `finish` [s since the call]."""
+        return self.time_limit - self._reserved
+
+    @property
+    def ample(self) -> bool:
+        """Whether judging a first path takes a small part of the time that is left."""
+        return self._reserved > 0 and self.remaining > AMPLE * self._reserved
 
     @property
     def remaining(self) -> float:
-        """Wall time left [s]; negative when it has run out."""
-        return self.time_limit - self.elapsed
+        """Wall time left for searching [s]; negative when it has run out."""
+        return self.search_until - self.elapsed
 
     def fail(self, status: Status, reason: str) -> PlanResult:
         """A result without a motion."""
@@ -55,7 +119,7 @@ class Call:
             robot=self.problem.robot.name,
             planning_time=self.elapsed,
             seed=self.seed,
-            notes=tuple(self.notes),
+            notes=self._all_notes,
             refused=self._refused,
         )
 
@@ -69,20 +133,45 @@ class Call:
         ended = f"the search ended after {self.elapsed:.2f} s without a path; another seed may find one"
         return self.fail(Status.NO_PATH, reason or ended)
 
-    def finish(self, waypoints: Float[ndarray, "n dof"], stage: str, reason: str = "") -> PlanResult | None:
+    def finish(
+        self,
+        waypoints: Float[ndarray, "n dof"],
+        stage: str,
+        reason: str = "",
+        notes: tuple[str, ...] = (),
+        keeps: Callable[[ndarray], bool] = lambda _: True,
+    ) -> PlanResult | None:
         """Judge the path through the waypoints and time it; None if it or its motion does not pass.
 
-        `stage` is the part of the planner that the waypoints come from.
+        `stage` is the part of the planner that the waypoints come from; `notes` are on this path alone;
+        `keeps` as in `time_parameterize`.
         """
+        began = self.elapsed
+        result = self._finished(waypoints, stage, reason, notes, keeps)
+        took = self.elapsed - began
+        before = _finishing.get(self.problem.robot.name, took)
+        _finishing[self.problem.robot.name] = before + 0.5 * (took - before)
+        self._reserved = max(self._reserved, took)
+        return result
+
+    def _finished(
+        self,
+        waypoints: Float[ndarray, "n dof"],
+        stage: str,
+        reason: str,
+        notes: tuple[str, ...],
+        keeps: Callable[[ndarray], bool],
+    ) -> PlanResult | None:
         problem = self.problem
         path = Path(problem.robot.joint_names, np.asarray(waypoints, dtype=np.float64))
-        judge = verifier(problem, VerifySettings())
-        report = judge.path(path)
+        report = self.judge.path(path)
         if report.violation is not None:
             return self._refuse(report.violation)
         planning_time = self.elapsed
-        motion = _TimedMotion(judge)
-        trajectory = time_parameterize(problem.robot, path, motion.valid, judge.collision_free)
+        motion = _TimedMotion(self.judge)
+        trajectory = time_parameterize(
+            problem.robot, path, motion.valid, self.judge.collision_free, self._timing, keeps
+        )
         timed = motion.report(trajectory)
         if timed.violation is not None:
             return self._refuse(timed.violation)
@@ -105,7 +194,7 @@ class Call:
             min_clearance=min(scene, itself),
             scene_clearance=scene,
             self_clearance=itself,
-            notes=tuple(self.notes),
+            notes=(*self._all_notes, *notes),
             progress=(*longer, (found[0] if found else planning_time, path.length)),
             refused=self._refused,
         )

@@ -11,144 +11,102 @@ without guidance this is the network alone: `guidance_steps` 0.
 """
 
 from dataclasses import dataclass, field
-from functools import cache
-from typing import ClassVar, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.checkpoint import BUNDLED, load_model
-from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
-from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.planners.base import Planner
+from robotdiffuse.learning.weights_at_hand import comes_with_package
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
+from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
-from robotdiffuse.settings import Settings
+from robotdiffuse.settings import Count, Natural, NotNegative, OneOf, Share
 from robotdiffuse.types import Path
-from robotdiffuse.verify import VerifySettings, verifier
+
+if TYPE_CHECKING:
+    from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
 
 SAMPLES_PER_GOAL = 4
 """So many samples are drawn at least for each goal that has a share of a batch."""
 
 
 @dataclass(frozen=True)
-class SamplingSettings(Settings):
+class SamplingSettings(LearnedSettings):
     """How batches of trajectories are drawn from a trained model."""
 
-    planner: ClassVar[str]
-    """Whose settings they are, in messages."""
-    weights: str | None = None
-    """Folder of a trained model; None: the one that comes with the package for the robot."""
-    samples: int = 16
+    samples: Count = 16
     """Trajectories per batch."""
-    sampling_steps: int | None = None
+    sampling_steps: Count | None = None
     """Calls of the denoiser per batch; None: as many as the weights name."""
-    sampler: str | None = None
+    sampler: Annotated[str, OneOf(SAMPLERS)] | None = None
     """Name in `learning.samplers.SAMPLERS`; None: the one that the weights name."""
-    eta: float = 0.0
+    eta: Share = 0.0
     """Fresh noise per denoising step: 0 is DDIM, 1 is ancestral sampling."""
-    guidance_steps: int = 8
+    guidance_steps: Natural = 8
     """Gradient steps at each guided denoising step."""
-    guided_share: float = 0.5
+    guided_share: Share = 0.5
     """Share of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
     guidance_scale: float = 1.0
     """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further.
     Other than 1 needs weights that were trained with a condition_drop above 0."""
-    points: int = 320
+    points: Count = 320
     """Points of the cloud that the encoder sees (paper: 1,400)."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
-
-    def __post_init__(self) -> None:
-        for name in ("samples", "sampling_steps", "points"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise InputError(f"{self.planner}.{name} is {value}; it must be at least 1")
-        if self.sampler is not None and self.sampler not in SAMPLERS:
-            raise unknown_name(f"{self.planner}.sampler", self.sampler, SAMPLERS)
-        if self.guidance_steps < 0:
-            raise InputError(f"{self.planner}.guidance_steps is {self.guidance_steps}; it must be at least 0")
-        if not 0 <= self.guided_share <= 1:
-            raise InputError(
-                f"{self.planner}.guided_share is {self.guided_share}; it must be between 0 and 1"
-            )
 
 
 @dataclass(frozen=True)
 class DiffusionSettings(SamplingSettings, name="diffusion"):
-    planner: ClassVar[str] = "diffusion"
-    optimize_time: float = 0.0
+    optimize_time: NotNegative = 0.0
     """Time in which further batches are drawn after the first that has a valid sample [s]; the shortest of
     all is the answer."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not self.optimize_time >= 0:
-            raise InputError(f"diffusion.optimize_time is {self.optimize_time}; it must be at least 0")
 
 
 Own = TypeVar("Own", bound=SamplingSettings)
 
 
-@cache
-def bundled_model(robot_name: str) -> MotionModel | None:
-    """The model that comes with the package for a robot of this name, or None."""
-    folder = BUNDLED / robot_name
-    return load_model(folder) if folder.is_dir() else None
-
-
-class ModelSampler(Planner[Own]):
+class ModelSampler(LearnedPlanner[Own]):
     """What planners around the diffusion model share: to load it, and to draw batches by the settings."""
 
-    def __init__(self, settings: Own | None = None) -> None:
-        """Raises InputError if the weights that the settings name cannot be read."""
-        super().__init__(settings)
-        self._model = load_model(self.settings.weights) if self.settings.weights else None
+    network_name = "model"
 
-    def model(self, robot: Robot) -> MotionModel | None:
+    def model(self, robot: Robot) -> "MotionModel | None":
         """The model for a robot; None if none comes with the package.
 
-        Raises InputError if the settings name weights of another robot.
+        Raises InputError if the settings name weights of another robot, or ones that cannot be read.
         """
-        if self._model is not None:
-            self._model.config.check_robot(robot, str(self.settings.weights))
-            return self._model
-        model = bundled_model(robot.name)
-        if model is None:
+        if self.settings.weights is None and not comes_with_package("model", robot):
             return None
-        try:
-            model.config.check_robot(robot, robot.name)
-        except InputError:
-            return None
-        return model
+        return self.network(robot)
 
     def draw(
         self,
-        model: MotionModel,
+        model: "MotionModel",
         checker: CollisionChecker,
         code: Float[ndarray, "code"],
         start: Float[ndarray, "dof"],
         goals: Float[ndarray, "k dof"],
         rng: np.random.Generator,
-        clearances: ClearanceFn | None = None,
-    ) -> Float[ndarray, "count frames dof"]:
+        clearances: "ClearanceFn | None" = None,
+    ) -> Float[ndarray, "count waypoints dof"]:
         """A batch of samples under guidance, shared out among the nearest goals; `code` as by `encode`.
 
         clearances: what the model is told of the obstacles; None: what is true.
         """
+        from robotdiffuse.learning.clearances import link_clearances
+
         settings = self.settings
         guidance = CollisionGuidance(checker, settings.guidance)
         order = np.argsort(np.linalg.norm(goals - start, axis=1))
         order = order[: max(settings.samples // SAMPLES_PER_GOAL, 1)]
         counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(order))]
-        clearances = clearances or link_clearances(checker, model.config)
+        clearances = clearances or link_clearances(checker, model.settings)
 
         def guide(q: ndarray, _level: float) -> ndarray:
             return guidance(q, settings.guidance_steps)[0]
@@ -174,10 +132,11 @@ class ModelSampler(Planner[Own]):
 
 
 def encode(
-    model: MotionModel, checker: CollisionChecker, points: int, rng: np.random.Generator
+    model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
     """z of a scene: its point cloud through the frozen encoder."""
-    return model.encode(sample_surface(checker.scene, points, rng, model.config.encoder_settings.region), rng)
+    region = model.settings.encoder_settings.region
+    return model.encode(sample_surface(checker.scene, points, rng, region), rng)
 
 
 class Diffusion(ModelSampler[DiffusionSettings]):
@@ -186,26 +145,17 @@ class Diffusion(ModelSampler[DiffusionSettings]):
     name = "diffusion"
     settings_class = DiffusionSettings
 
-    def prepare(self, robot: Robot) -> None:
-        """See `planners.base.Planner`."""
-        if self.model(robot) is None:
-            raise InputError(
-                f"no weights of diffusion come with the package for {robot.name}; train them: "
-                "robotdiffuse train planner --data FOLDER --encoder FOLDER --out FOLDER"
-            )
-
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
-        model, rng = self.model(call.problem.robot), call.rng
-        assert model is not None  # by prepare
+        model, rng = self.network(call.problem.robot), call.rng
         start, goals = ends.rows()
         code = encode(model, ends.checker, self.settings.points, rng)
-        judge, names = verifier(call.problem, VerifySettings()), call.problem.robot.joint_names
+        names = call.problem.robot.joint_names
         every, valid, until = list[Path](), list[Path](), call.time_limit
         while not every or call.elapsed < until:
             batch = self.draw(model, ends.checker, code, start, goals, rng)
             paths = [Path(names, ends.complete(q)) for q in batch]
-            passed = [path for path in paths if judge.path(path).valid]
+            passed = [path for path in paths if call.judge.path(path).valid]
             for path in passed:
                 call.improved(path.length)
             if passed and not valid:

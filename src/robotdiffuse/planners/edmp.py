@@ -8,21 +8,22 @@ Settings and the paper's values:
 
 | setting | here | there |
 |---|---|---|
-| guides | 12: frames or swept motion, 3 clearances, 2 of weight and start | 12, of the same kinds |
+| guides | 12: waypoints or swept motion, 3 clearances, 2 of weight and start | 12, of the same kinds |
 | trajectories per guide | 2 | 10, on a GPU |
 | denoising steps | 30 of the 255 levels, for a CPU | 255 |
 | gradient steps per denoising step | 1 | 1 |
 
 Differences: distances of covering spheres stand in for the volumes of boxes: the hinge of their signed
-distance at single frames for the intersection volume of links and obstacles, and the same at several places
-between frames as well for the swept volume. Obstacles are expanded by a margin that falls with the noise, as
-there. Links must keep a distance to each other too, which is not there. The numbers of the guides are ours,
-for theirs are in other units. Batches are repeated with new noise while there is time.
+distance at single waypoints for the intersection volume of links and obstacles, and the same at several
+places between waypoints as well for the swept volume. Obstacles are expanded by a margin that falls with the
+noise, as there. Links must keep a distance to each other too, which is not there. The numbers of the guides
+are ours, for theirs are in other units. Batches are repeated with new noise while there is time.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise, product
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -32,30 +33,24 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior, quadratic_levels
 from robotdiffuse.planners.guided_prior import GuidedPrior, PriorSettings, collision_gradient, limited
+from robotdiffuse.settings import Bound, Count, Filled, Natural, NotNegative, Positive, Settings, Share
 
 
 @dataclass(frozen=True)
-class GuideSettings:
+class GuideSettings(Settings, name="edmp.guides"):
     """One guide of the ensemble."""
 
-    between: int
-    """Places between two frames that the cost looks at: 0 is the intersection's cost, more that of the swept
-    motion."""
-    far_margin: float
+    between: Natural
+    """Places between two waypoints that the cost looks at: 0 is the intersection's cost, more that of the
+    swept motion."""
+    far_margin: NotNegative
     """By which obstacles are expanded at the first guided step [m]."""
-    near_margin: float
+    near_margin: NotNegative
     """The same at the last step [m]; it falls evenly from one to the other."""
-    weight: float
-    """Of the cost [rad²/m]: a frame that is too close moves by about this times 0.5 m/rad."""
-    guided_share: float
+    weight: NotNegative
+    """Of the cost [rad²/m]: a waypoint that is too close moves by about this times 0.5 m/rad."""
+    guided_share: Share
     """Share of the denoising steps that are guided, the last ones."""
-
-    def __post_init__(self) -> None:
-        for name in ("between", "far_margin", "near_margin", "weight"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"edmp.guides: {name} is {getattr(self, name)}; it must be at least 0")
-        if not 0 <= self.guided_share <= 1:
-            raise InputError(f"edmp.guides: guided_share is {self.guided_share}; it must be between 0 and 1")
 
     def margin(self, left: int, steps: int) -> float | None:
         """The margin where `left` of `steps` denoising steps are still to come [m]; None: not guided yet."""
@@ -76,29 +71,20 @@ ENSEMBLE = tuple(
 
 @dataclass(frozen=True)
 class EDMPSettings(PriorSettings, name="edmp"):
-    samples: int = 24
+    samples: Count = 24
     """Trajectories per batch, shared out evenly among the guides."""
-    sampling_steps: int = 30
+    sampling_steps: Annotated[int, Bound(least=2.0)] = 30
     """Denoising steps, closer where there is little noise."""
-    self_margin: float = 0.01
-    """Distance between links below which their cost arises [m], for all guides."""
-    push: float = 0.15
-    """Longest move of a frame in one gradient step [rad]."""
-    guides: tuple[GuideSettings, ...] = ENSEMBLE
+    push: Positive = 0.15
+    """Longest move of a waypoint in one gradient step [rad]."""
+    guides: Annotated[tuple[GuideSettings, ...], Filled()] = ENSEMBLE
 
     def __post_init__(self) -> None:
-        if not self.guides:
-            raise InputError("edmp.guides is empty; there must be at least one")
+        super().__post_init__()
         if self.samples < len(self.guides):
             raise InputError(
                 f"edmp.samples is {self.samples} and guides are {len(self.guides)}; each needs a sample"
             )
-        if self.sampling_steps < 2:
-            raise InputError(f"edmp.sampling_steps is {self.sampling_steps}; it must be at least 2")
-        if not self.self_margin >= 0:
-            raise InputError(f"edmp.self_margin is {self.self_margin}; it must be at least 0")
-        if not self.push > 0:
-            raise InputError(f"edmp.push is {self.push}; it must be positive")
 
     def shares(self) -> list[slice]:
         """The rows of a batch that each guide has."""
@@ -120,7 +106,7 @@ class EDMP(GuidedPrior[EDMPSettings]):
         goals: Float[ndarray, "count dof"],
         rng: np.random.Generator,
         stop: Callable[[], bool] = lambda: False,
-    ) -> Float[ndarray, "count frames dof"] | None:
+    ) -> Float[ndarray, "count waypoints dof"] | None:
         """See `GuidedPrior.draw`."""
         levels = quadratic_levels(prior.schedule, self.settings.sampling_steps)
 
@@ -130,8 +116,8 @@ class EDMP(GuidedPrior[EDMPSettings]):
         return prior.sample(starts, goals, levels, rng, guide, stop=stop)
 
     def guided(
-        self, checker: CollisionChecker, q: Float[ndarray, "samples frames dof"], left: int
-    ) -> Float[ndarray, "samples frames dof"]:
+        self, checker: CollisionChecker, q: Float[ndarray, "samples waypoints dof"], left: int
+    ) -> Float[ndarray, "samples waypoints dof"]:
         """The batch after a gradient step of every guide on its share; the ends of trajectories stay."""
         settings, moved = self.settings, q.copy()
         for share, guide in zip(settings.shares(), settings.guides, strict=True):

@@ -6,6 +6,8 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import explain_collision
+from robotdiffuse.collision.kernels.motions import Space
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.planners.call import Call
 from robotdiffuse.problems.problem import JointGoal, PoseGoal
 from robotdiffuse.results import PlanResult
@@ -14,6 +16,8 @@ from robotdiffuse.types import Status
 
 GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""
+END_MARGIN = 0.0005
+"""What an end that is closer than the wanted clearance keeps less than it has [m]."""
 RETREAT_STEP = 0.01
 """Step of the way out of contact of the covering spheres [rad]."""
 RETREAT_STEPS = 100
@@ -44,6 +48,21 @@ class Ends:
         start, goals = self.rows()
         leads = np.concatenate([start[None], goals])
         return min(wanted, 0.5 * float(self.checker.link_clearances(leads).min(initial=wanted)))
+
+    def space(self, resolution: float, clearance: float) -> Space:
+        """What searches between the ends check motions in, `clearance` [m] away from obstacles.
+
+        Around an end that is closer itself, it is what that end has, and more with the distance from it
+        (`collision.kernels.motions.padding_near`).
+        """
+        start, goals = self.rows()
+        ends = np.concatenate([start[None], goals])
+        if clearance <= 0:
+            return search_space(self.checker, resolution)
+        has = self.checker.link_clearances(ends).min(axis=1, initial=1.0)
+        close = has < clearance + END_MARGIN
+        near = np.column_stack([ends[close], np.maximum(has[close] - END_MARGIN, 0.0)])
+        return search_space(self.checker, resolution, clearance, near)
 
     def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
         """The path with its exact ends in float64 in place of, or before and after, those of the search."""

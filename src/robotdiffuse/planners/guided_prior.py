@@ -3,7 +3,7 @@
 from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -12,14 +12,12 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free, path_length
 from robotdiffuse.collision.motion import search_space
-from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior
-from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
+from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.results import PlanResult
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.settings import Settings
+from robotdiffuse.settings import Bound, Count, NotNegative, Positive
 
 RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of a sample [m]."""
@@ -31,34 +29,35 @@ class Attempt(NamedTuple):
     """A sample that collides."""
 
     segments: int
-    """How many of the motions from frame to frame are not free."""
+    """How many of the motions from waypoint to waypoint are not free."""
     length: float
     """[rad]"""
-    path: Float[ndarray, "frames dof"]
+    path: Float[ndarray, "waypoints dof"]
 
 
 @dataclass(frozen=True)
-class PriorSettings(Settings):
-    weights: str | None = None
-    """Folder of a trained trajectory_prior; None: the one that comes with the package for the robot."""
-    samples: int = 16
+class PriorSettings(LearnedSettings):
+    samples: Count = 16
     """Trajectories per batch."""
+    sampling_steps: Annotated[int, Bound(least=2.0)] = 25
+    """Denoising steps."""
+    self_margin: NotNegative = 0.01
+    """Distance between links below which their cost arises [m]."""
+    push: Positive = 0.1
+    """Longest move of a waypoint in one gradient step [rad]."""
 
 
 Own = TypeVar("Own", bound=PriorSettings)
 
 
-class GuidedPrior(Planner[Own]):
+class GuidedPrior(LearnedPlanner[Own]):
     """A planner that samples batches from the prior under guidance.
 
     The free samples of a batch go to the judge, the shortest first; where none passes, the next batch is
     drawn from new noise, until time runs out. There is no search, and no sample is shortened or repaired.
     """
 
-    def __init__(self, settings: Own | None = None) -> None:
-        """Raises InputError if the folder that the settings name holds no weights."""
-        super().__init__(settings)
-        check_weights("trajectory_prior", self.settings.weights)
+    network_name = "trajectory_prior"
 
     @abstractmethod
     def draw(
@@ -69,22 +68,12 @@ class GuidedPrior(Planner[Own]):
         goals: Float[ndarray, "count dof"],
         rng: np.random.Generator,
         stop: Callable[[], bool] = lambda: False,
-    ) -> Float[ndarray, "count frames dof"] | None:
+    ) -> Float[ndarray, "count waypoints dof"] | None:
         """A batch of guided samples, float32; None if `stop` says so before they are done."""
-
-    def prior(self, robot: Robot) -> TrajectoryPrior:
-        """The trained network. Raises InputError if there is none for the robot."""
-        prior = load_baseline("trajectory_prior", self.settings.weights, robot)
-        assert isinstance(prior, TrajectoryPrior)
-        return prior.for_inference()
-
-    def prepare(self, robot: Robot) -> None:
-        """See `planners.base.Planner`."""
-        self.prior(robot)
 
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
-        prior, samples = self.prior(call.problem.robot), self.settings.samples
+        prior, samples = self.network(call.problem.robot), self.settings.samples
         start, goals = shared_out(*ends.rows(), samples)
         space = search_space(ends.checker, RESOLUTION)
         closest: Attempt | None = None
@@ -115,7 +104,7 @@ class GuidedPrior(Planner[Own]):
         )
 
 
-def _attempt(space: Space, path: Float[ndarray, "frames dof"]) -> Attempt:
+def _attempt(space: Space, path: Float[ndarray, "waypoints dof"]) -> Attempt:
     return Attempt(int((~motions_free(space, path)).sum()), float(path_length(path)), path)
 
 
@@ -129,19 +118,19 @@ def shared_out(
 
 def collision_gradient(
     checker: CollisionChecker,
-    q: Float[ndarray, "count frames dof"],
+    q: Float[ndarray, "count waypoints dof"],
     margin: float,
     self_margin: float,
     between: int,
-) -> tuple[Float[ndarray, "count"], Float[ndarray, "count frames dof"]]:
-    """Collision cost of trajectories [m] and its gradient by their frames [m/rad], of the ends too.
+) -> tuple[Float[ndarray, "count"], Float[ndarray, "count waypoints dof"]]:
+    """Collision cost of trajectories [m] and its gradient by their waypoints [m/rad], of the ends too.
 
     The cost of a configuration is the root of the sum of h² over the covering spheres and pairs of links,
     with the hinges h of their signed distances (see `learning.guidance`): how far the arm is within margins.
-    That of a trajectory is its sum over the frames and over `between` places in each step from frame to
-    frame, the places of a step counting together as one more frame.
+    That of a trajectory is its sum over the waypoints and over `between` places in each step from waypoint to
+    waypoint, the places of a step counting together as one more waypoint.
     """
-    count, frames, dof = q.shape
+    count, waypoints, dof = q.shape
     shares = np.arange(1, between + 1, dtype=np.float32) / (between + 1)
     step = np.diff(q, axis=1)[:, :, None]
     inner = q[:, :-1, None] + shares[:, None] * step
@@ -149,18 +138,23 @@ def collision_gradient(
     squares, gradients = checker.cost_gradients(every, margin, self_margin)
     depth = np.sqrt(2 * squares)
     gradients = gradients / np.maximum(depth, np.float32(1e-6))[:, None]
-    at_frames = count * frames
-    costs, by_frame = depth[:at_frames].reshape(q.shape[:2]).sum(1), gradients[:at_frames].reshape(q.shape)
+    at_waypoints = count * waypoints
+    costs, by_frame = (
+        depth[:at_waypoints].reshape(q.shape[:2]).sum(1),
+        gradients[:at_waypoints].reshape(q.shape),
+    )
     if between:
         weight = np.float32(1 / between)
-        costs = costs + weight * depth[at_frames:].reshape(count, -1).sum(1)
-        by_place = weight * gradients[at_frames:].reshape(inner.shape)
+        costs = costs + weight * depth[at_waypoints:].reshape(count, -1).sum(1)
+        by_place = weight * gradients[at_waypoints:].reshape(inner.shape)
         by_frame[:, :-1] += ((1 - shares)[:, None] * by_place).sum(2)
         by_frame[:, 1:] += (shares[:, None] * by_place).sum(2)
     return costs, by_frame
 
 
-def limited(moves: Float[ndarray, "count frames dof"], most: float) -> Float[ndarray, "count frames dof"]:
-    """Moves of frames, none longer than `most` [rad, joint-space L2]."""
+def limited(
+    moves: Float[ndarray, "count waypoints dof"], most: float
+) -> Float[ndarray, "count waypoints dof"]:
+    """Moves of waypoints, none longer than `most` [rad, joint-space L2]."""
     lengths = np.linalg.norm(moves, axis=2, keepdims=True)
     return moves * np.minimum(1.0, most / np.maximum(lengths, 1e-9)).astype(moves.dtype)

@@ -17,7 +17,7 @@ Settings and the paper's or its code's values:
 | share of them that is guided, the last | 0.25 | 0.25 |
 | gradient steps per denoising step | 5 | 5 |
 | factor of the noise of a step | 0.5 | 0.5 |
-| places checked per frame by the collision cost | 2 | 1.5 |
+| places checked per waypoint by the collision cost | 2 | 1.5 |
 | weights of the costs | below | for other units and distances |
 
 Other differences: signed distances of covering spheres by our compiled kernel in place of their grid; the
@@ -35,52 +35,33 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
 from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior, exponential_levels
 from robotdiffuse.planners.guided_prior import GuidedPrior, PriorSettings, collision_gradient, limited
+from robotdiffuse.settings import Count, Natural, NotNegative, Share
 
 
 @dataclass(frozen=True)
 class MPDSettings(PriorSettings, name="mpd"):
-    sampling_steps: int = 25
-    """Denoising steps, at levels as far apart as those of MPD's exponential schedule."""
-    quiet_steps: int = 5
-    """Steps without noise after them."""
-    guided_share: float = 0.25
-    """Share of the denoising steps that are guided, the last ones; the quiet steps always are."""
-    guide_steps: int = 5
-    """Gradient steps at each guided denoising step."""
-    noise_scale: float = 0.5
-    """Factor of the standard deviation that a denoising step adds."""
-    margin: float = 0.04
-    """Distance to obstacles below which the collision cost arises [m]."""
-    self_margin: float = 0.01
-    """The same between links [m]."""
-    limit_margin: float = 0.02
-    """The same of joint values to their limits [rad]."""
-    collision_weight: float = 0.1
-    """Of the collision cost [rad²/m]: a frame that is too close moves by about this times 0.5 m/rad."""
-    prior_weight: float = 2.0
-    """Of the Gaussian process' cost, with frames one unit of time apart and a power spectrum of 1 rad²."""
-    between: int = 1
-    """Places between two frames that the collision cost looks at."""
-    push: float = 0.1
-    """Longest move of a frame in one gradient step [rad]."""
+    """Denoising steps are at levels as far apart as those of MPD's exponential schedule."""
 
-    def __post_init__(self) -> None:
-        for name in ("samples", "guide_steps"):
-            if getattr(self, name) < 1:
-                raise InputError(f"mpd.{name} is {getattr(self, name)}; it must be at least 1")
-        if self.sampling_steps < 2:
-            raise InputError(f"mpd.sampling_steps is {self.sampling_steps}; it must be at least 2")
-        if not 0 <= self.guided_share <= 1:
-            raise InputError(f"mpd.guided_share is {self.guided_share}; it must be between 0 and 1")
-        for name in ("quiet_steps", "noise_scale", "margin", "self_margin", "limit_margin",
-                     "collision_weight", "prior_weight", "between"):  # fmt: skip
-            if not getattr(self, name) >= 0:
-                raise InputError(f"mpd.{name} is {getattr(self, name)}; it must be at least 0")
-        if not self.push > 0:
-            raise InputError(f"mpd.push is {self.push}; it must be positive")
+    quiet_steps: Natural = 5
+    """Steps without noise after the others."""
+    guided_share: Share = 0.25
+    """Share of the denoising steps that are guided, the last ones; the quiet steps always are."""
+    guide_steps: Count = 5
+    """Gradient steps at each guided denoising step."""
+    noise_scale: NotNegative = 0.5
+    """Factor of the standard deviation that a denoising step adds."""
+    margin: NotNegative = 0.04
+    """Distance to obstacles below which the collision cost arises [m]."""
+    limit_margin: NotNegative = 0.02
+    """The same of joint values to their limits [rad]."""
+    collision_weight: NotNegative = 0.1
+    """Of the collision cost [rad²/m]: a waypoint that is too close moves by about this times 0.5 m/rad."""
+    prior_weight: NotNegative = 2.0
+    """Of the Gaussian process' cost, with waypoints one unit of time apart and a power spectrum of 1 rad²."""
+    between: Natural = 1
+    """Places between two waypoints that the collision cost looks at."""
 
 
 class MPD(GuidedPrior[MPDSettings]):
@@ -97,7 +78,7 @@ class MPD(GuidedPrior[MPDSettings]):
         goals: Float[ndarray, "count dof"],
         rng: np.random.Generator,
         stop: Callable[[], bool] = lambda: False,
-    ) -> Float[ndarray, "count frames dof"] | None:
+    ) -> Float[ndarray, "count waypoints dof"] | None:
         """See `GuidedPrior.draw`."""
         settings = self.settings
         guided = ceil(settings.guided_share * settings.sampling_steps)
@@ -111,8 +92,8 @@ class MPD(GuidedPrior[MPDSettings]):
         )
 
     def guided(
-        self, checker: CollisionChecker, q: Float[ndarray, "count frames dof"]
-    ) -> Float[ndarray, "count frames dof"]:
+        self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]
+    ) -> Float[ndarray, "count waypoints dof"]:
         """Trajectories after the gradient steps of one denoising step; their ends stay."""
         settings, robot = self.settings, checker.robot
         gaussian = gaussian_process(q.shape[1])
@@ -132,31 +113,32 @@ class MPD(GuidedPrior[MPDSettings]):
 class GaussianProcess:
     """The prior of constant velocity over trajectories (M. Mukadam et al., IJRR 2018, section 3).
 
-    Its states (position, velocity) follow white noise on acceleration: between frames one unit of time apart,
+    Its states (position, velocity) follow white noise on acceleration: between waypoints one unit of time
+    apart,
 
         state' = F state + noise,  F = [[1, 1], [0, 1]],  covariance Q = [[1/3, 1/2], [1/2, 1]],
 
     for every joint alike, so the precision of all states is block tri-diagonal. Samples of the prior have no
     velocities; integrated out, they leave the precision of the positions, which is that Schur complement.
-    The cost q P q / 2 is the least integral of squared accelerations through the frames over 2, so that of
+    The cost q P q / 2 is the least integral of squared accelerations through the waypoints over 2, so that of
     natural cubic splines; straight lines cost nothing.
     """
 
-    precision: Float[ndarray, "frames frames"]
+    precision: Float[ndarray, "waypoints waypoints"]
     """P, of the positions of one joint."""
 
-    def costs(self, q: Float[ndarray, "count frames dof"]) -> Float[ndarray, "count"]:
+    def costs(self, q: Float[ndarray, "count waypoints dof"]) -> Float[ndarray, "count"]:
         """The sum over the joints of q P q / 2 [rad²]."""
         return 0.5 * (q * self.gradient(q)).sum((1, 2))
 
-    def gradient(self, q: Float[ndarray, "count frames dof"]) -> Float[ndarray, "count frames dof"]:
+    def gradient(self, q: Float[ndarray, "count waypoints dof"]) -> Float[ndarray, "count waypoints dof"]:
         """P q."""
         return self.precision.astype(q.dtype) @ q
 
     def step(
-        self, q: Float[ndarray, "count frames dof"], weight: float
-    ) -> Float[ndarray, "count frames dof"]:
-        """One implicit gradient step down weight q P q / 2 on all frames but the ends.
+        self, q: Float[ndarray, "count waypoints dof"], weight: float
+    ) -> Float[ndarray, "count waypoints dof"]:
+        """One implicit gradient step down weight q P q / 2 on all waypoints but the ends.
 
         It solves x = q - weight P x, the minimum of |x - q|² / 2 + weight x P x / 2 its ends held.
         """
@@ -166,21 +148,21 @@ class GaussianProcess:
         return moved
 
 
-def state_precision(frames: int) -> Float[ndarray, "states states"]:
-    """Of the states of one joint, (position, velocity) of each frame in turn: block tri-diagonal."""
+def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
+    """Of the states of one joint, (position, velocity) of each waypoint in turn: block tri-diagonal."""
     transition = np.array([[1.0, 1.0], [0.0, 1.0]])
     inverse = np.linalg.inv(np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]))
-    precision = np.zeros((2 * frames, 2 * frames))
+    precision = np.zeros((2 * waypoints, 2 * waypoints))
     error = np.hstack([-transition, np.eye(2)])
-    for i in range(frames - 1):
+    for i in range(waypoints - 1):
         precision[2 * i : 2 * i + 4, 2 * i : 2 * i + 4] += error.T @ inverse @ error
     return precision
 
 
 @cache
-def gaussian_process(frames: int) -> GaussianProcess:
-    """The prior over so many frames."""
-    every = state_precision(frames)
+def gaussian_process(waypoints: int) -> GaussianProcess:
+    """The prior over so many waypoints."""
+    every = state_precision(waypoints)
     position, velocity = slice(0, None, 2), slice(1, None, 2)
     mixed = every[position, velocity]
     return GaussianProcess(
@@ -189,8 +171,10 @@ def gaussian_process(frames: int) -> GaussianProcess:
 
 
 @cache
-def _implicit(frames: int, weight: float) -> tuple[Float[ndarray, "inner inner"], Float[ndarray, "inner 2"]]:
-    """What `GaussianProcess.step` multiplies inner frames and ends with."""
-    precision = gaussian_process(frames).precision
-    inverse = np.linalg.inv(np.eye(frames - 2) + weight * precision[1:-1, 1:-1])
+def _implicit(
+    waypoints: int, weight: float
+) -> tuple[Float[ndarray, "inner inner"], Float[ndarray, "inner 2"]]:
+    """What `GaussianProcess.step` multiplies inner waypoints and ends with."""
+    precision = gaussian_process(waypoints).precision
+    inverse = np.linalg.inv(np.eye(waypoints - 2) + weight * precision[1:-1, 1:-1])
     return inverse, -weight * inverse @ precision[1:-1][:, [0, -1]]

@@ -26,68 +26,38 @@ from torch import Tensor
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motion import search_space
-from robotdiffuse.errors import InputError
-from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, RollOuts
-from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
+from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.results import PlanResult
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
-from robotdiffuse.settings import Settings
+from robotdiffuse.settings import Count, NotNegative, Positive
 
 STILL = 1e-4
 """The policy stands still where no joint moves further in a step [rad]; it would for ever."""
 
 
 @dataclass(frozen=True)
-class MPiNetsSettings(Settings, name="mpinets"):
-    weights: str | None = None
-    """Folder of a trained network; None: the one that comes with the package for the robot."""
-    steps: int = 150
+class MPiNetsSettings(LearnedSettings, name="mpinets"):
+    steps: Count = 150
     """Most steps of a roll-out (the paper's)."""
-    near: float = 0.3
+    near: NotNegative = 0.3
     """Largest distance of a joint at which a straight edge to the goal is tried [rad]."""
-    batch: int = 8
+    batch: Count = 8
     """Roll-outs at once, after the first, which is alone."""
-    noise: float = 0.015
+    noise: NotNegative = 0.015
     """Standard deviation of the noise on where the policy sees the arm, as in training [rad]; none in the
     first roll-out."""
-    resolution: float = 0.02
+    resolution: Positive = 0.02
     """No point of the arm moves further than this between two checks [m]."""
 
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch"):
-            if getattr(self, name) < 1:
-                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("near", "noise"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must not be negative")
-        if not self.resolution > 0:
-            raise InputError(f"mpinets.resolution is {self.resolution}; it must be positive")
 
-
-class MPiNets(Planner[MPiNetsSettings]):
+class MPiNets(LearnedPlanner[MPiNetsSettings]):
     """The policy's roll-outs as a planner; see the head of this file."""
 
-    name = "mpinets"
+    name = network_name = "mpinets"
     settings_class = MPiNetsSettings
-
-    def __init__(self, settings: MPiNetsSettings | None = None) -> None:
-        """Raises InputError if the folder that the settings name holds no weights."""
-        super().__init__(settings)
-        check_weights("mpinets", self.settings.weights)
-
-    def network(self, robot: Robot) -> MPiNetsNetwork:
-        """The policy for a robot. Raises InputError, naming the command that trains it, if there is none."""
-        network = load_baseline("mpinets", self.settings.weights, robot)
-        assert isinstance(network, MPiNetsNetwork)
-        return network
-
-    def prepare(self, robot: Robot) -> None:
-        """See `planners.base.Planner`."""
-        self.network(robot)
 
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
@@ -146,8 +116,8 @@ class MPiNets(Planner[MPiNetsSettings]):
             noise = settings.noise * rng.standard_normal(goal.shape, dtype=np.float32)
             roll_outs.advance(None if first else noise)
             for i in np.flatnonzero(roll_outs.running).tolist():
-                motions[i].go(space, roll_outs.frames[-1][i])
-            roll_outs.stop(np.abs(roll_outs.frames[-1] - roll_outs.frames[-2]).max(1) < STILL)
+                motions[i].go(space, roll_outs.waypoints[-1][i])
+            roll_outs.stop(np.abs(roll_outs.waypoints[-1] - roll_outs.waypoints[-2]).max(1) < STILL)
         return motions
 
 
@@ -155,7 +125,7 @@ class _Motion:
     """What a roll-out has made so far."""
 
     def __init__(self, start: Float32[ndarray, "dof"], goal: Float32[ndarray, "dof"]) -> None:
-        self.frames, self.goal = [start], goal
+        self.waypoints, self.goal = [start], goal
         self.collided = self.arrived = False
 
     @property
@@ -164,20 +134,22 @@ class _Motion:
         return self.arrived and not self.collided
 
     def go(self, space: Space, q: Float32[ndarray, "dof"]) -> None:
-        self.collided |= not motions_free(space, np.stack([self.frames[-1], q]))[0]
-        self.frames.append(q)
+        self.collided |= not motions_free(space, np.stack([self.waypoints[-1], q]))[0]
+        self.waypoints.append(q)
 
     def try_to_arrive(self, space: Space) -> None:
         """Go straight to the goal if that is free."""
-        if motions_free(space, np.stack([self.frames[-1], self.goal]))[0]:
-            self.frames.append(self.goal)
+        if motions_free(space, np.stack([self.waypoints[-1], self.goal]))[0]:
+            self.waypoints.append(self.goal)
             self.arrived = True
 
     def path(self, ends: Ends) -> Float[ndarray, "n dof"]:
         """Its waypoints, with the exact ends of the problem as far as it has reached them."""
         if self.arrived:
-            return ends.complete(np.stack(self.frames))
-        return np.concatenate([ends.start[None], np.stack(self.frames[1:] or self.frames).astype(np.float64)])
+            return ends.complete(np.stack(self.waypoints))
+        return np.concatenate(
+            [ends.start[None], np.stack(self.waypoints[1:] or self.waypoints).astype(np.float64)]
+        )
 
 
 def scene_clouds(

@@ -32,18 +32,15 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motion import finer, search_space
-from robotdiffuse.errors import InputError
-from robotdiffuse.learning.networks.checkpoint import check_weights, load_baseline
 from robotdiffuse.learning.networks.mpnet import MPNetNetwork
-from robotdiffuse.paths.shortcut import shortcut
-from robotdiffuse.planners.base import Planner
+from robotdiffuse.paths.simplify import shortcut
+from robotdiffuse.planners.aorrtc import kernel
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
-from robotdiffuse.planners.rrt_connect import kernel
+from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.results import PlanResult
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
-from robotdiffuse.settings import Settings
+from robotdiffuse.settings import Count, Natural, NotNegative, Positive
 
 SEARCH_ITERATIONS = 500
 """Iterations of RRT-Connect between two looks at the clock, in hybrid replanning."""
@@ -51,57 +48,29 @@ SEARCH_CAPACITY = 20_000
 
 
 @dataclass(frozen=True)
-class MPNetPlannerSettings(Settings, name="mpnet"):
-    weights: str | None = None
-    """Folder of trained networks; None: those that come with the package for the robot."""
-    attempts: int = 16
+class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
+    attempts: Count = 16
     """Paths that are planned at once (paper: 1)."""
-    steps: int = 24
+    steps: Count = 24
     """Most steps of bidirectional neural planning between two states; a step is 0.7 rad."""
-    replanning: int = 10
+    replanning: Natural = 10
     """N_r, how often what collides is planned anew before the attempts are given up."""
     hybrid: bool = False
     """Whether RRT-Connect joins what the network has left broken."""
-    hybrid_reach: float = 1.0
+    hybrid_range: Positive = 1.0
     """Longest extension of a tree of RRT-Connect [rad, joint-space L2]."""
-    resolution: float = 0.03
+    resolution: Positive = 0.03
     """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
     covers the rest, and after a path that it refuses it is half of that."""
-    clearance: float = 0.002
+    clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
 
-    def __post_init__(self) -> None:
-        for name in ("attempts", "steps"):
-            if getattr(self, name) < 1:
-                raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("resolution", "hybrid_reach"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must be positive")
-        for name in ("replanning", "clearance"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must not be negative")
 
-
-class MPNet(Planner[MPNetPlannerSettings]):
+class MPNet(LearnedPlanner[MPNetPlannerSettings]):
     """Motion Planning Networks as a planner."""
 
-    name = "mpnet"
+    name = network_name = "mpnet"
     settings_class = MPNetPlannerSettings
-
-    def __init__(self, settings: MPNetPlannerSettings | None = None) -> None:
-        """Raises InputError if the folder that the settings name holds no weights."""
-        super().__init__(settings)
-        check_weights("mpnet", self.settings.weights)
-
-    def network(self, robot: Robot) -> MPNetNetwork:
-        """The networks for a robot. Raises InputError, naming the command that trains them, without them."""
-        network = load_baseline("mpnet", self.settings.weights, robot)
-        assert isinstance(network, MPNetNetwork)
-        return network
-
-    def prepare(self, robot: Robot) -> None:
-        """See `planners.base.Planner`."""
-        self.network(robot)
 
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
@@ -242,8 +211,8 @@ class NeuralPlanning:
         """A free path from a to b by RRT-Connect; the straight line if time runs out."""
         trees = kernel.make_trees(a, b[None], SEARCH_CAPACITY)
         while self.call.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
-            reach = np.float32(self.settings.hybrid_reach)
-            path = kernel.search(self.space, trees, reach, SEARCH_ITERATIONS, self.state)
+            longest = np.float32(self.settings.hybrid_range)
+            path = kernel.connect(self.space, trees, longest, SEARCH_ITERATIONS, self.state)
             if len(path):
                 return path
         return np.stack([a, b])

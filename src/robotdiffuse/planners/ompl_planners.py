@@ -39,7 +39,6 @@ from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import NotNegative, Positive, Settings
 from robotdiffuse.types import Path
-from robotdiffuse.verify import VerifySettings, verifier
 
 try:
     from ompl import base as ob
@@ -121,7 +120,7 @@ class OmplPlanner(Planner[OmplSettings]):
             path = Path(problem.robot.joint_names, ends.complete(search.path()))
             searched = search.cost
             if path.length < shortest:
-                if verifier(problem, VerifySettings()).path(path).valid:
+                if call.judge.path(path).valid:
                     best, shortest = path.positions, path.length
                     call.improved(shortest)
                     if searched <= enough:

@@ -10,7 +10,7 @@ import yaml
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.problems.moveit import MoveItRequest, moveit_frames, moveit_request, moveit_scene
-from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem, check_clearance
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.files import check_fields, read_scene, read_text, read_yaml, scene_entries
@@ -19,6 +19,7 @@ from robotdiffuse.scenes.shapes import numbers, shown, unit_quaternion, vector
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
 FIELDS = ("robot", "scene", "start", "goal")
+OPTIONAL = ("locked", "clearance")
 GOALS = ("joints", "joint_set", "pose")
 
 
@@ -107,13 +108,16 @@ def problem_record(
     else:
         wxyz = quaternion_from_rotation(goal.T_base_frame[:3, :3]).tolist()
         asked = {"pose": {"frame": goal.frame, "xyz": goal.T_base_frame[:3, 3].tolist(), "wxyz": wxyz}}
-    return {
+    record: dict[str, object] = {
         "robot": robot,
         "locked": problem.robot.locked,
         "scene": scene_entries(problem.scene, folder),
         "start": problem.start.tolist(),
         "goal": asked,
     }
+    if problem.clearance is not None:
+        record["clearance"] = problem.clearance
+    return record
 
 
 def problem_from_record(record: object) -> Problem:
@@ -197,7 +201,7 @@ def _moveit_problem(scene_file: Path, robot: Robot | None) -> Problem:
         raise InputError(f"{prefix}{error}") from None
 
 
-def _requested(robot: Robot, scene: Scene, request: MoveItRequest) -> Problem:
+def _requested(robot: Robot, scene: Scene, request: MoveItRequest, clearance: float | None = None) -> Problem:
     held = {j.name for j in robot.joints if j.kind in MOVING_KINDS} - {*robot.joint_names}
     locked = {name: value for name, value in request.start.items() if name in held}
     robot = robot.with_locked(locked)
@@ -210,9 +214,9 @@ def _requested(robot: Robot, scene: Scene, request: MoveItRequest) -> Problem:
 
     start = values("start_state", request.start)
     if request.pose_goal is not None:
-        return Problem(robot, scene, start, PoseGoal(*request.pose_goal))
+        return Problem(robot, scene, start, PoseGoal(*request.pose_goal), clearance=clearance)
     goals = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
-    return Problem(robot, scene, start, JointGoal(goals))
+    return Problem(robot, scene, start, JointGoal(goals), clearance=clearance)
 
 
 def _json(where: str, text: str) -> object:
@@ -227,9 +231,10 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
     try:
         requested = isinstance(data, dict) and "request" in data
         values = check_fields(
-            "problem", data, ("robot", "scene", "request") if requested else FIELDS, ("locked",)
+            "problem", data, ("robot", "scene", "request") if requested else FIELDS, OPTIONAL
         )
         robot = _robot(values["robot"], values.get("locked", {}), folder)
+        clearance = check_clearance("clearance", values["clearance"]) if "clearance" in values else None
         frames, notes = moveit_frames({}, robot), ()
         if isinstance(values["scene"], str):
             file = folder / values["scene"]
@@ -240,8 +245,8 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
             scene, notes = read_scene(values["scene"], folder)
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames)
-            return _requested(robot, scene, request)
-        return Problem(robot, scene, values["start"], _goal(values["goal"]), notes)
+            return _requested(robot, scene, request, clearance)
+        return Problem(robot, scene, values["start"], _goal(values["goal"]), notes, clearance)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

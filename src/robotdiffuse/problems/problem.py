@@ -91,8 +91,13 @@ class Problem:
     goal: JointGoal | PoseGoal
     notes: tuple[str, ...] = ()
     """What was changed in the input, e.g. a start clamped to a limit."""
+    clearance: float | None = None
+    """Distance to obstacles that is to be kept where start, goal and passages allow it [m]; None: what the
+    call of the planner says."""
 
     def __post_init__(self) -> None:
+        if self.clearance is not None:
+            check_clearance("clearance", self.clearance)
         if not isinstance(self.robot, Robot):
             raise InputError(f"robot is {shown(self.robot)}; it must be a Robot, e.g. rd.load_robot('panda')")
         if not isinstance(self.scene, Scene):
@@ -126,10 +131,19 @@ class Problem:
             start: ArrayLike,
             goal: ArrayLike | JointGoal | PoseGoal,
             notes: tuple[str, ...] = (),
+            clearance: float | None = None,
         ) -> None: ...
 
     load: ClassVar[Callable[..., "Problem"]]
     """`problems.files.load_problem`, put here by the package: files know problems, not the reverse."""
+
+
+def check_clearance(field: str, value: object) -> float:
+    """The value as a distance [m]; InputError unless it is a finite number from 0 on."""
+    clearance = numbers(value)
+    if clearance is None or clearance.ndim != 0 or not 0 <= clearance < np.inf:
+        raise InputError(f"{field} is {shown(value)}; it must be a distance of at least 0 m")
+    return float(clearance)
 
 
 def _configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:

@@ -35,8 +35,6 @@ class LinkReport:
     stick_out: float
     """How far a sphere reaches out of the arm, at most [m]: of the meshes of the link and, where it meets its
     neighbours, of theirs, at any value of the joints between them."""
-    stick_out_of_link: float
-    """The same for the meshes of this link alone, so with what is hidden in its neighbours [m]."""
     covered: bool
     """Whether the spheres provably cover the surface of the meshes."""
 
@@ -106,7 +104,7 @@ def add_robot(
         fit = fit_spheres(meshes, tolerance, np.random.default_rng(seed), hidden, settings)
         fitted[link] = np.round(fit, 6)  # as the file holds them: these are judged
         own, arm = float(stick_out(meshes, fitted[link]).max()), stick_out_of_arm(robot, link, fitted[link])
-        links.append(LinkReport(link, len(fit), min(own, arm), own, covered(meshes, fitted[link])))
+        links.append(LinkReport(link, len(fit), min(own, arm), covered(meshes, fitted[link])))
     report("pairs of links", steps - 1, steps)
     robot = replace(robot, spheres=fitted)
     pairs = find_allowed_collisions(robot, sampling or SamplingSettings(), np.random.default_rng(seed))

@@ -45,8 +45,6 @@ class PairReport:
     """adjacent, always, never or default (allowed), or checked."""
     colliding: float
     """Share of the configurations in which the meshes collide."""
-    false_positives: float
-    """Share in which the meshes are free and the spheres collide."""
 
 
 def find_allowed_collisions(
@@ -64,34 +62,29 @@ def find_allowed_collisions(
     that never collided are driven together by random descent from their closest samples; those that can be
     made to collide are checked.
     """
-    sampler = _Sampler(robot)
-    default = np.clip(np.zeros((1, len(sampler.joints))), sampler.lower, sampler.upper)
-    q = sampler.random(settings.samples, rng)
-    poses = sampler.poses(q)
-    default_poses = sampler.poses(default)
+    links = _Links(robot)
+    default = np.clip(np.zeros((1, len(links.joints))), links.lower, links.upper)
+    q = links.random(settings.samples, rng)
+    poses = links.poses(q)
+    default_poses = links.poses(default)
     adjacent = _adjacent(robot)
     reports = []
     for a, b in _moving_pairs(robot):
-        near = sampler.sphere_distance(poses, a, b)
-        touching = near <= 0
+        near = links.sphere_distance(poses, a, b)
         colliding = np.zeros(len(q), dtype=bool)
-        for i in np.flatnonzero(touching):
-            colliding[i] = sampler.collide(poses, a, b, int(i))
+        for i in np.flatnonzero(near <= 0):
+            colliding[i] = links.collide(poses, a, b, int(i))
         if frozenset((a, b)) in adjacent:
             reason = ADJACENT
         elif colliding.mean() >= settings.always:
             reason = ALWAYS
-        elif _default_counts(robot, a, b) and sampler.collide(default_poses, a, b, 0):
+        elif _default_counts(robot, a, b) and links.collide(default_poses, a, b, 0):
             reason = DEFAULT
-        elif not colliding.any() and not _descend(
-            sampler, a, b, q[np.argsort(near)[: settings.descents]], rng
-        ):
+        elif not colliding.any() and not _descend(links, a, b, q[np.argsort(near)[: settings.descents]], rng):
             reason = NEVER
         else:
             reason = CHECKED
-        reports.append(
-            PairReport((a, b), reason, float(colliding.mean()), float((touching & ~colliding).mean()))
-        )
+        reports.append(PairReport((a, b), reason, float(colliding.mean())))
     return tuple(reports)
 
 
@@ -101,16 +94,16 @@ def allowed_pairs(reports: tuple[PairReport, ...]) -> frozenset[frozenset[str]]:
 
 
 def _descend(
-    sampler: "_Sampler", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator
+    links: "_Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator
 ) -> bool:
     """Whether random descent on the distance between the meshes finds a collision of the links."""
     for start in starts:
-        q, step = start, 0.1 * (sampler.upper - sampler.lower)
-        least = sampler.mesh_distance(sampler.poses(q[None]), a, b)
+        q, step = start, 0.1 * (links.upper - links.lower)
+        least = links.mesh_distance(links.poses(q[None]), a, b)
         for _ in range(15):
-            around = np.clip(q + step * rng.normal(size=(8, len(q))), sampler.lower, sampler.upper)
-            poses = sampler.poses(around)
-            distances = [sampler.mesh_distance(poses, a, b, i) for i in range(len(around))]
+            around = np.clip(q + step * rng.normal(size=(8, len(q))), links.lower, links.upper)
+            poses = links.poses(around)
+            distances = [links.mesh_distance(poses, a, b, i) for i in range(len(around))]
             i = int(np.argmin(distances))
             if distances[i] <= 0:
                 return True
@@ -155,7 +148,7 @@ def _adjacent(robot: Robot) -> set[frozenset[str]]:
     return pairs
 
 
-class _Sampler:
+class _Links:
     """Poses of all links for many values of all movable joints, and tests of pairs of links."""
 
     def __init__(self, robot: Robot) -> None:

@@ -1,25 +1,34 @@
 """Joint values in units of the joint limits."""
 
+from typing import TypeVar
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from torch import Tensor
 
 from robotdiffuse.errors import InputError
 
+Joints = TypeVar("Joints", ndarray, Tensor)
+"""[*batch, dof], of either kind; the result is of the same kind, type and device."""
+
 
 class JointNormalizer:
-    """Maps lower limits to -1 and upper limits to 1, joint by joint."""
+    """Maps lower limits to -1 and upper limits to 1, joint by joint; arrays are computed with in float64."""
 
     def __init__(self, lower: Float[ndarray, "dof"], upper: Float[ndarray, "dof"]) -> None:
         """Limits [rad], [m] for prismatic joints. Raises InputError for an empty or infinite range."""
         for i, (low, high) in enumerate(zip(lower, upper, strict=True)):
             if not (np.isfinite(low) and np.isfinite(high) and low < high):
                 raise InputError(f"limits of joint {i} are {low} and {high}; they must be finite and rising")
-        self.middle = ((upper + lower) / 2).astype(np.float32)
-        self.half_range = ((upper - lower) / 2).astype(np.float32)
+        self.middle, self.half_range = (upper + lower) / 2, (upper - lower) / 2
 
-    def to_unit(self, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch dof"]:
-        return (q - self.middle) / self.half_range
+    def to_unit(self, q: Joints) -> Joints:
+        if isinstance(q, Tensor):
+            return (q - q.new_tensor(self.middle)) / q.new_tensor(self.half_range)
+        return ((q - self.middle) / self.half_range).astype(q.dtype)
 
-    def from_unit(self, x: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch dof"]:
-        return x * self.half_range + self.middle
+    def from_unit(self, x: Joints) -> Joints:
+        if isinstance(x, Tensor):
+            return x * x.new_tensor(self.half_range) + x.new_tensor(self.middle)
+        return (x * self.half_range + self.middle).astype(x.dtype)

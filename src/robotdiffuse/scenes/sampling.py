@@ -12,23 +12,25 @@ from numpy.random import Generator
 from robotdiffuse.errors import InputError
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, Triangulated
+from robotdiffuse.settings import Positive, Settings
 
 ROUNDS = 6
 """How often `sample_surface` draws before it repeats points that it has."""
 
 
 @dataclass(frozen=True)
-class VisibleRegion:
+class VisibleRegion(Settings, name="region"):
     """Where points on obstacles count: within reach of the arm and above the plane that it stands on."""
 
     floor: float = 0.02
     """Points must be higher than this [m]: the mounting plane is part of every scene and tells nothing."""
     center: tuple[float, float, float] = (0.0, 0.0, 0.3)
     """In the base frame [m]: on the base axis, about at a Panda's shoulder."""
-    reach: float = 1.2
+    reach: Positive = 1.2
     """Points must be within this distance of the centre [m]; a Panda's flange reaches 0.86."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.floor >= self.center[2] + self.reach:
             raise InputError(
                 f"floor is {self.floor}; it must be below the top of the reach, {self.center[2] + self.reach}"
@@ -93,7 +95,7 @@ def _point_cloud(shape: PointCloud, n: int, rng: Generator) -> ndarray:
     return shape.points[rng.integers(len(shape.points), size=n)]
 
 
-SAMPLERS: dict[type[Shape], Callable[..., ndarray]] = {
+DRAWS: dict[type[Shape], Callable[..., ndarray]] = {
     Sphere: _sphere,
     Box: _box,
     Cylinder: _cylinder,
@@ -121,8 +123,8 @@ def sample_surface(
     missing, draw = count, 2 * count
     for _ in range(ROUNDS):
         parts = rng.multinomial(draw, shares)
-        samplers = [SAMPLERS.get(type(shape), _triangles) for shape in shapes]
-        drawn = [f(s, int(n), rng) for f, s, n in zip(samplers, shapes, parts, strict=True) if n > 0]
+        draws = [DRAWS.get(type(shape), _triangles) for shape in shapes]
+        drawn = [f(s, int(n), rng) for f, s, n in zip(draws, shapes, parts, strict=True) if n > 0]
         points = np.concatenate(drawn)
         points = points[region.holds(points)]
         # The points come shape by shape; any first few of them would be of the first shape alone.

@@ -271,9 +271,9 @@ def _hidden(
         enter, leave = torch.zeros_like(t), torch.ones_like(t)
         for a, w in zip(at, way, strict=True):
             inverse = w.reciprocal()
-            middle, reach = a * inverse, inverse.abs_()
-            enter = torch.maximum(enter, -middle - reach)
-            leave = torch.minimum(leave, reach - middle)
+            middle, width = a * inverse, inverse.abs_()
+            enter = torch.maximum(enter, -middle - width)
+            leave = torch.minimum(leave, width - middle)
         behind = ((near < 1 - SLACK) & other.sphere) | ((enter < leave - SLACK) & ~other.sphere)
         hidden |= behind & (shape != j) & (other.half[..., 0] > 0)
     return hidden

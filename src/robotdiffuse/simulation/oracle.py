@@ -123,9 +123,9 @@ class PyBulletOracle:
         self, best: OracleContact | None, within: float, link: str, other: str, body: int, index: int
     ) -> OracleContact | None:
         world = self._world
-        reach = within if best is None else best.distance
+        nearest = within if best is None else best.distance
         points = pybullet.getClosestPoints(
-            world.body, body, max(reach, 0.0), world.links[link], index, physicsClientId=world.client
+            world.body, body, max(nearest, 0.0), world.links[link], index, physicsClientId=world.client
         )
         distance = min(map(world.gap, points), default=np.inf)
-        return OracleContact(link, other, float(distance)) if distance <= reach else best
+        return OracleContact(link, other, float(distance)) if distance <= nearest else best

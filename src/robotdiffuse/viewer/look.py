@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.results import PlanResult
-from robotdiffuse.robots.kinematics import ForwardKinematics
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual import load_visual
 from robotdiffuse.scenes.scene import Scene

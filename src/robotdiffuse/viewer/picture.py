@@ -35,7 +35,6 @@ GROUND_RADIUS = 3.2
 PAPER = (0xF2, 0xF4, 0xF6)
 FREE = (0.05, 0.11)
 """Shares of the height that stay free above the arm, and below it for the caption."""
-ROBOT_ALBEDO = 0.86
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,40 @@
-"""What compiled code shares: the decorator of functions that allocate nothing, and random numbers."""
+"""What compiled code shares: the decorator of functions that allocate nothing, random numbers, and the time
+that compiling took."""
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numba import njit
+from numba.core import event
 from numpy import ndarray
+
+
+class _CompileTimer(event.Listener):
+    """Adds up the outermost compilations; one thread compiles at a time, the others wait for it."""
+
+    def __init__(self) -> None:
+        self.seconds, self._depth, self._began = 0.0, 0, 0.0
+
+    def on_start(self, event: event.Event) -> None:
+        if self._depth == 0:
+            self._began = time.perf_counter()
+        self._depth += 1
+
+    def on_end(self, event: event.Event) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.perf_counter() - self._began
+
+
+_timer = _CompileTimer()
+event.register("numba:compile", _timer)
+
+
+def compile_seconds() -> float:
+    """Time that this process has spent on compiling so far [s]; code that is loaded from disk counts none."""
+    return _timer.seconds
 
 
 def allocation_free(fastmath: bool = False, inline: str = "never") -> Callable[[Callable], Any]:

@@ -208,29 +208,36 @@ def _write(least, radius, best):
 
 
 @allocation_free()
+def group_clearance(robot, scene, g, limit, work, best):
+    """Signed distances of a group to the scene, at most `limit`, in 16 lanes: best[1, 16].
+
+    The frames and centres of `work` must be those of the configurations (`place_frames`).
+    """
+    solids = count_obstacles(scene) - 1
+    obstacles = solids + (len(scene.points) > 0)
+    radius = robot.bounds[g, 3]
+    _to_scene(work.centres, g, scene, radius, work.near, True, work.bounds)
+    for i in range(W):
+        best[0, i] = limit
+    if _mark_near(solids, obstacles, radius, limit, work.near, work.bounds, work.least) > 0:
+        for s in range(robot.first[g], robot.first[g + 1]):
+            place(work.frames, robot.frame[g], robot.spheres, s, work.position, 0)
+            # what the spheres before have found limits what is looked for
+            for i in range(W):
+                work.least[0, i] = best[0, i] + robot.spheres[s, 3]
+            _to_scene(work.position, 0, scene, robot.spheres[s, 3], work.near, False, work.least)
+            _write(work.least, robot.spheres[s, 3], best)
+
+
+@allocation_free()
 def block_clearances(robot, scene, first, q, limit, work, best, out):
     """Signed distances to the scene, at most `limit`, of the groups from `first` on: out[groups, 16].
 
-    q: [dof, 16].
-
-    `best` is scratch, [1, 16].
+    q: [dof, 16]. `best` is scratch, [1, 16].
     """
     place_frames(robot, q, work.frames, work.centres)
-    solids = count_obstacles(scene) - 1
-    obstacles = solids + (len(scene.points) > 0)
     for g in range(first, len(robot.frame)):
-        radius = robot.bounds[g, 3]
-        _to_scene(work.centres, g, scene, radius, work.near, True, work.bounds)
-        for i in range(W):
-            best[0, i] = limit
-        if _mark_near(solids, obstacles, radius, limit, work.near, work.bounds, work.least) > 0:
-            for s in range(robot.first[g], robot.first[g + 1]):
-                place(work.frames, robot.frame[g], robot.spheres, s, work.position, 0)
-                # what the spheres before have found limits what is looked for
-                for i in range(W):
-                    work.least[0, i] = best[0, i] + robot.spheres[s, 3]
-                _to_scene(work.position, 0, scene, robot.spheres[s, 3], work.near, False, work.least)
-                _write(work.least, robot.spheres[s, 3], best)
+        group_clearance(robot, scene, g, limit, work, best)
         for i in range(W):
             out[g - first, i] = best[0, i]
 
@@ -244,25 +251,35 @@ def _place_group(robot, g, work):
 
 
 @allocation_free()
+def pair_clearance(robot, p, limit, work, best):
+    """Distances between the links of a checked pair, at most `limit`, in 16 lanes: best[1, 16].
+
+    The frames and centres of `work` must be those of the configurations, `placed` says which groups'
+    positions.
+    """
+    a, b = robot.pairs[p, 0], robot.pairs[p, 1]
+    centres, positions = work.centres, work.positions
+    spheres, bounds, first = robot.spheres, robot.bounds, robot.first
+    for i in range(W):
+        best[0, i] = limit
+    if _nearer(centres, a, centres, b, bounds[a, 3] + bounds[b, 3], best) > 0:
+        _place_group(robot, a, work)
+        _place_group(robot, b, work)
+        for s in range(first[a], first[a + 1]):
+            radius = spheres[s, 3]
+            if _nearer(positions, s, centres, b, radius + bounds[b, 3], best) > 0:
+                _keep_least(positions, s, positions, first[b], first[b + 1], spheres, radius, best)
+
+
+@allocation_free()
 def block_pair_clearances(robot, q, limit, work, out):
     """Distances between the links of the checked pairs, at most `limit`, of q[dof, 16]: out[pairs, 16]."""
     place_frames(robot, q, work.frames, work.centres)
     work.placed[:] = False
-    centres, positions, best = work.centres, work.positions, work.least
-    spheres, bounds, first = robot.spheres, robot.bounds, robot.first
     for p in range(len(robot.pairs)):
-        a, b = robot.pairs[p, 0], robot.pairs[p, 1]
+        pair_clearance(robot, p, limit, work, work.least)
         for i in range(W):
-            best[0, i] = limit
-        if _nearer(centres, a, centres, b, bounds[a, 3] + bounds[b, 3], best) > 0:
-            _place_group(robot, a, work)
-            _place_group(robot, b, work)
-            for s in range(first[a], first[a + 1]):
-                radius = spheres[s, 3]
-                if _nearer(positions, s, centres, b, radius + bounds[b, 3], best) > 0:
-                    _keep_least(positions, s, positions, first[b], first[b + 1], spheres, radius, best)
-        for i in range(W):
-            out[p, i] = best[0, i]
+            out[p, i] = work.least[0, i]
 
 
 @njit(cache=True)

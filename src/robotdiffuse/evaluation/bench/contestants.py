@@ -1,10 +1,12 @@
 """Who takes part in a bench: a planner, maybe with weights or settings of its own."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path as FilePath
+from typing import Any
 
 from robotdiffuse.planners import PLANNERS, load_planner, planner_settings
 from robotdiffuse.planners.base import Planner
+from robotdiffuse.planners.call import Request
 from robotdiffuse.settings import Settings
 
 
@@ -17,7 +19,7 @@ class Contestant:
     weights: str | None = None
     """A folder; None: those that come with the package."""
     settings: tuple[str, ...] = ()
-    """NAME=VALUE, other than the defaults."""
+    """NAME=VALUE, other than the defaults: of the planner, and of what its calls ask for (`Request`)."""
 
     @classmethod
     def of(cls, text: str) -> "Contestant":
@@ -29,6 +31,7 @@ class Contestant:
         name, at, folder = whole.partition("@")
         PLANNERS.entry(name)
         found = cls(name, str(FilePath(folder).resolve()) if at else None, tuple(settings))
+        found.request()
         if settings:
             found._settings()
         return found
@@ -46,6 +49,10 @@ class Contestant:
         name = self.name if self.weights is None else f"{self.name}@{FilePath(self.weights).name}"
         return ":".join([name, *self.settings])
 
+    def request(self) -> dict[str, Any]:
+        """What its calls ask for: until, clearance, ..."""
+        return vars(Request().changed(text for text in self.settings if _of_call(text)))
+
     def load(self) -> Planner:
         """Raises InputError as `load_planner`."""
         if not self.settings:
@@ -54,4 +61,9 @@ class Contestant:
 
     def _settings(self) -> Settings:
         weights = () if self.weights is None else (f"weights={self.weights}",)
-        return planner_settings(self.name, (*weights, *self.settings))
+        own = (text for text in self.settings if not _of_call(text))
+        return planner_settings(self.name, (*weights, *own))
+
+
+def _of_call(text: str) -> bool:
+    return text.partition("=")[0] in {field.name for field in fields(Request)}

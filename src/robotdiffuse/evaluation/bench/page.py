@@ -22,7 +22,7 @@ from robotdiffuse.evaluation.bench.figures import (
     counting,
     outcome,
 )
-from robotdiffuse.evaluation.look import STYLE
+from robotdiffuse.evaluation.look import card
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.tables import html as html_table
@@ -109,7 +109,6 @@ def write_plots(bench: Bench, parts: Sequence[Section], folder: FilePath) -> lis
 
 
 def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
-    name = html.escape(bench.folder.resolve().name)
     planners = list(bench.records)
     apart = [section for section in parts if section.name == section.problem_set]
     families = plots.families([section.main for section in apart], planners)
@@ -117,7 +116,7 @@ def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
     text = f"Share of problems solved within {limits}, with 95 % intervals; in brackets, how many calls"
     frame = ""
     if replays:
-        frame = _card(
+        frame = card(
             "Motions",
             12,
             "The problems with the longest ways round, by several planners; and problems that planners "
@@ -127,39 +126,29 @@ def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
         )
     # in JSON a '<' stands only in strings, and escaped it cannot end the script element
     mains = json.dumps({s.name: f"{s.main.limit:g}" for s in parts}).replace("<", "\\u003c")
-    pieces = (
-        '<!doctype html>\n<html lang="en">\n<head><meta charset="utf-8">',
-        f"<title>{name}</title>",
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        f"<style>{STYLE}{OWN_STYLE}</style></head>\n<body><main>",
-        f"<h1>{name}</h1>",
-        f'<div class="about">{"<br>".join(html.escape(line) for line in report.about(bench))}</div>',
-        f'<div class="tiles">{_tiles(bench)}</div>',
+    content = (
         _picks(parts),
         *(_section(bench, section, planners) for section in parts),
         '<h3>All problems</h3><div class="cards">',
-        _card("Success by family", 12, text, f'<div class="wide">{families}</div>'),
+        card("Success by family", 12, text, f'<div class="wide">{families}</div>'),
         _crashes(bench),
         frame,
         "</div>",
         "<details><summary>How to read the tables</summary><ul>",
         *(f"<li>{html.escape(note)}</li>" for note in report.NOTES),
         "</ul></details>",
-        f"</main><script>const mains = {mains};{SCRIPT}</script></body></html>\n",
     )
-    return "\n".join(pieces)
+    script = f"<script>const mains = {mains};{SCRIPT}</script>"
+    name = bench.folder.resolve().name
+    return look.page(name, report.about(bench), _facts(bench), "\n".join(content), OWN_STYLE, script)
 
 
-def _card(title: str, width: int, text: str, content: str) -> str:
-    return f'<section class="card w{width}"><h2>{title}</h2><p>{text}</p>{content}</section>'
-
-
-def _tiles(bench: Bench) -> str:
+def _facts(bench: Bench) -> list[tuple[str, str]]:
     records = [record for of in bench.records.values() for record in of]
     problems = {(record.problem_set, record.name) for record in records}
     limits = sorted({record.time_limit for record in records})
     hours = sum(record.time for record in records) / 3600
-    tiles = [
+    return [
         (f"{len(bench.records)}", "planners"),
         (f"{len(problems):,}", f"problems in {len(bench.problem_sets)} sets"),
         (f"{len(records):,}", "calls"),
@@ -167,10 +156,6 @@ def _tiles(bench: Bench) -> str:
         (f"{hours:.1f} h" if hours >= 1 else f"{60 * hours:.1f} min", "of planning"),
         (f"{sum(record.solved for record in records):,}", "verified motions"),
     ]
-    return "".join(
-        f'<div class="tile"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'
-        for value, what in tiles
-    )
 
 
 def _picks(parts: Sequence[Section]) -> str:
@@ -199,12 +184,12 @@ def _section(bench: Bench, section: Section, planners: list[str]) -> str:
     curves = ""
     if section.curves:
         ran = section.curves[0].calls
-        curves = _card(
+        curves = card(
             "Success over time",
             6,
             f"{name}: share of {ran} calls. Learned planners solid, sampling dashed, search dotted",
             f'<div class="wide">{plots.success_over_time(section, planners)}</div>',
-        ) + _card(
+        ) + card(
             "Length over time",
             6,
             f"{name}: median length over the best known, of non-trivial problems. Points: one path a call",
@@ -223,22 +208,20 @@ def _comparison(bench: Bench, section: Section, comparison: Comparison) -> str:
     text, planners = html.escape(report.missing_line(comparison)), list(bench.records)
 
     colors = {report.named(name): plots.color_of(name, planners) for name in planners}
-    cards = [
-        _card(html.escape(main.title), 12, text, html_table(main, colors, report.named(bench.reference)))
-    ]
+    cards = [card(html.escape(main.title), 12, text, html_table(main, colors, report.named(bench.reference)))]
     for table in others:
         heading, _, rest = table.title.partition("; ")
         wide = len(table.columns) >= 8 and not heading.startswith("Failures")
         if heading.startswith("Failures"):
             plot = plots.failures(section, comparison, planners)
-            cards.append(_card("Failures", 6, html.escape(rest), f'<div class="wide">{plot}</div>'))
+            cards.append(card("Failures", 6, html.escape(rest), f'<div class="wide">{plot}</div>'))
         cards.append(
-            _card(html.escape(heading), 12 if wide else 6, html.escape(rest), html_table(table, colors))
+            card(html.escape(heading), 12 if wide else 6, html.escape(rest), html_table(table, colors))
         )
         if heading.startswith("Quality"):
             plot = plots.metrics(section, comparison, planners)
             text = "Means of the solved problems with their 95 % intervals; nothing, where nothing was solved"
-            cards.append(_card("Quality", 12, text, f'<div class="wide">{plot}</div>'))
+            cards.append(card("Quality", 12, text, f'<div class="wide">{plot}</div>'))
     return "".join(cards)
 
 
@@ -247,7 +230,7 @@ def _crashes(bench: Bench) -> str:
     if not lines:
         return ""
     rows = "".join(f"<tr><td>{html.escape(line)}</td></tr>" for line in lines[:20])
-    return _card("Crashes and exceptions", 12, "", f'<table class="wrong"><tbody>{rows}</tbody></table>')
+    return card("Crashes and exceptions", 12, "", f'<table class="wrong"><tbody>{rows}</tbody></table>')
 
 
 @dataclass(frozen=True, eq=False)

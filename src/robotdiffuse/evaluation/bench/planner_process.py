@@ -9,12 +9,8 @@ import json
 import os
 import queue
 import resource
-import select
-import signal
-import subprocess
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Iterator
 from pathlib import Path as FilePath
@@ -27,6 +23,7 @@ from robotdiffuse.evaluation.trial import Fields, Trial
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.processes import Companion
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -51,10 +48,7 @@ class PlannerProcess:
 
     def __init__(self, contestant: Contestant, log: FilePath) -> None:
         """`log`: what the process prints is added to this file."""
-        self._contestant, self._log = contestant, log
-        self._process: subprocess.Popen[bytes] | None = None
-        self._unread = b""
-        self._closed = False
+        self._far = Companion([*FAR_SIDE, contestant.text], log)
 
     def warm(self, trial: Trial) -> None:
         """Be ready for a trial's robot. A process that dies of it will say so when it is to plan."""
@@ -63,93 +57,46 @@ class PlannerProcess:
     def plan(self, trial: Trial, restarts: bool = False) -> list[Fields]:
         """The answers to a trial, as fields of records; a death or an overrun is an answer too."""
         asked = {"seed": trial.seed, "time_limit": trial.limit, "restarts": restarts}
-        process = self._tell({"problem": problem_record(trial.problem), **asked})
-        if not isinstance(process, subprocess.Popen):
-            return [process]
+        failure = self._tell({"problem": problem_record(trial.problem), **asked})
+        if failure is not None:
+            return [failure]
         answers: list[Fields] = []
         patience = trial.limit + PATIENCE
-        while (line := self._answer(process, patience)) is not None:
+        while (line := self._far.answer(patience)) is not None:
             answer = json.loads(line)
             if answer == END:
                 return answers
             answers.append(answer)
             patience = PATIENCE_WITH_RESTARTS * trial.limit + PATIENCE
-        return [*answers, self._ended(process, patience)]
+        return [*answers, self._ended(patience)]
 
     def close(self) -> None:
         """End the process, whatever another thread waits for."""
-        self._closed = True
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
+        self._far.close()
 
-    def _tell(self, task: Fields) -> "subprocess.Popen[bytes] | Fields":
-        """The process, when it is warm and begins with the task, or what became of it."""
-        process = self._process
-        if process is None or process.poll() is not None:
-            process = self._process = self._start()
-            if self._closed:  # by another thread, which did not see this process
-                process.kill()
-            if self._answer(process, START_SECONDS) is None:
-                return self._ended(process, START_SECONDS)
-        assert process.stdin is not None
-        try:
-            process.stdin.write(json.dumps(task).encode() + b"\n")
-            process.stdin.flush()
-        except BrokenPipeError:
-            return self._ended(process, 0.0)
+    def _tell(self, task: Fields) -> Fields | None:
+        """None when the process is warm and begins with the task, else what became of it."""
+        if not self._far.runs:
+            self._far.start()
+            if self._far.answer(START_SECONDS) is None:
+                return self._ended(START_SECONDS)
+        if not self._far.tell(json.dumps(task)):
+            return self._ended(0.0)
         # a robot that is new to the process is warmed up first
-        return (
-            process
-            if self._answer(process, START_SECONDS) is not None
-            else self._ended(process, START_SECONDS)
-        )
+        return None if self._far.answer(START_SECONDS) is not None else self._ended(START_SECONDS)
 
-    def _start(self) -> "subprocess.Popen[bytes]":
-        self._unread = b""
-        environment = os.environ | {"OMP_NUM_THREADS": "1"}
-        self._log.parent.mkdir(parents=True, exist_ok=True)
-        with self._log.open("ab") as log:
-            return subprocess.Popen(
-                [*FAR_SIDE, self._contestant.text],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                env=environment,
-                start_new_session=True,  # Ctrl-C is for the near side to act on
-            )
-
-    def _answer(self, process: "subprocess.Popen[bytes]", patience: float) -> bytes | None:
-        """The next line; None if the process ends or does not answer in this time [s]."""
-        assert process.stdout is not None
-        until = time.monotonic() + patience
-        while b"\n" not in self._unread:
-            ready, _, _ = select.select([process.stdout], [], [], max(until - time.monotonic(), 0.0))
-            part = os.read(process.stdout.fileno(), 1 << 20) if ready else b""
-            if not part:
-                return None
-            self._unread += part
-        line, _, self._unread = self._unread.partition(b"\n")  # more than one line may be there
-        return line
-
-    def _ended(self, process: "subprocess.Popen[bytes]", patience: float) -> Fields:
+    def _ended(self, patience: float) -> Fields:
         """What became of a process that gave no answer."""
-        try:
-            code = process.wait(timeout=1.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        how = self._far.ended()
+        if how is None:
             reason = f"no answer {patience:g} s after the call; the process was killed"
             return {"status": OVERRAN, "reason": reason, "time": patience}
-        how = f"by {signal.Signals(-code).name}" if code < 0 else f"with exit status {code}"
-        lines = self._log.read_text(errors="replace").strip().splitlines()
-        said = f": {lines[-1][:300]}" if lines else ""
-        return {"status": CRASHED, "reason": f"the planner's process ended {how}{said}", "time": 0.0}
+        return {"status": CRASHED, "reason": f"the planner's process ended {how}", "time": 0.0}
 
 
-def serve(planner: Planner, tasks: TextIO, answers: TextIO) -> None:
-    """Answer tasks, one a line: an empty line when the robot is warmed up, then, unless that was all, the
-    fields of each record, and END.
+def serve(planner: Planner, request: Fields, tasks: TextIO, answers: TextIO) -> None:
+    """Answer tasks, one a line, by calls that ask for `request` too: an empty line when the robot is warmed
+    up, then, unless that was all, the fields of each record, and END.
 
     An empty line comes at the start too, when the planner is ready.
     """
@@ -170,7 +117,7 @@ def serve(planner: Planner, tasks: TextIO, answers: TextIO) -> None:
             _warm_up(planner, problem)
         answer("")
         if "seed" in task:
-            for fields in _calls(planner, problem, task):
+            for fields in _calls(planner, problem, task, request):
                 answer(json.dumps(fields))
             answer(json.dumps(END))
 
@@ -198,9 +145,10 @@ def _warm_up(planner: Planner, problem: Problem) -> None:
             traceback.print_exc()
 
 
-def _calls(planner: Planner, problem: Problem, task: Fields) -> Iterator[Fields]:
+def _calls(planner: Planner, problem: Problem, task: Fields, request: Fields) -> Iterator[Fields]:
     """With what the process and the machine had to bear meanwhile."""
-    for fields in planner_calls(planner, problem, task["seed"], task["time_limit"], task["restarts"]):
+    about = task["seed"], task["time_limit"], task["restarts"]
+    for fields in planner_calls(planner, problem, *about, request):
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
         yield fields | {"memory": round(memory, 1), "load": round(os.getloadavg()[0], 2)}
 
@@ -212,7 +160,8 @@ def main() -> None:
     import torch
 
     torch.set_num_threads(1)
-    serve(Contestant.of(sys.argv[1]).load(), sys.stdin, answers)
+    contestant = Contestant.of(sys.argv[1])
+    serve(contestant.load(), contestant.request(), sys.stdin, answers)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robotdiffuse.evaluation.bench.figures import FAILURES, Comparison, Section, base_name, plain_name
-from robotdiffuse.evaluation.look import FAINT, INK, LINE, SOFT, as_svg, make_figure
+from robotdiffuse.evaluation.look import FAINT, INK, LINE, SOFT, as_svg, make_figure, percent_axis
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.statistics import wilson_interval
 
@@ -45,6 +45,8 @@ INSIDE = (0.085, 0.07, 0.655, 0.9)
 """Of a figure, where the plot is when names stand beside it."""
 LABEL = 7.2
 """Size of the names in plots [pt]."""
+GAP = 0.0535
+"""Between names beside a plot [share of its height]."""
 
 
 def color_of(planner: str, planners: Sequence[str]) -> str:
@@ -77,7 +79,7 @@ def success_over_time(section: Section, planners: Sequence[str]) -> str:
         ends[curve.planner] = curve.end, float(shares[-1])
     _time_axis(axes, low, high)
     axes.set_ylim(-1.5, 101.5)
-    _percent(axes)
+    percent_axis(axes)
     _names_at_right(axes, ends, planners)
     return _svg(figure, f"success {section.name}")
 
@@ -124,15 +126,10 @@ def length_over_time(section: Section, planners: Sequence[str]) -> str:
 
 def families(comparisons: Sequence[Comparison], planners: Sequence[str]) -> str:
     """Success of every planner on every family of problems, with 95 % intervals."""
-    shown = [(family, of) for c in comparisons for family, of in c.families.items()]
-    across = min(4, len(shown))
-    down = -(-len(shown) // across)
-    height = 0.165 * len(planners) + 0.42
-    figure = make_figure(12, height * down + 0.1)
-    panels = figure.subplots(down, across, squeeze=False, sharey=True).reshape(-1)
-    for panel in panels[len(shown) :]:
-        panel.set_axis_off()
-    for i, (panel, (family, of)) in enumerate(zip(panels, shown, strict=False)):
+    shown = {family: of for c in comparisons for family, of in c.families.items()}
+    titles = [f"{family}  ({max(n for _, n in of.values())})" for family, of in shown.items()]
+    figure, panels = _panels(titles, planners, 0.42)
+    for panel, of in zip(panels, shown.values(), strict=True):
         for y, planner in enumerate(planners):
             if planner not in of:
                 panel.text(1, y, "not run", va="center", fontsize=6.5, color="#a8b0ba")
@@ -142,15 +139,8 @@ def families(comparisons: Sequence[Comparison], planners: Sequence[str]) -> str:
             color = color_of(planner, planners)
             panel.barh(y, 100 * solved / n, 0.66, color=color, alpha=0.88, linewidth=0)
             panel.plot([100 * low, 100 * high], [y, y], color=INK, linewidth=0.9, solid_capstyle="butt")
-        panel.set_title(f"{family}  ({max(n for _, n in of.values())})", loc="left")
         panel.set_xlim(0, 101)
         panel.set_xticks([0, 50, 100], ["0", "50", "100 %"])
-        panel.grid(axis="x", color=FAINT, linewidth=0.8)
-        panel.spines[["left", "bottom"]].set_visible(False)
-        panel.tick_params(axis="x", length=0)
-        panel.set_ylim(len(planners) - 0.4, -0.6)
-        panel.set_yticks(range(len(planners)), planners)
-        panel.tick_params(axis="y", labelcolor=INK, labelsize=LABEL, labelleft=i % across == 0)
     return _svg(figure, "families")
 
 
@@ -171,11 +161,7 @@ def failures(section: Section, comparison: Comparison, planners: Sequence[str]) 
     for y, total in enumerate(left):
         axes.text(total + 0.012 * most, y, f"{total:.1f}", va="center", fontsize=6.8, color=SOFT)
     axes.set_xlim(0, 1.09 * most)
-    axes.set_ylim(len(shown) - 0.4, -0.6)
-    axes.grid(axis="x", color=FAINT, linewidth=0.8)
-    axes.spines[["left", "bottom"]].set_visible(False)
-    axes.tick_params(axis="x", length=0)
-    axes.tick_params(axis="y", labelcolor=INK, labelsize=LABEL)
+    _planner_axis(axes, shown)
     axes.set_xlabel("calls that failed [%]")
     if axes.get_legend_handles_labels()[0]:
         figure.legend(loc="outside upper left", ncols=5, columnspacing=1.1, handletextpad=0.4)
@@ -186,27 +172,44 @@ def metrics(section: Section, comparison: Comparison, planners: Sequence[str]) -
     """A panel for each metric of motions: the means of all planners, with their 95 % intervals."""
     rows = {row.planner: row for row in comparison.rows}
     shown = [name for name in planners if name in rows]
-    across = 4
-    down = -(-len(comparison.metrics) // across)
-    figure = make_figure(12, (0.165 * len(shown) + 0.5) * down + 0.1)
-    panels = figure.subplots(down, across, squeeze=False, sharey=True).reshape(-1)
-    for panel in panels[len(comparison.metrics) :]:
-        panel.set_axis_off()
-    for i, (panel, metric) in enumerate(zip(panels, comparison.metrics, strict=False)):
+    titles = [
+        f"{metric.heading}{f' [{metric.unit}]' if metric.unit else ''}"
+        + (f", {metric.better} is better" if metric.better else "")
+        for metric in comparison.metrics
+    ]
+    figure, panels = _panels(titles, shown, 0.5)
+    for panel, metric in zip(panels, comparison.metrics, strict=True):
         for y, planner in enumerate(shown):
             value, half = (metric.scale * x for x in rows[planner].measures[metric.name])
             color = color_of(planner, planners)
             panel.plot([value - half, value + half], [y, y], color=color, linewidth=1.1)
             panel.plot(value, y, "o", color=color, markersize=3.2)
-        better = f", {metric.better} is better" if metric.better else ""
-        panel.set_title(f"{metric.heading}{f' [{metric.unit}]' if metric.unit else ''}{better}", loc="left")
-        panel.grid(axis="x", color=FAINT, linewidth=0.8)
-        panel.spines[["left", "bottom"]].set_visible(False)
-        panel.tick_params(axis="x", length=0)
-        panel.set_ylim(len(shown) - 0.4, -0.6)
-        panel.set_yticks(range(len(shown)), shown)
-        panel.tick_params(axis="y", labelcolor=INK, labelsize=LABEL, labelleft=i % across == 0)
     return _svg(figure, f"metrics {section.name} {comparison.limit:g}")
+
+
+def _panels(titles: Sequence[str], planners: Sequence[str], room: float) -> "tuple[Figure, list[Axes]]":
+    """Panels in rows of four, each with a line for each planner. room: for title and ticks [inch]."""
+    across = min(4, len(titles))
+    down = -(-len(titles) // across)
+    figure = make_figure(12, (0.165 * len(planners) + room) * down + 0.1)
+    panels = figure.subplots(down, across, squeeze=False, sharey=True).reshape(-1).tolist()
+    for panel in panels[len(titles) :]:
+        panel.set_axis_off()
+    for i, (panel, title) in enumerate(zip(panels, titles, strict=False)):
+        panel.set_title(title, loc="left")
+        _planner_axis(panel, planners)
+        panel.tick_params(axis="y", labelleft=i % across == 0)
+    return figure, panels[: len(titles)]
+
+
+def _planner_axis(axes: "Axes", planners: Sequence[str]) -> None:
+    """Planners from top to bottom."""
+    axes.grid(axis="x", color=FAINT, linewidth=0.8)
+    axes.spines[["left", "bottom"]].set_visible(False)
+    axes.tick_params(axis="x", length=0)
+    axes.set_ylim(len(planners) - 0.4, -0.6)
+    axes.set_yticks(range(len(planners)), planners)
+    axes.tick_params(axis="y", labelcolor=INK, labelsize=LABEL)
 
 
 def _svg(figure: "Figure", name: str) -> str:
@@ -247,23 +250,13 @@ def _time_axis(axes: "Axes", low: float, high: float) -> None:
     axes.grid(axis="x", color=FAINT, linewidth=0.8)
 
 
-def _percent(axes: "Axes") -> None:
-    from matplotlib.ticker import FuncFormatter
-
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} %"))
-    axes.grid(axis="y", color=FAINT, linewidth=0.8)
-    axes.spines[["left"]].set_visible(False)
-
-
-def _names_at_right(
-    axes: "Axes", ends: dict[str, tuple[float, float]], planners: Sequence[str], gap: float = 0.0535
-) -> None:
-    """Names in the colours of their lines beside the plot, in the order of the ends, moved apart to be
-    `gap` from each other [share of the height]; a thin line leads from each end to its name."""
+def _names_at_right(axes: "Axes", ends: dict[str, tuple[float, float]], planners: Sequence[str]) -> None:
+    """Names in the colours of their lines beside the plot, in the order of the ends, moved apart where they
+    would touch; a thin line leads from each end to its name."""
     transform = axes.transData + axes.transAxes.inverted()
     at = {name: transform.transform(end) for name, end in ends.items()}
     order = sorted(at, key=lambda name: (at[name][1], -planners.index(name)))
-    heights = _spread(np.array([at[name][1] for name in order]), gap)
+    heights = _spread(np.array([at[name][1] for name in order]), GAP)
     for name, height in zip(order, heights.tolist(), strict=True):
         (x, y), color = at[name], color_of(name, planners)
         axes.plot(

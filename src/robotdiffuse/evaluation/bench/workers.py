@@ -7,11 +7,11 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 
+from robotdiffuse import processes
 from robotdiffuse.evaluation.bench.contestants import Contestant
 from robotdiffuse.evaluation.bench.planner_process import PlannerProcess
 from robotdiffuse.evaluation.records import RESTARTED, Record
 from robotdiffuse.evaluation.trial import Execute, Fields, Made, Trial
-from robotdiffuse.generation.workers import ray_cluster
 
 CHUNK = 20
 """Calls of one planner that a node of a cluster makes in one go, with one start of the process."""
@@ -33,11 +33,11 @@ def on_this_machine(
         stop, news, ready = threading.Event(), threading.Condition(), deque[tuple[Trial, list[Record]]]()
         todo: deque[Trial] = deque(trials)
         first = {trial.method: trial for trial in reversed(trials)}
-        processes = {
+        planners = {
             label: PlannerProcess(contestants[label], logs / f"{label.replace('/', '_')}.log")
             for label in first
         }
-        idle = set(processes)
+        idle = set(planners)
 
         def next_trial() -> Trial | None:
             """The first one whose planner is idle; None when there is nothing left to do."""
@@ -53,7 +53,7 @@ def on_this_machine(
 
         def work() -> None:
             while (trial := next_trial()) is not None:
-                answers = processes[trial.method].plan(trial, restarts)
+                answers = planners[trial.method].plan(trial, restarts)
                 with news:
                     if not stop.is_set():  # else it is the stop that ended the call
                         ready.append((trial, records_of(trial, answers, about)))
@@ -62,7 +62,7 @@ def on_this_machine(
 
         pool = ThreadPoolExecutor(workers)
         try:
-            jobs = {pool.submit(processes[label].warm, trial) for label, trial in first.items()}
+            jobs = {pool.submit(planners[label].warm, trial) for label, trial in first.items()}
             while jobs:
                 jobs = wait(jobs, timeout=0.2).not_done
             jobs = {pool.submit(work) for _ in range(workers)}
@@ -79,7 +79,7 @@ def on_this_machine(
             stop.set()
             with news:
                 news.notify_all()
-            for process in processes.values():
+            for process in planners.values():
                 process.close()
             pool.shutdown(cancel_futures=True)
 
@@ -94,7 +94,7 @@ def records_of(trial: Trial, answers: Sequence[Fields], about: Fields) -> list[R
 
 
 def on_ray(contestants: Contestants, restarts: bool, run: str, logs: FilePath) -> Execute:
-    """Calls in portions, each by a process of its own on a node of a Ray cluster; see `ray_cluster`.
+    """Calls in portions, each by a process of its own on a node of a Ray cluster; see `processes.on_ray`.
 
     The nodes need this package, and weights and files at the same places.
     """
@@ -103,23 +103,15 @@ def on_ray(contestants: Contestants, restarts: bool, run: str, logs: FilePath) -
     def execute(trials: Sequence[Trial]) -> Made:
         of = {label: [trial for trial in trials if trial.method == label] for label in contestants}
         portions = [(label, t[i : i + CHUNK]) for label, t in of.items() for i in range(0, len(t), CHUNK)]
-        with ray_cluster() as ray:
-            remote = ray.remote(num_cpus=1)(_portion)
-            running = {
-                remote.remote(contestants[label], portion, restarts): (label, portion)
-                for label, portion in portions
-            }
-            while running:
-                done, _ = ray.wait(list(running), num_returns=1)
-                for reference in done:
-                    label, portion = running.pop(reference)
-                    answers, said = ray.get(reference)
-                    if said:
-                        logs.mkdir(parents=True, exist_ok=True)
-                        with (logs / f"{label.replace('/', '_')}.log").open("a") as log:
-                            log.write(said)
-                    for trial, answer in zip(portion, answers, strict=True):
-                        yield trial, records_of(trial, answer, about)
+        calls = [(contestants[label], portion, restarts) for label, portion in portions]
+        for number, (answers, said) in processes.on_ray(_portion, calls):
+            label, portion = portions[number]
+            if said:
+                logs.mkdir(parents=True, exist_ok=True)
+                with (logs / f"{label.replace('/', '_')}.log").open("a") as log:
+                    log.write(said)
+            for trial, answer in zip(portion, answers, strict=True):
+                yield trial, records_of(trial, answer, about)
 
     return execute
 

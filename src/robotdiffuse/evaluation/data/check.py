@@ -3,11 +3,8 @@
 Nothing of what the factory said is taken on trust: a problem is rebuilt from its row alone.
 """
 
-import multiprocessing
-import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path as FilePath
 
@@ -28,7 +25,8 @@ from robotdiffuse.data.shards import (
     scenes_of,
 )
 from robotdiffuse.errors import InputError
-from robotdiffuse.generation.workers import prepare_worker
+from robotdiffuse.evaluation.tables import Column, Table
+from robotdiffuse.processes import Workers, in_order
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -50,16 +48,16 @@ EXAMPLES = 5
 """Of each kind, this many are named."""
 
 LIMIT_SLACK = 1e-6
-"""Limits are held up to this, for frames are in single precision [rad]."""
+"""Limits are held up to this, for waypoints are in single precision [rad]."""
 CLEARANCE_TOLERANCE = 1e-4
-"""The recorded clearance may differ by this from the least one of the frames by covering spheres [m]."""
+"""The recorded clearance may differ by this from the least one of the waypoints by covering spheres [m]."""
 COST_TOLERANCE = 0.05
-"""Frames cut corners, timed ones more: they may be shorter than the recorded length by this share ..."""
+"""Waypoints cut corners, timed ones more: they may be shorter than the recorded length by this share ..."""
 ROUNDING = 1e-4
 """... and longer by this; the detour must be as recorded up to this."""
 PYBULLET_STEP = 0.01
-"""PyBullet looks at every frame, and between frames that are further apart at places no further apart than
-this [rad, joint-space L2]."""
+"""PyBullet looks at every waypoint, and between waypoints that are further apart at places no further apart
+than this [rad, joint-space L2]."""
 PYBULLET_TOLERANCE = 0.001
 """Contacts of less depth are Bullet's rounding [m]."""
 CHUNK = 100
@@ -110,6 +108,27 @@ class DataCheck:
     def clean(self) -> bool:
         return not any(self.counts.values())
 
+    @property
+    def tables(self) -> list[Table]:
+        """What was found, with the first examples of each kind below."""
+        planned = f" of {self.planned:,} planned" if self.motions < self.planned else ""
+        rate = self.checked / max(self.seconds, 1e-9)
+        asked = {kind: kind != "pybullet" or self.pybullet for kind in KINDS}
+        rows = [
+            ("shards, motions", f"{self.shards:,}, {self.motions:,}{planned}"),
+            ("judged", f"{self.checked:,} in {self.seconds:.1f} s ({rate:.0f}/s)"),
+            *(
+                (name, f"{self.counts[kind]:,}" if asked[kind] else "not asked")
+                for kind, name in KINDS.items()
+            ),
+            ("least clearance recorded", f"{1e3 * self.least_clearance + 0.0:.3f} mm"),
+        ]
+        found = [Table.pairs(f"{self.robot}: {'clean' if self.clean else 'violations found'}", rows)]
+        if self.examples:
+            columns = "first examples", Column("where", left=True), Column("what", left=True)
+            found.append(Table.of("", columns, [(f.kind, f.where, f.message) for f in self.examples]))
+        return found
+
 
 def check_data(
     folder: str | FilePath,
@@ -123,7 +142,7 @@ def check_data(
     """Check the structure of every shard, and `count` random motions (all by default).
 
     Each motion is judged on a problem that is rebuilt from its row: ends, limits, collision by the judge, and
-    by PyBullet on meshes at and between the frames; and what is recorded of it is compared with what is
+    by PyBullet on meshes at and between the waypoints; and what is recorded of it is compared with what is
     measured. `robot`: that of the data, by default found by the name in the manifest. The motions and the
     findings do not depend on `workers` (processes). `progress` is called with the numbers of judged motions
     and of all.
@@ -138,8 +157,8 @@ def check_data(
         _need_pybullet()
     indices = existing_shards(folder)
     task = _Task(str(folder), manifest, robot, pybullet)
-    with _Processes(workers) as processes:
-        sizes = dict(zip(indices, processes.map(task.size, indices), strict=True))
+    with Workers(workers if workers > 1 else 0) as processes:
+        sizes = dict(zip(indices, in_order(processes.each(task.size, [(i,) for i in indices])), strict=True))
         found = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
         rows = {i: size for i, size in sizes.items() if isinstance(size, int)}
         chosen = [
@@ -148,7 +167,7 @@ def check_data(
             for i in range(0, len(picked), CHUNK)
         ]
         total, done, least = sum(len(part) for _, part in chosen), 0, np.inf
-        for part in processes.map(task.judge, chosen):
+        for part in in_order(processes.each(task.judge, [(some,) for some in chosen])):
             found += part.findings
             done, least = done + part.motions, min(least, part.least_clearance)
             if progress is not None:
@@ -177,31 +196,6 @@ def _need_pybullet() -> None:
             "the second judge needs PyBullet, whose wheels stop at Python 3.11: pip install "
             "'robotdiffuse[sim]', or leave it out by --no-pybullet (pybullet=False)"
         ) from None
-
-
-class _Processes:
-    """Calls of a function in this process, or spread over several, with results in order."""
-
-    def __init__(self, workers: int) -> None:
-        self._pool = None
-        if workers > 1:
-            self._pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _prepare)
-
-    def __enter__(self) -> "_Processes":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
-
-    def map(self, call: Callable, items: Iterable) -> Iterator:
-        return map(call, items) if self._pool is None else self._pool.map(call, items)
-
-
-def _prepare() -> None:
-    """A worker leaves Ctrl-C to its parent, and ends with it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    prepare_worker()
 
 
 @dataclass(frozen=True)
@@ -254,7 +248,7 @@ class _Task:
                 contact = oracle.check_path(path, PYBULLET_STEP, PYBULLET_TOLERANCE)
                 if contact is not None:
                     depth, at = -1e3 * contact.distance, contact.at
-                    text = f"{contact.link} is {depth:.1f} mm inside {contact.other} at frame {at:.2f}"
+                    text = f"{contact.link} is {depth:.1f} mm inside {contact.other} at waypoint {at:.2f}"
                     yield Finding("pybullet", shard.index, row, text)
 
 
@@ -271,7 +265,7 @@ def _wrong(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
         return
     violation = Verifier(problem, VerifySettings()).path(path).violation
     if violation is not None and violation.kind.endswith("collision"):
-        yield "collision", f"{violation.message} at frame {violation.time:.2f}"
+        yield "collision", f"{violation.message} at waypoint {violation.time:.2f}"
     elif violation is not None and violation.kind not in ("limits", "start"):
         yield "motion", violation.message
     checker = CollisionChecker(robot, problem.scene)
@@ -290,12 +284,12 @@ def _ends(shard: Shard, row: int) -> Iterator[tuple[str, str]]:
     q, goals, goal = shard["trajectories"][row], shard["goals"][row], int(shard["goal_index"][row])
     if not np.array_equal(q[0], shard["start"][row]):
         off = np.abs(q[0] - shard["start"][row]).max()
-        yield "ends", f"the first frame differs from the start by {off:.3g}"
+        yield "ends", f"the first waypoint differs from the start by {off:.3g}"
     if not 0 <= goal < len(goals) or np.isnan(goals[goal]).any():
         yield "ends", f"goal_index is {goal}; there is no such goal"
     elif not np.array_equal(q[-1], goals[goal]):
         off = np.abs(q[-1] - goals[goal]).max()
-        yield "ends", f"the last frame differs from goal {goal} by {off:.3g}"
+        yield "ends", f"the last waypoint differs from goal {goal} by {off:.3g}"
 
 
 def _limits(robot: Robot, q: Float[ndarray, "n dof"]) -> Iterator[tuple[str, str]]:
@@ -304,7 +298,7 @@ def _limits(robot: Robot, q: Float[ndarray, "n dof"]) -> Iterator[tuple[str, str
         i, j = np.unravel_index(excess.argmax(), excess.shape)
         low, high = robot.lower[j], robot.upper[j]
         message = (
-            f"{robot.joint_names[j]} is {q[i, j]:.6g} at frame {i}; its limits are {low:.6g} to {high:.6g}"
+            f"{robot.joint_names[j]} is {q[i, j]:.6g} at waypoint {i}; its limits are {low:.6g} to {high:.6g}"
         )
         yield "limits", message
 
@@ -312,7 +306,7 @@ def _limits(robot: Robot, q: Float[ndarray, "n dof"]) -> Iterator[tuple[str, str
 def _lengths(shard: Shard, row: int, path: Path) -> Iterator[tuple[str, str]]:
     cost, detour = float(shard["cost"][row]), float(shard["detour"][row])
     if not cost * (1 - COST_TOLERANCE) - ROUNDING <= path.length <= cost * (1 + ROUNDING) + ROUNDING:
-        yield "cost", f"cost is {cost:.4f} rad; the frames are {path.length:.4f} rad long"
+        yield "cost", f"cost is {cost:.4f} rad; the waypoints are {path.length:.4f} rad long"
     straight = float(np.linalg.norm(path.positions[-1] - path.positions[0]))
     if abs(detour * straight - cost) > ROUNDING * max(cost, 1.0):
         yield (

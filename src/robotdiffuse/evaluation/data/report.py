@@ -1,21 +1,30 @@
-"""What is in a data set, in figures. `page` draws the same as a page of plots."""
+"""What is in a data set: its figures, and tables of them. `page` draws the same as a page of plots."""
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path as FilePath
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool
 from numpy import ndarray
 
 from robotdiffuse.data.manifest import Manifest, read_manifest
 from robotdiffuse.data.shards import SPLITS, existing_shards, read_shard, scenes_of, shard_path, split_of
 from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.tables import Column, Table
 
-QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
+QUANTITIES = {
+    "cost": Column("length", "[rad]", ".3f"),
+    "detour": Column("detour", "", ".3f"),
+    "clearance": Column("clearance", "[cm]", ".3f", scale=100.0),
+}
+"""What is told of every motion: arrays, and how they are shown."""
+SPREAD = {"least": 0.0, "5 %": 0.05, "median": 0.5, "95 %": 0.95, "most": 1.0}
+"""Quantiles that tell how a quantity is spread over the motions."""
 SAMPLE = 20_000
 """Motions, spread evenly over the set, whose larger arrays are kept for the plots."""
 FRAMES_KEPT = 24
-"""Frames of each of these, spread evenly."""
+"""Waypoints of each of these, spread evenly."""
 SMALL = (
     "cost",
     "clearance",
@@ -32,84 +41,30 @@ LARGE = ("start", "goals", "goal_costs", "target_pose", "obstacle_kinds", "obsta
 REASONS = ("solved", "unsolved", "refused", "thinned")
 """What becomes of a problem that was tried."""
 KEPT_SLACK = 0.002
-"""By this a motion may come closer than the safety distance and still count as keeping it: frames cut corners
-[m]."""
-
-
-@dataclass(frozen=True)
-class Spread:
-    """How a quantity is spread over the motions: its mean, and the quantiles of QUANTILES."""
-
-    mean: float
-    quantiles: tuple[float, ...]
+"""By this a motion may come closer than the safety distance and still count as keeping it: waypoints cut
+corners [m]."""
 
 
 @dataclass(frozen=True, eq=False)
-class DataColumns:
-    """Arrays of a data set, in the order of the shards."""
+class DataFigures:
+    """Arrays of a data set, in the order of the shards, and figures of them."""
 
     manifest: Manifest
     shards: int
     bytes: int
     """Size on disk."""
     counts: dict[str, int]
-    """Sums of the shards' counts."""
+    """What became of the problems that were tried, by REASONS and `tried`: sums of the shards' counts."""
     splits: dict[str, int]
+    """Trajectories by split."""
     all: dict[str, ndarray] = field(repr=False)
     """SMALL, of all motions."""
     sample: dict[str, ndarray] = field(repr=False)
-    """SMALL and LARGE of the sample; `trajectories` with FRAMES_KEPT frames."""
+    """SMALL and LARGE of the sample; `trajectories` with FRAMES_KEPT waypoints."""
 
-
-@dataclass(frozen=True)
-class Family:
-    """Figures of one family of scenes."""
-
-    trajectories: int
-    trivial: float
-    """Share of motions that the straight line would have done."""
-    length: Spread
-    """[rad, joint-space L2]"""
-    detour: Spread
-    clearance: Spread
-    """[m]"""
-
-
-@dataclass(frozen=True)
-class DataSummary:
-    """Figures of a data set."""
-
-    robot: str
-    timing: str
-    trajectories: int
-    planned: int
-    frames: int
-    """Of all trajectories together."""
-    shards: int
-    bytes: int
-    """Size on disk."""
-    splits: dict[str, int]
-    """Trajectories by split."""
-    counts: dict[str, int]
-    """What became of the problems that were tried, by REASONS and `tried`."""
-    families: dict[str, Family]
-    """The families that occur, by name."""
-    length: Spread
-    """Of the paths [rad, joint-space L2]."""
-    detour: Spread
-    """Length in units of the straight line's."""
-    clearance: Spread
-    """Least distance between arm and obstacles, of each motion [m]."""
-    safety_distance: float
-    """That the search set out with [m]."""
-    kept: float
-    """Share of motions that come no closer than the safety distance, or than the closer of start and goal."""
-    kept_throughout: float
-    """Share that keeps the safety distance all along, of motions whose ends have it; nan if none have."""
-    trivial: float
-    """Share of motions that the straight line would have done."""
-    goals_reached: float
-    """Mean number of goals that a search reached."""
+    @property
+    def trajectories(self) -> int:
+        return len(self.all["cost"])
 
     @property
     def success(self) -> float:
@@ -117,18 +72,48 @@ class DataSummary:
         tried = self.counts.get("tried", 0) - self.counts.get("thinned", 0)
         return self.counts.get("solved", 0) / tried if tried else float("nan")
 
+    @cached_property
+    def families(self) -> dict[str, Bool[ndarray, "n"]]:
+        """Which motions are of a family, for those that occur."""
+        of = {name: self.all["family"] == i for i, name in enumerate(self.manifest.families)}
+        return {name: chosen for name, chosen in of.items() if chosen.any()}
 
-def describe(folder: str | FilePath) -> DataSummary:
-    """The figures of a data set. Raises InputError if there is none, or it is damaged or empty."""
-    return summarize(read_columns(folder))
+    @property
+    def safety_distance(self) -> float:
+        """The distance that searches set out with [m]: the greatest that any of them kept."""
+        return float(self.all["safety_distance"].max())
+
+    @property
+    def kept(self) -> float:
+        """Share of motions that come no closer than the safety distance, or than the closer of start and
+        goal."""
+        least = np.minimum(self.safety_distance, self.all["end_clearance"].min(axis=1))
+        return float((self.all["clearance"] >= least - KEPT_SLACK).mean())
+
+    @property
+    def kept_throughout(self) -> float:
+        """Share that keeps the safety distance all along, of motions whose ends have it; nan if none have."""
+        apart = self.all["clearance"][self.all["end_clearance"].min(axis=1) >= self.safety_distance]
+        return float((apart >= self.safety_distance - KEPT_SLACK).mean()) if len(apart) else float("nan")
+
+    @property
+    def trivial(self) -> float:
+        """Share of motions that the straight line would have done."""
+        return float(self.all["line_free"].mean())
+
+    @property
+    def goals_reached(self) -> float:
+        """Mean number of goals that a search reached."""
+        return float(np.isfinite(self.sample["goal_costs"]).sum(axis=1).mean())
 
 
-def read_columns(folder: str | FilePath) -> DataColumns:
-    """Read what figures and plots need, one shard at a time. Raises InputError as `describe`."""
+def read_figures(folder: str | FilePath) -> DataFigures:
+    """Read what figures and plots need, one shard at a time. Raises InputError if there is no data set, or it
+    is damaged or empty."""
     manifest = read_manifest(folder)
     indices = existing_shards(folder)
     every = max(1, manifest.trajectories // SAMPLE)
-    frames = np.unique(np.linspace(0, manifest.frames - 1, FRAMES_KEPT).round().astype(int))
+    waypoints = np.unique(np.linspace(0, manifest.waypoints - 1, FRAMES_KEPT).round().astype(int))
     small: list[dict[str, ndarray]] = []
     sample: list[dict[str, ndarray]] = []
     counts: dict[str, int] = {}
@@ -140,14 +125,14 @@ def read_columns(folder: str | FilePath) -> DataColumns:
         first += len(shard)
         small.append({name: shard[name] for name in SMALL})
         picked = {name: np.array(shard[name][rows]) for name in {*SMALL, *LARGE} - {"trajectories"}}
-        sample.append(picked | {"trajectories": np.array(shard["trajectories"][np.ix_(rows, frames)])})
+        sample.append(picked | {"trajectories": np.array(shard["trajectories"][np.ix_(rows, waypoints)])})
         splits += np.bincount(split_of(scenes_of(manifest, shard)), minlength=len(SPLITS))
         for name, value in shard.counts.items():
             counts[name] = counts.get(name, 0) + value
         size += sum(file.stat().st_size for file in shard_path(folder, index).rglob("*") if file.is_file())
     if not first:
         raise InputError(f"{folder} holds no trajectories")
-    return DataColumns(
+    return DataFigures(
         manifest=manifest,
         shards=len(indices),
         bytes=size,
@@ -158,48 +143,61 @@ def read_columns(folder: str | FilePath) -> DataColumns:
     )
 
 
-def summarize(columns: DataColumns) -> DataSummary:
-    """The figures of what was read."""
-    rows, manifest = columns.all, columns.manifest
-    families = {
-        name: _family(columns, rows["family"] == i)
-        for i, name in enumerate(manifest.families)
-        if (rows["family"] == i).any()
-    }
-    whole, ends = safety_distance(columns), rows["end_clearance"].min(axis=1)
-    apart = rows["clearance"][ends >= whole]
-    return DataSummary(
-        robot=manifest.robot,
-        timing=manifest.timing,
-        trajectories=len(rows["cost"]),
-        planned=manifest.trajectories,
-        frames=len(rows["cost"]) * manifest.frames,
-        shards=columns.shards,
-        bytes=columns.bytes,
-        splits=columns.splits,
-        counts=columns.counts,
-        families=families,
-        length=_spread(rows["cost"]),
-        detour=_spread(rows["detour"]),
-        clearance=_spread(rows["clearance"]),
-        safety_distance=whole,
-        kept=float((rows["clearance"] >= np.minimum(whole, ends) - KEPT_SLACK).mean()),
-        kept_throughout=float((apart >= whole - KEPT_SLACK).mean()) if len(apart) else float("nan"),
-        trivial=float(rows["line_free"].mean()),
-        goals_reached=float(np.isfinite(columns.sample["goal_costs"]).sum(axis=1).mean()),
-    )
+def facts(data: DataFigures) -> list[tuple[str, str]]:
+    """Figures, and what they are: the head of a report."""
+    planned, waypoints = data.manifest.trajectories, data.trajectories * data.manifest.waypoints
+    train, *held_out = ((name, f"{count:,}") for name, count in data.splits.items())
+    spacing = "length" if data.manifest.timing == "arc" else "time"
+    return [
+        (f"{data.trajectories:,}", f"of {planned:,} motions" if data.trajectories < planned else "motions"),
+        (
+            f"{waypoints:,}" if waypoints < 1e6 else f"{waypoints / 1e6:.1f} M",
+            f"waypoints, evenly spaced in {spacing}",
+        ),
+        (size_in_words(data.bytes), f"in {data.shards:,} shards"),
+        (f"{100 * data.success:.1f} %", "of problems solved"),
+        (
+            f"{100 * data.kept:.1f} %",
+            f"come no closer than {100 * data.safety_distance:.3g}\u00a0cm or than their ends",
+        ),
+        (f"{100 * data.trivial:.1f} %", "trivial: the line is free"),
+        (f"{np.median(data.all['cost']):.2f} rad", "median length"),
+        (train[1], f"to {train[0]} on, " + ", ".join(f"{count} {name}" for name, count in held_out)),
+    ]
 
 
-def safety_distance(columns: DataColumns) -> float:
-    """The distance that searches set out with [m]: the greatest that any of them kept."""
-    return float(columns.all["safety_distance"].max())
+def tables(data: DataFigures) -> list[Table]:
+    """What is printed of a data set."""
+    lost = ", ".join(f"{data.counts.get(name, 0):,} {name}" for name in REASONS[1:])
+    about = [
+        *((what, value) for value, what in facts(data)),
+        (f"of {data.counts.get('tried', 0):,} problems", lost),
+        ("keep that distance all along, where both ends have it", f"{100 * data.kept_throughout:.1f} %"),
+        ("goals reached per problem", f"{data.goals_reached:.1f}"),
+    ]
+    trivial = Column("trivial", "%", ".1f", scale=100.0)
+    families = [
+        (
+            name,
+            int(rows.sum()),
+            float(data.all["line_free"][rows].mean()),
+            *(float(np.median(data.all[of][rows])) for of in QUANTITIES),
+        )
+        for name, rows in data.families.items()
+    ]
+    spreads = [
+        (column.title, *(f"{column.scale * x + 0.0:.3f}" for x in (values.mean(dtype=float), *quantiles)))
+        for of, column in QUANTITIES.items()
+        for values in (data.all[of],)
+        for quantiles in (np.quantile(values, list(SPREAD.values())).tolist(),)
+    ]
+    return [
+        Table.pairs(f"{data.manifest.robot}: {data.trajectories:,} motions", about),
+        Table.of("", ("medians of", "motions", trivial, *QUANTITIES.values()), families),
+        Table.of("", ("", "mean", *SPREAD), spreads),
+    ]
 
 
-def _family(columns: DataColumns, chosen: ndarray) -> Family:
-    rows = {name: values[chosen] for name, values in columns.all.items()}
-    spreads = (_spread(rows[name]) for name in ("cost", "detour", "clearance"))
-    return Family(int(chosen.sum()), float(rows["line_free"].mean()), *spreads)
-
-
-def _spread(values: Float[ndarray, "n"]) -> Spread:
-    return Spread(float(values.mean(dtype=np.float64)), tuple(np.quantile(values, QUANTILES).tolist()))
+def size_in_words(size: int) -> str:
+    """A size on disk in words."""
+    return f"{size / 1e9:.2f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"

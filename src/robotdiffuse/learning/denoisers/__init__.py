@@ -1,8 +1,9 @@
-"""Networks that predict the clean trajectory from a noisy one.
+"""Networks that predict the clean trajectory from a noisy one. A new one is one file and one line.
 
-Millions of parameters of the defaults (48 frames) and of `PAPER_SIZE` (254 frames) for a Panda, and the time
-of a forward pass of the defaults on a batch of 16, one thread, in units of the transformer's (5.8 ms in bf16,
-10.7 ms in fp32; torch 2.13, CPU with AVX-512 BF16). Other work was running, so times are good to about 20 %.
+Millions of parameters of the defaults (48 waypoints) and of `paper_size` (254 waypoints) for a Panda, and
+the time of a forward pass of the defaults on a batch of 16, one thread, in units of the transformer's (5.8
+ms in bf16, 10.7 ms in fp32; torch 2.13, CPU with AVX-512 BF16). Other work was running, so times are good to
+about 20 %.
 
 | denoiser        | default | paper's size | bf16 | fp32 |
 |-----------------|---------|--------------|------|------|
@@ -12,44 +13,22 @@ of a forward pass of the defaults on a batch of 16, one thread, in units of the 
 | unet            |   1.7   |     16.4     | 1.1  | 1.3  |
 """
 
-from robotdiffuse.learning.denoisers.base import Denoiser
-from robotdiffuse.learning.denoisers.decoder_only import DecoderOnly, DecoderOnlySettings
-from robotdiffuse.learning.denoisers.encoder_decoder import EncoderDecoder, EncoderDecoderSettings
-from robotdiffuse.learning.denoisers.transformer import Transformer, TransformerSettings
-from robotdiffuse.learning.denoisers.unet import UNet, UNetSettings
+from robotdiffuse.registry import Entry, Registry
 
-DenoiserSettings = TransformerSettings | EncoderDecoderSettings | DecoderOnlySettings | UNetSettings
-"""Settings of any denoiser; a new one is named here and in DENOISERS."""
-
-DENOISERS: dict[str, tuple[type[Denoiser], type[DenoiserSettings]]] = {
-    "transformer": (Transformer, TransformerSettings),
-    "encoder_decoder": (EncoderDecoder, EncoderDecoderSettings),
-    "decoder_only": (DecoderOnly, DecoderOnlySettings),
-    "unet": (UNet, UNetSettings),
-}
-"""Name in checkpoints: network and its settings."""
-
-PAPER_SIZE: dict[str, DenoiserSettings] = {
-    "transformer": TransformerSettings(512, 8, 4, 1024, patch=1, add_z_tk=False),
-    "encoder_decoder": EncoderDecoderSettings(512, 2, 4, 4, 1024, patch=1),
-    "decoder_only": DecoderOnlySettings(512, 8, 4, 1024, patch=1),
-    "unet": UNetSettings(144, (1, 2, 4), 5, 512),
-}
-"""The paper's network, 8 layers of width 512 and a token per frame, and the others at about its size. The
-paper does not say how many heads and how large a hidden layer: those are of the network that it follows, the
-motion diffusion model of Tevet et al. 2023."""
-
-__all__ = [
-    "DENOISERS",
-    "PAPER_SIZE",
-    "DecoderOnly",
-    "DecoderOnlySettings",
-    "Denoiser",
-    "DenoiserSettings",
-    "EncoderDecoder",
-    "EncoderDecoderSettings",
-    "Transformer",
-    "TransformerSettings",
-    "UNet",
-    "UNetSettings",
-]
+_ROOM = "robotdiffuse.learning.denoisers."
+DENOISERS = Registry(
+    "denoiser",
+    {
+        "transformer": Entry(
+            _ROOM + "transformer:Transformer", "encoder-only transformer, the paper's", "TransformerSettings"
+        ),
+        "encoder_decoder": Entry(
+            _ROOM + "encoder_decoder:EncoderDecoder", "encoder-decoder transformer", "EncoderDecoderSettings"
+        ),
+        "decoder_only": Entry(
+            _ROOM + "decoder_only:DecoderOnly", "decoder-only transformer", "DecoderOnlySettings"
+        ),
+        "unet": Entry(_ROOM + "unet:UNet", "temporal U-Net", "UNetSettings"),
+    },
+)
+"""By the name in settings and checkpoints."""

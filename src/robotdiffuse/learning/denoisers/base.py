@@ -1,46 +1,83 @@
 """The interface of all denoisers."""
 
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from typing import Any
 
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.settings import Count, Settings
 
 
-class Denoiser(nn.Module):
-    """Predicts the clean trajectory from a noisy one, of frames or of the control points of a spline."""
+@dataclass(frozen=True)
+class DenoiserSettings(Settings):
+    """Of any denoiser."""
+
+    @classmethod
+    def paper_size(cls) -> "DenoiserSettings":
+        """At about the size of the paper's network: 8 layers of width 512 and a token per waypoint."""
+        return cls()
+
+
+@dataclass(frozen=True)
+class AttentionSettings(DenoiserSettings):
+    """What the transformers share. The paper does not say how many heads and how large a hidden layer its
+    network has: those of `paper_size` are of the network that it follows, the motion diffusion model of Tevet
+    et al. 2023."""
+
+    width: Count = 160
+    """Size of a token; even (paper: 512)."""
+    layers: Count = 6
+    """(paper: 8)"""
+    heads: Count = 5
+    """Attention heads; a divisor of width."""
+    hidden: Count = 480
+    """Size of the hidden layer of each feed-forward network."""
+    patch: Count = 4
+    """Waypoints per token; a divisor of the number of waypoints (paper: 1)."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        kind = self.settings_name
+        if self.width % self.heads:
+            raise InputError(f"{kind}.heads is {self.heads}; it must divide width, which is {self.width}")
+        if self.width % 2:  # sines and cosines
+            raise InputError(f"{kind}.width is {self.width}; it must be even")
+
+    @classmethod
+    def paper_size(cls) -> "AttentionSettings":
+        return cls(512, 8, 4, 1024, patch=1)
+
+    def tokens(self, waypoints: int) -> int:
+        """How many patches so many waypoints are. Raises InputError unless they can be cut into patches."""
+        if waypoints % self.patch:
+            raise InputError(
+                f"{self.settings_name}.patch is {self.patch}; it must divide the {waypoints} waypoints"
+            )
+        return waypoints // self.patch
+
+
+class Denoiser(nn.Module, ABC):
+    """Predicts the clean trajectory from a noisy one, of waypoints or of the control points of a spline."""
 
     out: nn.Linear
     """The last layer. It starts at zero, so that an untrained network predicts the mean trajectory."""
 
-    def __init__(self, settings: Any, frames: int, dof: int, features: int, condition: int) -> None:
-        """settings: of the class that stands beside the denoiser in DENOISERS.
-        frames: rows of a trajectory, features: numbers per row of the input.
+    def __init__(self, settings: Any, waypoints: int, dof: int, features: int, condition: int) -> None:
+        """settings: of the class that DENOISERS names beside the denoiser.
+        waypoints: rows of a trajectory, features: numbers per row of the input.
         condition: numbers in [z, start, goal]; start and goal are the last `dof` each.
         """
         super().__init__()
-        self.settings, self.frames, self.dof = settings, frames, dof
+        self.settings, self.waypoints, self.dof = settings, waypoints, dof
 
+    @abstractmethod
     def forward(
         self,
-        features: Float[Tensor, "batch frames features"],
+        features: Float[Tensor, "batch waypoints features"],
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
-    ) -> Float[Tensor, "batch frames dof"]:
+    ) -> Float[Tensor, "batch waypoints dof"]:
         """The clean trajectory. `level` is t / T in [0, 1]."""
-        raise NotImplementedError
-
-
-def check_attention(kind: str, width: int, heads: int) -> None:
-    """Raises InputError unless the width is even (sines and cosines) and a multiple of the heads."""
-    if heads < 1 or width % heads:
-        raise InputError(f"{kind}.heads is {heads}; it must divide width, which is {width}")
-    if width < 2 or width % 2:
-        raise InputError(f"{kind}.width is {width}; it must be even")
-
-
-def check_patch(kind: str, patch: int, frames: int) -> None:
-    """Raises InputError unless the frames can be cut into patches."""
-    if patch < 1 or frames % patch:
-        raise InputError(f"{kind}.patch is {patch}; it must divide the {frames} frames")

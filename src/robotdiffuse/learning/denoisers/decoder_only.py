@@ -1,4 +1,4 @@
-"""A decoder-only transformer: each frame sees z_tk and the frames before it (paper: Table 2)."""
+"""A decoder-only transformer: each waypoint sees z_tk and the waypoints before it (paper: Table 2)."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from robotdiffuse.learning.denoisers.base import Denoiser, check_attention, check_patch
+from robotdiffuse.learning.denoisers.base import AttentionSettings, Denoiser
 from robotdiffuse.learning.denoisers.layers import (
     Block,
     LevelEmbedding,
@@ -18,36 +18,24 @@ from robotdiffuse.learning.denoisers.layers import (
 
 
 @dataclass(frozen=True)
-class DecoderOnlySettings:
-    width: int = 160
-    """Size of a token."""
-    layers: int = 6
-    heads: int = 5
-    """Attention heads; a divisor of width."""
-    hidden: int = 480
-    """Size of the hidden layer of each feed-forward network."""
-    patch: int = 4
-    """Frames per token; a divisor of the number of frames. Frames of one token see each other."""
-
-    def __post_init__(self) -> None:
-        check_attention("decoder_only", self.width, self.heads)
+class DecoderOnlySettings(AttentionSettings, name="decoder_only"):
+    """Waypoints of one token see each other."""
 
 
 class DecoderOnly(Denoiser):
-    """Causal self attention over [z_tk, frames ...], after Radford et al. 2018.
+    """Causal self attention over [z_tk, waypoints ...], after Radford et al. 2018.
 
     z_tk carries the condition, and with it the goal, and the noise level. It is the first token, and so the
-    only one that all frames see. No frame is drawn after another: one pass predicts them all.
+    only one that all waypoints see. No waypoint is drawn after another: one pass predicts them all.
     """
 
     positions: Tensor
 
     def __init__(
-        self, settings: DecoderOnlySettings, frames: int, dof: int, features: int, condition: int
+        self, settings: DecoderOnlySettings, waypoints: int, dof: int, features: int, condition: int
     ) -> None:
-        super().__init__(settings, frames, dof, features, condition)
-        check_patch("decoder_only", settings.patch, frames)
-        width = settings.width
+        super().__init__(settings, waypoints, dof, features, condition)
+        tokens, width = settings.tokens(waypoints), settings.width
         self.embed = Linear(settings.patch * features, width)
         self.condition = two_layers(condition, 2 * width, width)
         self.level = LevelEmbedding(width)
@@ -58,14 +46,14 @@ class DecoderOnly(Denoiser):
         self.norm = nn.LayerNorm(width)
         self.out = Linear(width, settings.patch * dof)
         start_at_zero(self.out)
-        self.register_buffer("positions", positions(1 + frames // settings.patch, width), persistent=False)
+        self.register_buffer("positions", positions(1 + tokens, width), persistent=False)
 
     def forward(
         self,
-        features: Float[Tensor, "batch frames features"],
+        features: Float[Tensor, "batch waypoints features"],
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
-    ) -> Float[Tensor, "batch frames dof"]:
+    ) -> Float[Tensor, "batch waypoints dof"]:
         """The clean trajectory. `level` is t / T in [0, 1]."""
         batch = features.shape[0]
         z_tk = self.condition(condition) + self.level(level)
@@ -73,4 +61,4 @@ class DecoderOnly(Denoiser):
         x = torch.cat([z_tk[:, None], tokens], 1) + self.positions
         for block in self.blocks:
             x = block(x)
-        return self.out(self.norm(x[:, 1:])).float().reshape(batch, self.frames, self.dof)
+        return self.out(self.norm(x[:, 1:])).float().reshape(batch, self.waypoints, self.dof)

@@ -1,4 +1,4 @@
-"""An encoder-decoder transformer: the condition is encoded, the frames attend to it (paper: Table 2)."""
+"""An encoder-decoder transformer: the condition is encoded, the waypoints attend to it (paper: Table 2)."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from robotdiffuse.learning.denoisers.base import Denoiser, check_attention, check_patch
+from robotdiffuse.learning.denoisers.base import AttentionSettings, Denoiser
 from robotdiffuse.learning.denoisers.layers import (
     Block,
     CrossBlock,
@@ -16,37 +16,37 @@ from robotdiffuse.learning.denoisers.layers import (
     start_at_zero,
     two_layers,
 )
+from robotdiffuse.settings import Count
 
 
 @dataclass(frozen=True)
-class EncoderDecoderSettings:
-    width: int = 144
-    """Size of a token."""
-    encoder_layers: int = 2
-    layers: int = 4
+class EncoderDecoderSettings(AttentionSettings, name="encoder_decoder"):
+    width: Count = 144
+    """Size of a token; even."""
+    layers: Count = 4
     """Of the decoder."""
-    heads: int = 4
+    encoder_layers: Count = 2
+    heads: Count = 4
     """Attention heads; a divisor of width."""
-    hidden: int = 432
+    hidden: Count = 432
     """Size of the hidden layer of each feed-forward network."""
-    patch: int = 4
-    """Frames per token of the decoder; a divisor of the number of frames."""
 
-    def __post_init__(self) -> None:
-        check_attention("encoder_decoder", self.width, self.heads)
+    @classmethod
+    def paper_size(cls) -> "EncoderDecoderSettings":
+        return cls(512, 4, 4, 1024, patch=1)
 
 
 class EncoderDecoder(Denoiser):
     """After Vaswani et al. 2017, with norms first: the tokens z, start, goal and t go through the encoder,
-    the frames through the decoder. Frames see each other both ways, for they are not drawn in turn."""
+    the waypoints through the decoder. Waypoints see each other both ways, for they are not drawn in turn."""
 
     positions: Tensor
 
     def __init__(
-        self, settings: EncoderDecoderSettings, frames: int, dof: int, features: int, condition: int
+        self, settings: EncoderDecoderSettings, waypoints: int, dof: int, features: int, condition: int
     ) -> None:
-        super().__init__(settings, frames, dof, features, condition)
-        check_patch("encoder_decoder", settings.patch, frames)
+        super().__init__(settings, waypoints, dof, features, condition)
+        tokens = settings.tokens(waypoints)
         width, heads, hidden = settings.width, settings.heads, settings.hidden
         self.sizes = (condition - 2 * dof, dof, dof)
         self.condition = nn.ModuleList(two_layers(size, width, width) for size in self.sizes)
@@ -62,14 +62,14 @@ class EncoderDecoder(Denoiser):
         self.norm = nn.LayerNorm(width)
         self.out = Linear(width, settings.patch * dof)
         start_at_zero(self.out)
-        self.register_buffer("positions", positions(frames // settings.patch, width), persistent=False)
+        self.register_buffer("positions", positions(tokens, width), persistent=False)
 
     def forward(
         self,
-        features: Float[Tensor, "batch frames features"],
+        features: Float[Tensor, "batch waypoints features"],
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
-    ) -> Float[Tensor, "batch frames dof"]:
+    ) -> Float[Tensor, "batch waypoints dof"]:
         """The clean trajectory. `level` is t / T in [0, 1]."""
         batch = features.shape[0]
         parts = zip(self.condition, condition.split(self.sizes, -1), strict=True)
@@ -80,4 +80,4 @@ class EncoderDecoder(Denoiser):
         x = self.embed(features.reshape(batch, len(self.positions), -1)) + self.positions
         for block in self.decoder:
             x = block(x, memory)
-        return self.out(self.norm(x)).float().reshape(batch, self.frames, self.dof)
+        return self.out(self.norm(x)).float().reshape(batch, self.waypoints, self.dof)

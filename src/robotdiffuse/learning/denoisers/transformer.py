@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from robotdiffuse.learning.denoisers.base import Denoiser, check_attention, check_patch
+from robotdiffuse.learning.denoisers.base import AttentionSettings, Denoiser
 from robotdiffuse.learning.denoisers.layers import (
     Block,
     LevelEmbedding,
@@ -18,36 +18,26 @@ from robotdiffuse.learning.denoisers.layers import (
 
 
 @dataclass(frozen=True)
-class TransformerSettings:
-    width: int = 160
-    """Size of a token (paper: 512)."""
-    layers: int = 6
-    """(paper: 8)"""
-    heads: int = 5
-    """Attention heads; a divisor of width."""
-    hidden: int = 480
-    """Size of the hidden layer of each feed-forward network."""
-    patch: int = 4
-    """Frames per token; a divisor of the number of frames (paper: 1)."""
+class TransformerSettings(AttentionSettings, name="transformer"):
     add_z_tk: bool = True
     """Whether z_tk is also added to every other token, which spares the first layer from having to spread it;
     otherwise it is a token and no more (the paper's)."""
 
-    def __post_init__(self) -> None:
-        check_attention("transformer", self.width, self.heads)
+    @classmethod
+    def paper_size(cls) -> "TransformerSettings":
+        return cls(512, 8, 4, 1024, patch=1, add_z_tk=False)
 
 
 class Transformer(Denoiser):
-    """Tokens: patches of frames, and one token z_tk that carries the condition and the noise level."""
+    """Tokens: patches of waypoints, and one token z_tk that carries the condition and the noise level."""
 
     positions: Tensor
 
     def __init__(
-        self, settings: TransformerSettings, frames: int, dof: int, features: int, condition: int
+        self, settings: TransformerSettings, waypoints: int, dof: int, features: int, condition: int
     ) -> None:
-        super().__init__(settings, frames, dof, features, condition)
-        check_patch("transformer", settings.patch, frames)
-        width = settings.width
+        super().__init__(settings, waypoints, dof, features, condition)
+        tokens, width = settings.tokens(waypoints), settings.width
         self.embed = Linear(settings.patch * features, width)
         self.condition = two_layers(condition, 2 * width, width)
         self.level = LevelEmbedding(width)
@@ -57,14 +47,14 @@ class Transformer(Denoiser):
         self.norm = nn.LayerNorm(width)
         self.out = Linear(width, settings.patch * dof)
         start_at_zero(self.out)
-        self.register_buffer("positions", positions(frames // settings.patch, width), persistent=False)
+        self.register_buffer("positions", positions(tokens, width), persistent=False)
 
     def forward(
         self,
-        features: Float[Tensor, "batch frames features"],
+        features: Float[Tensor, "batch waypoints features"],
         level: Float[Tensor, "batch"],
         condition: Float[Tensor, "batch condition"],
-    ) -> Float[Tensor, "batch frames dof"]:
+    ) -> Float[Tensor, "batch waypoints dof"]:
         """The clean trajectory. `level` is t / T in [0, 1]."""
         batch = features.shape[0]
         z_tk = self.condition(condition) + self.level(level)
@@ -74,4 +64,4 @@ class Transformer(Denoiser):
         x = torch.cat([z_tk[:, None].to(tokens.dtype), tokens], 1)
         for block in self.blocks:
             x = block(x)
-        return self.out(self.norm(x[:, 1:])).float().reshape(batch, self.frames, self.dof)
+        return self.out(self.norm(x[:, 1:])).float().reshape(batch, self.waypoints, self.dof)

@@ -3,47 +3,37 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from numpy.random import Generator
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError
 from robotdiffuse.scenes.sampling import PANDA_REGION, VisibleRegion
+from robotdiffuse.settings import Count, Settings
 
 
 @dataclass(frozen=True)
-class EncoderSettings:
+class EncoderSettings(Settings, name="encoder"):
     """What training and planning need to know of any encoder."""
 
-    code: int = 96
+    code: Count = 96
     """Size of z (paper: 60, for two obstacles)."""
-    cloud: int = 512
+    cloud: Count = 512
     """Points of the clouds that it is given."""
     region: VisibleRegion = PANDA_REGION
     """Points outside do not count: the arm gets nowhere near them. A large reach: whole surfaces."""
 
-    def __post_init__(self) -> None:
-        for name in ("code", "cloud"):
-            if getattr(self, name) < 1:
-                raise InputError(f"encoder.{name} is {getattr(self, name)}; it must be 1 or more")
-
-    def check_layers(self, name: str, most_empty: int = 0) -> None:
-        """Raises InputError unless the field is the sizes of more than `most_empty` layers."""
-        sizes = getattr(self, name)
-        if len(sizes) <= most_empty or min(sizes, default=1) < 1:
-            raise InputError(
-                f"encoder.{name} is {sizes}; it must be the sizes of {most_empty + 1} layers or more"
-            )
+    @classmethod
+    def paper_size(cls) -> "EncoderSettings":
+        """The sizes that the authors of this encoder give, with z of this paper's size."""
+        return cls(code=60)
 
 
 class Encoder(nn.Module, ABC):
     """Point cloud to z. The order of the points never matters to `forward`, and a cloud may hold none."""
 
-    trained: ClassVar[Literal["alone", "jointly"]]
-    """Alone, with a loss of its own, and frozen then; or jointly with the planner, by the planner's loss."""
     any_size: ClassVar[bool] = True
     """Clouds of any size serve it well; otherwise they should be of about `settings.cloud` points."""
     settings: EncoderSettings
@@ -71,7 +61,6 @@ class Encoder(nn.Module, ABC):
 class Autoencoder(Encoder):
     """An encoder that is trained alone, to reconstruct what it encodes."""
 
-    trained = "alone"
     mean: Tensor
     scale: Tensor
 

@@ -16,22 +16,19 @@ from torch import Tensor, nn
 
 from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
 from robotdiffuse.scenes.surface_clouds import sort_points
+from robotdiffuse.settings import Count, Sizes
 
 
 @dataclass(frozen=True)
 class CompressionAutoencoderSettings(EncoderSettings):
     """The paper's sizes."""
 
-    code: int = 60
+    code: Count = 60
     """Size of z."""
-    cloud: int = 1400
+    cloud: Count = 1400
     """Points of a cloud: the input is three times as long."""
-    hidden: tuple[int, ...] = (786, 512, 256)
+    hidden: Sizes = (786, 512, 256)
     """Layers of the encoder between the cloud and z; the decoder has the same, from the last to the first."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_layers("hidden")
 
 
 class CompressionAutoencoder(Autoencoder):

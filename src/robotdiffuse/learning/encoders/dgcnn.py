@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from robotdiffuse.errors import InputError
 from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max, pool_mean
+from robotdiffuse.settings import Count, Sizes
 
 SLOPE = 0.2
 """Of the leaky ReLU below zero, as in the original."""
@@ -28,23 +28,22 @@ FAR = 1e9
 class DGCNNSettings(EncoderSettings):
     """Sizes small enough for training on a CPU; the paper's are in brackets."""
 
-    cloud: int = 128
+    cloud: Count = 128
     """Points of the clouds that it is given (1024)."""
-    neighbours: int = 8
+    neighbours: Count = 8
     """Nearest points that each is joined with (20)."""
-    edges: tuple[int, ...] = (32, 32, 64)
+    edges: Sizes = (32, 32, 64)
     """Layers of edge convolution (64, 64, 128, 256)."""
-    embedding: int = 192
+    embedding: Count = 192
     """Features of a point, from all those layers together, that are pooled (1024)."""
-    head: tuple[int, ...] = (192,)
+    head: tuple[Count, ...] = (192,)
     """Layers between the pooled features and z (512, 256)."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_layers("edges")
-        for name in ("neighbours", "embedding"):
-            if getattr(self, name) < 1:
-                raise InputError(f"encoder.{name} is {getattr(self, name)}; it must be 1 or more")
+    @classmethod
+    def paper_size(cls) -> "DGCNNSettings":
+        return cls(
+            code=60, cloud=1024, neighbours=20, edges=(64, 64, 128, 256), embedding=1024, head=(512, 256)
+        )
 
 
 def neighbours(
@@ -85,7 +84,6 @@ class EdgeConvolution(nn.Module):
 class DGCNN(Encoder):
     """z = MLP(max-pool and mean-pool of MLP(outputs of all edge convolutions))."""
 
-    trained = "jointly"
     any_size = False  # how far neighbours are is how dense the cloud is
 
     def __init__(self, settings: DGCNNSettings) -> None:

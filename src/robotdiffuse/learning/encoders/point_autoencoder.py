@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
+from robotdiffuse.settings import Count, Natural, NotNegative, Sizes
 
 QUERIES = 96
 """Points per cloud at which the distance field is reconstructed."""
@@ -25,21 +26,17 @@ DISTANCE_CAP = 0.5
 
 @dataclass(frozen=True)
 class PointAutoencoderSettings(EncoderSettings):
-    points: tuple[int, ...] = (64, 128, 256)
+    points: Sizes = (64, 128, 256)
     """Layers of the perceptron on each point."""
-    octaves: int = 4
+    octaves: Natural = 4
     """Sines and cosines of the coordinates that a point comes with, of wavelengths 4 m, 2 m, ..."""
-    hidden: int = 384
+    hidden: Count = 384
     """Layer between the pooled features and z, and in the decoder."""
-    decoded: int = 192
+    decoded: Count = 192
     """Points that the decoder reconstructs."""
-    distance_weight: float = 4.0
+    distance_weight: NotNegative = 4.0
     """In training: weight of the error of the reconstructed distance field beside the Chamfer distance, both
     in metres."""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.check_layers("points")
 
 
 class PointAutoencoder(Autoencoder):

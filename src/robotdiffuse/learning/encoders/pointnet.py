@@ -16,33 +16,41 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max
+from robotdiffuse.settings import Count, Sizes
 
 
 @dataclass(frozen=True)
 class PointNetSettings(EncoderSettings):
     """Sizes small enough for training on a CPU; the paper's are in brackets."""
 
-    cloud: int = 256
+    cloud: Count = 256
     """Points of the clouds that it is given (1024)."""
     input_transform: bool = True
     """Multiply the coordinates by a matrix that a small network makes of the cloud."""
     feature_transform: bool = True
     """The same with the features of the first layers."""
-    first: tuple[int, ...] = (32, 32)
+    first: Sizes = (32, 32)
     """Layers on each point before the feature transform (64, 64)."""
-    second: tuple[int, ...] = (32, 64, 192)
+    second: Sizes = (32, 64, 192)
     """Layers on each point after it (64, 128, 1024)."""
-    transform: tuple[int, ...] = (16, 32, 64)
+    transform: Sizes = (16, 32, 64)
     """Layers on each point within a transform's network (64, 128, 1024)."""
-    transform_head: tuple[int, ...] = (32,)
+    transform_head: tuple[Count, ...] = (32,)
     """Layers after its maximum (512, 256)."""
-    head: tuple[int, ...] = (192,)
+    head: tuple[Count, ...] = (192,)
     """Layers between the maximum and z (512, 256)."""
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("first", "second", "transform"):
-            self.check_layers(name)
+    @classmethod
+    def paper_size(cls) -> "PointNetSettings":
+        return cls(
+            code=60,
+            cloud=1024,
+            first=(64, 64),
+            second=(64, 128, 1024),
+            transform=(64, 128, 1024),
+            transform_head=(512, 256),
+            head=(512, 256),
+        )
 
 
 def layers(sizes: tuple[int, ...]) -> nn.Sequential:
@@ -79,8 +87,6 @@ class Transform(nn.Module):
 
 class PointNet(Encoder):
     """z = MLP(max over points of MLP(T2 MLP(T1 point)))."""
-
-    trained = "jointly"
 
     def __init__(self, settings: PointNetSettings) -> None:
         super().__init__(settings)

@@ -23,7 +23,7 @@ Differences from the paper:
   to the goal configuration too, and points are labelled by link, not only as scene, robot or target.
 - The floor, which is part of every scene, is in the collision loss but not in the cloud.
 - The collision loss is on the arm's covering spheres, which stick out a little, not on points.
-- The expert's motions are ours, of 48 frames (50), forwards or backwards, with a stand-still at the end.
+- The expert's motions are ours, of 48 waypoints (50), forwards or backwards, with a stand-still at the end.
 - Displacements are output in units of the experts' mean step, and weights begin as K. He et al. (ICCV 2015)
   have them: with PyTorch's defaults, signals fade in so many layers, and learning takes many times as long.
 """
@@ -38,17 +38,19 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.networks.base import BaselineNetwork, JointRanges
+from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.networks.pointnet2 import GroupAll, SetAbstraction
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.losses import ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import ForwardKinematics
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import PackedScenes
 from robotdiffuse.scenes.sampling import VisibleRegion
 from robotdiffuse.scenes.surface_clouds import surface_clouds
+from robotdiffuse.settings import Count, NotNegative, Positive, Settings, Share, Sizes
 
 SMOOTH = 0.1
 """Added to the distance to the goal, in units of half the joint ranges, where it is made a direction."""
@@ -61,77 +63,66 @@ ROLL_OUT_STEPS = 80
 
 
 @dataclass(frozen=True)
-class MPiNetsNetworkSettings:
-    scene_points: int = 256
+class MPiNetsNetworkSettings(Settings, name="mpinets"):
+    scene_points: Count = 256
     """Points of the scene (paper: 4,096)."""
-    robot_points: int = 12
+    robot_points: Count = 12
     """Points of each moving link at the current configuration (paper: 2,048 in all)."""
-    target_points: int = 6
+    target_points: Count = 6
     """The first so many of these at the goal (paper: 128 in all, of the gripper)."""
     region: VisibleRegion = field(default_factory=VisibleRegion)
     """Where points of the scene count."""
-    centres: tuple[int, int] = (96, 24)
+    centres: tuple[Count, Count] = (96, 24)
     """Of the two set abstractions (paper: 512, 128)."""
-    neighbours: tuple[int, int] = (16, 16)
+    neighbours: tuple[Count, Count] = (16, 16)
     """Most points around each centre (paper: 128, 128)."""
-    radii: tuple[float, float] = (0.2, 0.6)
+    radii: tuple[Positive, Positive] = (0.2, 0.6)
     """Of the balls [m] (paper: 0.05, 0.3)."""
-    first_widths: tuple[int, ...] = (32, 32, 64)
+    first_widths: Sizes = (32, 32, 64)
     """Layers of the first set abstraction (paper: 64, 64, 64)."""
-    second_widths: tuple[int, ...] = (96, 128, 192)
+    second_widths: Sizes = (96, 128, 192)
     """Of the second (paper: 128, 128, 256)."""
-    all_widths: tuple[int, ...] = (256, 512)
+    all_widths: Sizes = (256, 512)
     """Of all points together (paper: 512, 512, 1,024)."""
-    cloud_widths: tuple[int, int] = (512, 256)
+    cloud_widths: tuple[Count, Count] = (512, 256)
     """Layers after PointNet++, the last of which is its code (paper: 4,096, 2,048, 2,048)."""
-    joint_widths: tuple[int, ...] = (32, 64, 128, 128, 64)
+    joint_widths: Sizes = (32, 64, 128, 128, 64)
     """Layers of the configuration encoder (the paper's)."""
-    decoder_widths: tuple[int, ...] = (512, 256, 128)
+    decoder_widths: Sizes = (512, 256, 128)
     """Layers of the decoder (the paper's)."""
-    point_match: float = 1.0
+    point_match: NotNegative = 1.0
     """Weight of the loss on points of the arm (the paper's)."""
-    collision: float = 5.0
+    collision: NotNegative = 5.0
     """Weight of the loss on the distance to the scene (the paper's)."""
-    margin: float = 0.03
+    margin: NotNegative = 0.03
     """Distance to the scene at which it sets in [m] (the paper's)."""
-    noise: float = 0.015
+    noise: NotNegative = 0.015
     """Standard deviation of the noise on the input configuration [rad] (the paper's)."""
-    trivial_share: float = 0.3
+    trivial_share: Share = 0.3
     """Share of the samples from motions whose straight line is free too."""
-    near: float = 0.3
+    near: NotNegative = 0.3
     """In `success`: largest distance of a joint at which the goal is reached by a straight edge [rad]."""
 
     def __post_init__(self) -> None:
-        for name in ("scene_points", "robot_points", "target_points"):
-            if getattr(self, name) < 1:
-                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be at least 1")
+        super().__post_init__()
         if self.target_points > self.robot_points:
             raise InputError(
                 f"mpinets.target_points is {self.target_points}; it must be at most robot_points, "
                 f"{self.robot_points}"
             )
         for name in ("centres", "neighbours", "radii"):
-            if len(getattr(self, name)) != 2 or not min(getattr(self, name)) > 0:
-                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be two positive numbers")
+            if len(getattr(self, name)) != 2:
+                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be two numbers")
         if self.centres[0] > self.scene_points or self.centres[1] > self.centres[0]:
             raise InputError(
                 f"mpinets.centres is {self.centres}; it must fall, from at most scene_points, "
                 f"{self.scene_points}"
             )
-        for name in ("first_widths", "second_widths", "all_widths", "cloud_widths", "joint_widths",
-                     "decoder_widths"):  # fmt: skip
-            if not getattr(self, name) or min(getattr(self, name)) < 1:
-                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must be positive numbers")
         if len(self.cloud_widths) != 2 or self.cloud_widths[0] % GROUPS:
             raise InputError(
                 f"mpinets.cloud_widths is {self.cloud_widths}; it must be two numbers, the first a multiple "
                 f"of {GROUPS}"
             )
-        for name in ("point_match", "collision", "margin", "noise", "near"):
-            if not getattr(self, name) >= 0:
-                raise InputError(f"mpinets.{name} is {getattr(self, name)}; it must not be negative")
-        if not 0 <= self.trivial_share <= 1:
-            raise InputError(f"mpinets.trivial_share is {self.trivial_share}; it must be between 0 and 1")
 
 
 GROUPS = 16
@@ -144,7 +135,7 @@ class Steps(NamedTuple):
     q: Float32[Tensor, "n dof"]
     """Where the arm is, with noise [rad]."""
     expert: Float32[Tensor, "n dof"]
-    """The next frame of the motion [rad]."""
+    """The next waypoint of the motion [rad]."""
     goal: Float32[Tensor, "n dof"]
     clouds: Float32[Tensor, "n points 3"]
     """Of the scenes [m]."""
@@ -154,13 +145,12 @@ class Steps(NamedTuple):
 class MPiNetsNetwork(BaselineNetwork):
     """The policy. It loads the robot, bundled or from its URDF, for surface points and covering spheres."""
 
-    settings_class = MPiNetsNetworkSettings
     training_defaults: ClassVar[dict[str, Any]] = {"batch": 128, "learning_rate": 2e-3}
     settings: MPiNetsNetworkSettings
 
-    def __init__(self, ranges: JointRanges, settings: MPiNetsNetworkSettings) -> None:
-        super().__init__(ranges, settings)
-        s, kinematics = settings, ForwardKinematics(load_robot(ranges.robot))
+    def __init__(self, robot: RobotIdentity, settings: MPiNetsNetworkSettings) -> None:
+        super().__init__(robot, settings)
+        s, kinematics = settings, ForwardKinematics(load_robot(robot.source))
         # always the same points, so that a checkpoint needs no copy of them
         self._surface = SurfacePoints(kinematics, s.robot_points, np.random.default_rng(0))
         self._distance = ArmDistance(kinematics)
@@ -202,7 +192,8 @@ class MPiNetsNetwork(BaselineNetwork):
     def fit_statistics(self, data: TrajectoryData) -> None:
         """The size of the experts' steps."""
         some = data.q[:20_000]
-        size = np.sqrt(np.square(self.normalized(some[:, 1:]) - self.normalized(some[:, :-1])).mean((0, 1)))
+        steps = np.diff(self.normalizer.to_unit(some), axis=1)
+        size = np.sqrt(np.square(steps).mean((0, 1)))
         self.step.copy_(torch.from_numpy(np.maximum(size, 1e-4)))
 
     def forward(
@@ -218,11 +209,11 @@ class MPiNetsNetwork(BaselineNetwork):
             at, features = self.first(points, labels.expand(len(q), *labels.shape))
             seen = self.cloud_code(self.together(*self.second(at, features)))
         # bf16 would round configurations to a hundredth of a radian
-        x = self.normalized(q)
-        way = self.normalized(goal) - x
+        x = self.normalizer.to_unit(q)
+        way = self.normalizer.to_unit(goal) - x
         direction = 2 * way / (way.norm(dim=-1, keepdim=True) + SMOOTH)
         code = torch.cat([seen.float(), self.joint_code(torch.cat([x, direction], -1))], -1)
-        return self.joints((x + self.step * self.decoder(code)).clamp(-1, 1))
+        return self.normalizer.from_unit((x + self.step * self.decoder(code)).clamp(-1, 1))
 
     def loss(
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
@@ -236,15 +227,15 @@ class MPiNetsNetwork(BaselineNetwork):
         return (s.point_match * match + s.collision * close) / LOSS_UNIT
 
     def draw(self, data: TrajectoryData, count: int, rng: np.random.Generator) -> Steps:
-        """Random frames of random motions, forwards or backwards, and the frames that follow them."""
+        """Random waypoints of random motions, forwards or backwards, and the waypoints that follow them."""
         rows = data.draw(count, self.settings.trivial_share, rng)
         last = data.q.shape[1] - 1
         way = np.where(rng.random(count) < 0.5, 1, -1)
-        frame = rng.integers(0, last + 1, count)
-        frames = np.stack([frame, np.minimum(frame + 1, last), np.full(count, last)])
-        q, expert, goal = data.q[rows, np.where(way > 0, frames, last - frames)]
+        waypoint = rng.integers(0, last + 1, count)
+        waypoints = np.stack([waypoint, np.minimum(waypoint + 1, last), np.full(count, last)])
+        q, expert, goal = data.q[rows, np.where(way > 0, waypoints, last - waypoints)]
         q = q + self.settings.noise * rng.standard_normal(q.shape, dtype=np.float32)
-        q = self.joints(np.clip(self.normalized(q), -1, 1))
+        q = self.normalizer.from_unit(np.clip(self.normalizer.to_unit(q), -1, 1))
         scenes = data.scenes[rows]
         clouds = self.clouds(scenes, rng)
         here, after, end = (torch.from_numpy(part) for part in (q, expert, goal))
@@ -269,7 +260,7 @@ class MPiNetsNetwork(BaselineNetwork):
                 break
             roll_outs.advance()
         arrived = roll_outs.distances() < self.settings.near
-        motions = np.concatenate([np.stack(roll_outs.frames, 1), q[:, -1:]], 1)
+        motions = np.concatenate([np.stack(roll_outs.waypoints, 1), q[:, -1:]], 1)
         return float((arrived & motions_free(robot, scenes, motions)).mean())
 
 
@@ -285,13 +276,13 @@ class RollOuts:
     ) -> None:
         """clouds of the scenes [m]; start and goal in [rad]."""
         self.network, self._clouds, self._goal = network, clouds, goal
-        self.frames = [start]
+        self.waypoints = [start]
         """[n, dof] after each step [rad]; roll-outs that have stopped stay where they are."""
         self.running = np.ones(len(start), bool)
 
     def distances(self) -> Float[ndarray, "n"]:
         """How far the joint farthest from its goal is [rad]."""
-        return np.abs(self.frames[-1] - self._goal).max(1)
+        return np.abs(self.waypoints[-1] - self._goal).max(1)
 
     def stop(self, which: Bool[ndarray, "n"]) -> None:
         self.running &= ~which
@@ -299,14 +290,15 @@ class RollOuts:
     def advance(self, noise: Float32[ndarray, "n dof"] | None = None) -> None:
         """One step of those that run; `noise` [rad] is added to where the policy sees the arm."""
         rows = np.flatnonzero(self.running)
-        seen = self.frames[-1] if noise is None else self.frames[-1] + noise
-        q = self.network.normalized(seen[rows]).clip(-1, 1)
+        seen = self.waypoints[-1] if noise is None else self.waypoints[-1] + noise
+        normalizer = self.network.normalizer
+        q = normalizer.from_unit(normalizer.to_unit(seen[rows]).clip(-1, 1))
         with torch.inference_mode():
-            at, goal = (torch.from_numpy(part) for part in (self.network.joints(q), self._goal[rows]))
+            at, goal = torch.from_numpy(q), torch.from_numpy(self._goal[rows])
             moved = self.network(self._clouds[torch.from_numpy(rows)], at, goal).numpy()
-        after = self.frames[-1].copy()
+        after = self.waypoints[-1].copy()
         after[rows] = moved
-        self.frames.append(after)
+        self.waypoints.append(after)
 
 
 def _leaky(channels: int, widths: tuple[int, ...]) -> nn.Sequential:

@@ -20,7 +20,7 @@ Differences from the paper:
   dropout disturbs the step alone, not where the arm already is.
 - A quarter of Pnet's outputs is dropped, not half: of its narrower layers about as many are left as in the
   paper. With half, Pnet learns far less in the training that it has here.
-- Waypoints are 0.7 rad apart on our demonstrations, from a random frame on; those of the paper are the
+- Waypoints are 0.7 rad apart on our demonstrations, from a random waypoint on; those of the paper are the
   vertices of optimised RRT* paths. It is a sixth of a path on average, and the chords are 0.3 % shorter than
   the paths; steps of one length leave no doubt about it, as steps of a share of the path would.
 - Half of the samples have a later waypoint for their goal, not the last one: such pairs are what
@@ -30,7 +30,7 @@ Differences from the paper:
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -39,12 +39,14 @@ from numpy import ndarray
 from torch import Generator, Tensor, nn
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.networks.base import BaselineNetwork, JointRanges
+from robotdiffuse.learning.networks.base import BaselineNetwork
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import PANDA_REGION, VisibleRegion
 from robotdiffuse.scenes.surface_clouds import surface_clouds
+from robotdiffuse.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Share, Sizes
 
 BITS = 10
 """Of each coordinate in the place of a point along the space-filling curve."""
@@ -54,56 +56,39 @@ SUCCESS_STEPS = 24
 
 
 @dataclass(frozen=True)
-class MPNetSettings:
-    points: int = 320
+class MPNetSettings(Settings, name="mpnet"):
+    points: Count = 320
     """Points of the cloud that Enet sees (paper: 1,400, of a plane)."""
-    encoder_layers: tuple[int, ...] = (384, 256, 128)
+    encoder_layers: Sizes = (384, 256, 128)
     """Layers of Enet between the cloud and z (paper: 512, 256, 128)."""
-    decoder_layer: int = 128
+    decoder_layer: Count = 128
     """The one layer between z and the reconstruction, which is of no use after the training (paper: the
     mirror image of Enet)."""
-    code: int = 60
+    code: Count = 60
     """Size of z (paper: 28, for a plane)."""
-    contraction: float = 1e-3
+    contraction: NotNegative = 1e-3
     """lambda, the weight of the contractive penalty [m^2]."""
-    pretraining: float = 0.1
+    pretraining: Annotated[float, Bound(least=0.0, below=1.0)] = 0.1
     """Share of the training, the first, in which Enet is trained as an auto-encoder."""
-    layers: tuple[int, ...] = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
+    layers: Sizes = (768, 640, 512, 384, 320, 256, 192, 128, 128, 64, 32)
     """Layers of Pnet (paper: 1280, 1024, 896, 768, 512, 384, 256, 256, 128, 64, 32)."""
-    dropout: float = 0.25
+    dropout: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
     """Share of the outputs of Pnet's layers that is dropped, in planning as in training (paper: 0.5,
     of wider layers)."""
-    steady_layers: int = 2
+    steady_layers: Natural = 2
     """So many of Pnet's layers, the last, have no dropout (paper: nearly all have it)."""
-    step: float = 0.7
+    step: Positive = 0.7
     """Way along the path from one waypoint to the next [rad, joint-space L2]."""
-    waypoints: int = 8
+    waypoints: Count = 8
     """Samples drawn of each trajectory; they share z."""
-    sub_goals: float = 0.5
-    """Share of the samples whose goal is a later frame of the trajectory than its last one."""
-    trivial_share: float = 0.15
+    sub_goals: Share = 0.5
+    """Share of the samples whose goal is a later waypoint of the trajectory than its last one."""
+    trivial_share: Share = 0.15
     """Share of the trajectories in training whose straight line is free as well."""
 
     def __post_init__(self) -> None:
-        for name in ("points", "code", "decoder_layer", "waypoints"):
-            if getattr(self, name) < 1:
-                raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must be at least 1")
-        for name in ("encoder_layers", "layers"):
-            if not getattr(self, name) or min(getattr(self, name)) < 1:
-                raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must hold sizes of at least 1")
-        for name in ("dropout", "pretraining"):
-            if not 0 <= getattr(self, name) < 1:
-                raise InputError(
-                    f"mpnet.{name} is {getattr(self, name)}; it must be at least 0 and less than 1"
-                )
-        for name in ("sub_goals", "trivial_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InputError(f"mpnet.{name} is {getattr(self, name)}; it must be between 0 and 1")
-        if not self.step > 0:
-            raise InputError(f"mpnet.step is {self.step}; it must be positive")
-        if not self.contraction >= 0:
-            raise InputError(f"mpnet.contraction is {self.contraction}; it must not be negative")
-        if not 0 <= self.steady_layers <= len(self.layers):
+        super().__post_init__()
+        if self.steady_layers > len(self.layers):
             raise InputError(
                 f"mpnet.steady_layers is {self.steady_layers}; Pnet has {len(self.layers)} layers"
             )
@@ -112,14 +97,13 @@ class MPNetSettings:
 class MPNetNetwork(BaselineNetwork):
     """Enet with its decoder, and Pnet."""
 
-    settings_class: ClassVar[type] = MPNetSettings
     training_defaults: ClassVar[dict[str, Any]] = {"batch": 1024}
     settings: MPNetSettings
     region: VisibleRegion = PANDA_REGION
     """Where points on obstacles count."""
 
-    def __init__(self, ranges: JointRanges, settings: MPNetSettings | None = None) -> None:
-        super().__init__(ranges, settings or MPNetSettings())
+    def __init__(self, robot: RobotIdentity, settings: MPNetSettings | None = None) -> None:
+        super().__init__(robot, settings or MPNetSettings())
         of = self.settings
         sizes = (3 * of.points, *of.encoder_layers, of.code)
         self.encoder = Perceptron(sizes)
@@ -136,7 +120,7 @@ class MPNetNetwork(BaselineNetwork):
             rng = np.random.default_rng(0)
             rows = data.draw(5_000, self.settings.trivial_share, rng)
             here, following, _ = self._samples(data.q[rows], rng)
-            step = self.normalized(following) - self.normalized(here)
+            step = self.normalizer.to_unit(following) - self.normalizer.to_unit(here)
             self.step_scale.fill_(max(float(np.sqrt(np.mean(step**2))), 1e-3))
 
     def encode(self, cloud: Float[Tensor, "batch points 3"]) -> Float[Tensor, "batch code"]:
@@ -154,9 +138,9 @@ class MPNetNetwork(BaselineNetwork):
 
         Dropout is drawn from the generator, in training and evaluation mode alike; None: without dropout.
         """
-        x, target = self.normalized(q), self.normalized(goal)
+        x, target = self.normalizer.to_unit(q), self.normalizer.to_unit(goal)
         step = self.policy(torch.cat([z, x, target], 1), generator)
-        return self.joints((x + self.step_scale * step).clamp(-1, 1))
+        return self.normalizer.from_unit((x + self.step_scale * step).clamp(-1, 1))
 
     def loss(
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
@@ -175,9 +159,9 @@ class MPNetNetwork(BaselineNetwork):
                 return self.autoencoder_loss(cloud, generator)
             z = self.encode(cloud).repeat_interleave(of.waypoints, 0)
             q, following, goal = (torch.from_numpy(a) for a in self._samples(data.q[rows], rng))
-            x, target = self.normalized(q), self.normalized(goal)
+            x, target = self.normalizer.to_unit(q), self.normalizer.to_unit(goal)
             step = self.policy(torch.cat([z, x.to(z), target.to(z)], 1), generator)
-        wanted = (self.normalized(following) - x) / self.step_scale
+        wanted = (self.normalizer.to_unit(following) - x) / self.step_scale
         return (step.float() - wanted).square().mean()
 
     def autoencoder_loss(
@@ -220,7 +204,7 @@ class MPNetNetwork(BaselineNetwork):
         return float(found.mean())
 
     def _samples(
-        self, q: Float[ndarray, "scenes frames dof"], rng: np.random.Generator
+        self, q: Float[ndarray, "scenes waypoints dof"], rng: np.random.Generator
     ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
         """Configurations, the waypoints that follow them, and goals, in random directions [rad]."""
         of, last = self.settings, q.shape[1] - 1
@@ -238,12 +222,12 @@ class MPNetNetwork(BaselineNetwork):
         return here, following, end
 
 
-def refined(path: Float[ndarray, "n frames dof"], parts: int) -> Float[ndarray, "n _ dof"]:
+def refined(path: Float[ndarray, "n waypoints dof"], parts: int) -> Float[ndarray, "n _ dof"]:
     """The path with so many equal parts in place of each of its segments."""
-    n, frames, dof = path.shape
+    n, waypoints, dof = path.shape
     share = (np.arange(parts, dtype=path.dtype) / parts)[:, None]
     dense = path[:, :-1, None] + share * np.diff(path, axis=1)[:, :, None]
-    return np.concatenate([dense.reshape(n, (frames - 1) * parts, dof), path[:, -1:]], 1)
+    return np.concatenate([dense.reshape(n, (waypoints - 1) * parts, dof), path[:, -1:]], 1)
 
 
 class Perceptron(nn.Module):

@@ -12,7 +12,8 @@ step. So one trained network serves both; each samples by levels, noise and guid
 
 Differences from the papers, with their values:
 
-- One network for both. Frames: 48, as all our data (MPD 64, EDMP 50). Joint positions alone as in EDMP (MPD
+- One network for both. Waypoints: 48, as all our data (MPD 64, EDMP 50). Joint positions alone as in EDMP
+(MPD
   adds velocities), scaled to the joint limits as in both.
 - T = 255 levels of the cosine schedule, as EDMP; MPD trains with 25 levels of an exponential schedule. Its
   sampler takes the 25 of these levels that are nearest to it in signal-to-noise ratio (`exponential_levels`).
@@ -25,7 +26,7 @@ Differences from the papers, with their values:
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
@@ -40,11 +41,14 @@ from robotdiffuse.learning.denoisers.unet import UNet, UNetSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import one_thread
-from robotdiffuse.learning.networks.base import BaselineNetwork, JointRanges
+from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.objectives import objective_for
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.samplers.ddpm import ancestral
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.settings import Bound, Settings, Share
 
 SUCCESS_PROBLEMS = 24
 """Motions that `success` tries."""
@@ -57,28 +61,20 @@ EXPONENTIAL_BETAS = (1e-4, 1.0)
 
 
 @dataclass(frozen=True)
-class TrajectoryPriorSettings:
-    frames: int = 48
+class TrajectoryPriorSettings(Settings, name="trajectory_prior"):
+    waypoints: Annotated[int, Bound(least=3.0)] = 48
     """Of a trajectory, evenly spaced along it (MPD: 64, EDMP: 50)."""
     unet: UNetSettings = field(
         default_factory=lambda: UNetSettings(width=32, multiples=(1, 2, 4), kernel=5, condition_width=64)
     )
     schedule: ScheduleSettings = field(default_factory=lambda: ScheduleSettings(steps=255, kind="cosine"))
     """EDMP's; of MPD's 25 exponential levels a part, see the head of this file."""
-    trivial_share: float = 0.1
+    trivial_share: Share = 0.1
     """Share of a batch whose straight lines are free."""
-
-    def __post_init__(self) -> None:
-        if self.frames < 3:
-            raise InputError(f"trajectory_prior.frames is {self.frames}; it must be at least 3")
-        if not 0 <= self.trivial_share <= 1:
-            raise InputError(
-                f"trajectory_prior.trivial_share is {self.trivial_share}; it must be between 0 and 1"
-            )
 
 
 Guide = Callable[[ndarray, int], ndarray]
-"""The mean of a denoising step [count, frames, dof] [rad], and how many steps are still to come (0 at
+"""The mean of a denoising step [count, waypoints, dof] [rad], and how many steps are still to come (0 at
 the last one and in the steps without noise after it), to the mean after steps down the guide's costs."""
 
 
@@ -86,19 +82,18 @@ class TrajectoryPrior(BaselineNetwork):
     """The U-Net and its noise schedule; see the head of this file."""
 
     settings: TrajectoryPriorSettings
-    settings_class = TrajectoryPriorSettings
     training_defaults: ClassVar[dict[str, Any]] = {"batch": 128, "learning_rate": 2e-3}
 
-    def __init__(self, ranges: JointRanges, settings: TrajectoryPriorSettings) -> None:
-        super().__init__(ranges, settings)
+    def __init__(self, robot: RobotIdentity, settings: TrajectoryPriorSettings) -> None:
+        super().__init__(robot, settings)
         self.schedule = NoiseSchedule(settings.schedule)
         self.objective = objective_for("noise", self.schedule)
         # the U-Net wants a condition: one number that is always zero
-        self.denoiser = UNet(settings.unet, settings.frames, self.dof, self.dof, 1)
+        self.denoiser = UNet(settings.unet, settings.waypoints, self.dof, self.dof, 1)
 
     def for_inference(self) -> "TrajectoryPrior":
         """Freeze, and keep the matrices in bf16 where that is fast, here by a sixth. Returns self."""
-        self.requires_grad_(False).eval()
+        super().for_inference()
         if fast_bf16():
             for module in self.denoiser.modules():
                 if isinstance(module, Linear):
@@ -106,8 +101,8 @@ class TrajectoryPrior(BaselineNetwork):
         return self
 
     def forward(
-        self, x: Float[Tensor, "batch frames dof"], level: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch frames dof"]:
+        self, x: Float[Tensor, "batch waypoints dof"], level: Float[Tensor, "batch"]
+    ) -> Float[Tensor, "batch waypoints dof"]:
         """The noise in x; `level` is t / T. In bf16 where the CPU multiplies it fast."""
         with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16() and x.device.type == "cpu"):
             return self.denoiser(x, level, x.new_zeros(len(x), 1)).float()
@@ -115,20 +110,21 @@ class TrajectoryPrior(BaselineNetwork):
     def loss(
         self, data: TrajectoryData, count: int, fraction: float, rng: np.random.Generator
     ) -> Float[Tensor, ""]:
-        """The squared error of the noise of all frames but the ends, which are held (Ho et al. 2020, eq. 14).
+        """The squared error of the noise of all waypoints but the ends, which are held (Ho et al. 2020, eq.
+        14).
 
-        Raises InputError if the data have another number of frames.
+        Raises InputError if the data have another number of waypoints.
         """
-        frames, schedule = self.settings.frames, self.schedule
-        if data.q.shape[1] != frames:
+        waypoints, schedule = self.settings.waypoints, self.schedule
+        if data.q.shape[1] != waypoints:
             raise InputError(
-                f"the data have {data.q.shape[1]} frames and trajectory_prior.frames is {frames}; "
+                f"the data have {data.q.shape[1]} waypoints and trajectory_prior.waypoints is {waypoints}; "
                 "they must be the same"
             )
         q = data.q[data.draw(count, self.settings.trivial_share, rng)]
         back = rng.random(count) < 0.5
         q[back] = q[back, ::-1]
-        clean = self.normalized(q.astype(np.float32))
+        clean = self.normalizer.to_unit(q.astype(np.float32))
         # One level from each of `count` equal parts of the range: less variance than independent draws.
         parts = (np.arange(count) + rng.random(count)) / count
         levels = np.minimum(1 + (parts * schedule.steps).astype(np.int64), schedule.steps)
@@ -178,16 +174,20 @@ class TrajectoryPrior(BaselineNetwork):
         noise_scale: float = 1.0,
         quiet_steps: int = 0,
         stop: Callable[[], bool] = lambda: False,
-    ) -> Float[ndarray, "count frames dof"] | None:
+    ) -> Float[ndarray, "count waypoints dof"] | None:
         """A trajectory from each start to its goal, float32, within the limits but for the ends themselves.
 
-        levels, noise_scale, quiet_steps: see `denoise`.
+        levels, noise_scale: see `ancestral`.
+        quiet_steps: more steps at the last level, to which no noise is added (MPD: 5).
         stop: asked before every step; None is returned if it says so.
         """
-        ends = self.normalized(np.stack([starts, goals], 1).astype(np.float32))
+        ends = self.normalizer.to_unit(np.stack([starts, goals], 1).astype(np.float32))
         device = next(self.parameters()).device
 
         def predict(x: ndarray, level: int) -> ndarray:
+            if stop():
+                raise StoppedError
+            x[:, [0, -1]] = ends
             of_levels = torch.full((len(x),), level / self.schedule.steps, device=device)
             noise = self(torch.from_numpy(x).to(device), of_levels).cpu().numpy()
             signal, noise_level = float(self.schedule.signal[level]), float(self.schedule.noise[level])
@@ -195,61 +195,25 @@ class TrajectoryPrior(BaselineNetwork):
             return np.clip(self.objective.clean(x, noise, signal, noise_level), -1.0, 1.0)
 
         def move(x: ndarray, left: int) -> ndarray:
-            return x if guide is None else self.normalized(guide(self.joints(x), left))
+            return x if guide is None else self.normalizer.to_unit(guide(self.normalizer.from_unit(x), left))
 
-        noise = rng.standard_normal((len(ends), self.settings.frames, self.dof), np.float32)
+        def draw_noise() -> ndarray:
+            return rng.standard_normal((len(ends), self.settings.waypoints, self.dof), np.float32)
+
         with torch.inference_mode(), one_thread():
-            x = denoise(
-                predict, self.schedule, levels, noise, ends, rng, move, noise_scale, quiet_steps, stop
-            )
-        if x is None:
-            return None
-        q = self.joints(np.clip(x, -1.0, 1.0))
+            try:
+                x = ancestral(predict, self.schedule, draw_noise, levels, move, noise_scale)
+                for _ in range(quiet_steps):
+                    x = move(predict(x, int(levels[-1])), 0)
+            except StoppedError:
+                return None
+        q = self.normalizer.from_unit(np.clip(x, -1.0, 1.0))
         q[:, 0], q[:, -1] = starts, goals
         return q
 
 
-def denoise(
-    predict: Callable[[ndarray, int], ndarray],
-    schedule: NoiseSchedule,
-    levels: Int[ndarray, "steps"],
-    x: Float[ndarray, "count frames dof"],
-    ends: Float[ndarray, "count 2 dof"],
-    rng: np.random.Generator,
-    move: Callable[[ndarray, int], ndarray],
-    noise_scale: float = 1.0,
-    quiet_steps: int = 0,
-    stop: Callable[[], bool] = lambda: False,
-) -> Float[ndarray, "count frames dof"] | None:
-    """Ancestral sampling (Ho et al. 2020, algorithm 2) with held ends, and means that `move` may move.
-
-    predict: (x_t, t) to the clean x_0, as samplers have it.
-    levels: falling; the first is where x, standard noise, is put, and below the last comes the clean x_0.
-    move: the mean of a step and the steps still to come to the mean that is used (MPD, algorithm 1).
-    noise_scale: factor of the standard deviation that is added to the means (MPD: 0.5).
-    quiet_steps: more steps at the last level, to which no noise is added (MPD: 5).
-    """
-    if not len(levels) or np.any(np.diff(levels) >= 0) or not 1 <= levels[-1] <= levels[0] <= schedule.steps:
-        raise InputError(f"levels is {levels.tolist()}; they must fall from at most {schedule.steps} to 1")
-    x = x.copy()
-    x[:, [0, -1]] = ends
-    lower = [*levels[1:].tolist(), 0]
-    pairs = list(zip(levels.tolist(), lower, strict=True)) + [(int(levels[-1]), 0)] * quiet_steps
-    for step, (level, low) in enumerate(pairs):
-        if stop():
-            return None
-        clean = predict(x, level)
-        variance, variance_low = float(schedule.noise[level]) ** 2, float(schedule.noise[low]) ** 2
-        kept = float(schedule.signal[level] / schedule.signal[low])
-        added = max(variance - kept**2 * variance_low, 0.0)
-        # q(x_low | x_level, x_0): Ho et al. 2020, eq. 7, between any two levels
-        mean = kept * variance_low / variance * x + float(schedule.signal[low]) * added / variance * clean
-        x = move(mean.astype(np.float32), max(len(levels) - 1 - step, 0))
-        deviation = (added * variance_low / variance) ** 0.5
-        if deviation > 0:
-            x = x + np.float32(noise_scale * deviation) * rng.standard_normal(x.shape, np.float32)
-        x[:, [0, -1]] = ends
-    return x
+class StoppedError(Exception):
+    """Time ran out while trajectories were sampled."""
 
 
 def exponential_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:

@@ -1,17 +1,15 @@
-"""Samplers: from noise to clean trajectories by calls of a denoiser."""
+"""Samplers: from noise to clean trajectories by calls of a denoiser. A new one is one file and one line."""
 
-from robotdiffuse.learning.samplers.ddim import ddim
-from robotdiffuse.learning.samplers.ddpm import ddpm
-from robotdiffuse.learning.samplers.dpm_solver import dpm_solver
-from robotdiffuse.learning.samplers.euler import euler
-from robotdiffuse.learning.samplers.sampler import DrawNoise, Predict, Sampler
+from robotdiffuse.registry import Entry, Registry
 
-SAMPLERS: dict[str, Sampler] = {
-    "ddim": ddim,
-    "ddpm": ddpm,
-    "dpm_solver": dpm_solver,
-    "euler": euler,
-}
-"""Name in checkpoints: function."""
-
-__all__ = ["SAMPLERS", "DrawNoise", "Predict", "Sampler", "ddim", "ddpm", "dpm_solver", "euler"]
+_ROOM = "robotdiffuse.learning.samplers."
+SAMPLERS = Registry(
+    "sampler",
+    {
+        "ddim": Entry(_ROOM + "ddim:ddim", "deterministic, or with a share of the noise drawn afresh"),
+        "ddpm": Entry(_ROOM + "ddpm:ddpm", "ancestral sampling, the paper's"),
+        "dpm_solver": Entry(_ROOM + "dpm_solver:dpm_solver", "DPM-Solver++(2M), of second order"),
+        "euler": Entry(_ROOM + "ddim:ddim", "Euler's method for flows, which is DDIM"),
+    },
+)
+"""By the name in settings and checkpoints: functions, see `sampler.Sampler`."""

@@ -1,4 +1,16 @@
-"""DDIM (Song et al. 2021): deterministic, or with a share of the noise drawn afresh at every step."""
+"""DDIM (Song et al. 2021): deterministic, or with a share of the noise drawn afresh at every step.
+
+It is Euler's method for flows too. On the flow schedule, with t from 1 to 0, x_t = (1 - t) x_0 + t n and the
+velocity is dx/dt = n - x_0. The predicted x_0 makes it v = (x_t - x_0) / t, and Euler's step from t to s is
+
+    x_s = x_t + (s - t) v = (s / t) x_t + (1 - s / t) x_0.
+
+DDIM keeps x_0 and the noise n = (x_t - (1 - t) x_0) / t that belongs to it, and mixes them anew:
+
+    x_s = (1 - s) x_0 + s n = (s / t) x_t + (1 - s - s (1 - t) / t) x_0 = (s / t) x_t + (1 - s / t) x_0,
+
+the same rule. On other schedules DDIM is Euler's method in x / signal over noise / signal (eq. 14 there).
+"""
 
 from itertools import pairwise
 

@@ -1,12 +1,18 @@
-"""DDPM, ancestral sampling (Ho et al. 2020): the paper's sampler, with all T levels."""
+"""DDPM, ancestral sampling (Ho et al. 2020): the paper's sampler, with all T levels; MPD's and EDMP's."""
 
+from collections.abc import Callable
 from itertools import pairwise
 
-from jaxtyping import Float
+import numpy as np
+from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.errors import InputError
 from robotdiffuse.learning.diffusion import NoiseSchedule
 from robotdiffuse.learning.samplers.sampler import DrawNoise, Predict, check_eta
+
+Move = Callable[[ndarray, int], ndarray]
+"""The mean of a step [count, ...], and how many steps are still to come, to the mean that is used."""
 
 
 def ddpm(
@@ -18,19 +24,51 @@ def ddpm(
 ) -> Float[ndarray, "count ..."]:
     """See `Sampler`; None for `steps` is all T of them.
 
-    Each x is drawn from q(x_lower | x_level, x_0) at the predicted x_0, whose variance is beta tilde (Ho et
-    al. 2020, eq. 7; between any two levels, Kingma et al. 2021, eq. 25). Ancestral sampling draws all of its
-    noise afresh, so `eta` changes nothing.
+    Ancestral sampling draws all of its noise afresh, so `eta` changes nothing.
     """
     check_eta(eta)
-    levels = schedule.sampling_levels(schedule.steps if steps is None else steps).tolist()
-    signal, variance = schedule.signal.tolist(), (schedule.noise**2).tolist()
+    levels = schedule.sampling_levels(schedule.steps if steps is None else steps)
+    return ancestral(predict, schedule, draw_noise, levels[:-1])
+
+
+def ancestral(
+    predict: Predict,
+    schedule: NoiseSchedule,
+    draw_noise: DrawNoise,
+    levels: Int[ndarray, "steps"],
+    move: Move | None = None,
+    noise_scale: float = 1.0,
+) -> Float[ndarray, "count ..."]:
+    """Ancestral sampling (Ho et al. 2020, algorithm 2) at any levels, with means that may be moved.
+
+    Each x is drawn from q(x_lower | x_level, x_0) at the predicted x_0, whose variance is beta tilde (Ho et
+    al. 2020, eq. 7; between any two levels, Kingma et al. 2021, eq. 25).
+
+    levels: falling; the first is where standard noise is put, and below the last comes the clean x_0.
+    move: moves the means, down the costs of a guide, say (MPD, algorithm 1).
+    noise_scale: factor of the standard deviation that is added to the means (MPD: 0.5).
+
+    Raises InputError for levels that do not fall, or are not of the schedule.
+    """
+    if not len(levels) or np.any(np.diff(levels) >= 0) or not 1 <= levels[-1] <= levels[0] <= schedule.steps:
+        raise InputError(f"levels is {levels.tolist()}; they must fall from at most {schedule.steps} to 1")
+    pairs = list(pairwise([*levels.tolist(), 0]))
     x = draw_noise()
-    for level, lower in pairwise(levels[:-1]):
+    for step, (level, lower) in enumerate(pairs, 1):
         clean = predict(x, level)
-        kept = signal[level] / signal[lower]
-        added = max(variance[level] - kept**2 * variance[lower], 0.0)
-        of_x = kept * variance[lower] / variance[level]
-        of_clean = signal[lower] * added / variance[level]
-        x = of_x * x + of_clean * clean + (added * variance[lower] / variance[level]) ** 0.5 * draw_noise()
-    return predict(x, levels[-2])
+        mean, deviation = _posterior(schedule, level, lower, x, clean) if lower else (clean, 0.0)
+        x = mean if move is None else move(mean, len(pairs) - step)
+        if lower:
+            x = x + noise_scale * deviation * draw_noise()
+    return x
+
+
+def _posterior(
+    schedule: NoiseSchedule, level: int, lower: int, x: Float[ndarray, "*s"], clean: Float[ndarray, "*s"]
+) -> tuple[Float[ndarray, "*s"], float]:
+    """Mean and standard deviation of x at the lower level, see `ancestral`."""
+    variance, variance_low = float(schedule.noise[level]) ** 2, float(schedule.noise[lower]) ** 2
+    kept = float(schedule.signal[level] / schedule.signal[lower])
+    added = max(variance - kept**2 * variance_low, 0.0)
+    mean = kept * variance_low / variance * x + float(schedule.signal[lower]) * added / variance * clean
+    return mean, (added * variance_low / variance) ** 0.5

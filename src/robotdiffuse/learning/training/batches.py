@@ -13,14 +13,14 @@ from jaxtyping import Bool, Float, Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.data.dataset import read_rows
+from robotdiffuse.data.rows import read_rows
 from robotdiffuse.data.shards import SPLITS, shard_indices
 from robotdiffuse.data.turns import turns_about_vertical
 from robotdiffuse.errors import InputError
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.checkpoint import fingerprint
 from robotdiffuse.learning.clearances import PackedClearanceFn
-from robotdiffuse.learning.encoders import Encoder
+from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import BOX, NONE, SPHERE, PackedScenes
@@ -55,7 +55,7 @@ def random_scenes(count: int, max_obstacles: int, rng: np.random.Generator) -> P
 class TrajectoryData:
     """Planned trajectories with their scenes, in memory."""
 
-    q: Float[ndarray, "n frames dof"]
+    q: Float[ndarray, "n waypoints dof"]
     """[rad], float32, evenly spaced along the path."""
     scenes: PackedScenes
     trivial: Bool[ndarray, "n"]
@@ -104,11 +104,12 @@ def load_data(
     folder: str,
     robot: Robot,
     encoder: Encoder | None,
-    frames: int,
+    waypoints: int,
     report: Callable[[str], None],
     turns: int = 0,
 ) -> TrajectoryData:
-    """The rows for training and validation of a data set, at `frames` frames, with the codes of their scenes.
+    """The rows for training and validation of a data set, at `waypoints` waypoints, with the codes of their
+    scenes.
 
     turns: copies of each row for training that are turned by random angles, see `turns.py`; none if the
         robot's first joint is not vertical.
@@ -124,7 +125,7 @@ def load_data(
     encoder_print = "" if encoder is None else fingerprint(encoder)
     prints: list[str] = []
     count, shards = 0, len(shard_indices(folder))
-    for rows in read_rows(folder, robot, frames, turns):
+    for rows in read_rows(folder, robot, waypoints, turns):
         prints += [rows.shard.fingerprint] * (rows.turn == 0)
         key = f"{rows.shard.fingerprint}-{encoder_print}" + (f"-turn{rows.turn}" if rows.turn else "")
         codes = _codes(FilePath(folder), rows.scenes, encoder, key)
@@ -248,7 +249,7 @@ class Batches:
         data, model, schedule = self.data, self.model, self.model.schedule
         scenes = data.scenes[rows]
         if data.codes is None:
-            codes = np.zeros((len(rows), model.config.encoder_settings.code), np.float32)
+            codes = np.zeros((len(rows), model.settings.encoder_settings.code), np.float32)
             clouds = scene_clouds(model.encoder, scenes, rng)
         else:
             codes, clouds = data.codes[rows].astype(np.float32), None

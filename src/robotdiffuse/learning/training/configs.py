@@ -1,7 +1,7 @@
 """Named settings of planner training: the paper's, the compact ones that ship, and the rows of its Table 2.
 
 The rows share everything but what they compare, and a size that a CPU can train. Unlike `paper` they diffuse
-48 frames in patches of 4, as residuals to the straight line, with smooth noise: fewer samples teach more.
+48 waypoints in patches of 4, as residuals to the straight line, with smooth noise: fewer samples teach more.
 Only the row that predicts the noise has the paper's white noise: smooth noise has next to nothing of the high
 frequencies, so the least error there, divided by the little signal of the last levels, is what is sampled.
 Their networks see no clearances, as the paper's: these would make up for what an encoder loses.
@@ -10,13 +10,13 @@ Their networks see no clearances, as the paper's: these would make up for what a
 from typing import Any, NamedTuple
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.denoisers import PAPER_SIZE
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import LossSettings
 
 JOINT = LossSettings()
-JOINT_POINT = LossSettings(point=0.3, frames=4)
-JOINT_POINT_COLLISION = LossSettings(point=0.3, collision=0.05, begin=0.3, frames=4)
+JOINT_POINT = LossSettings(point=0.3, waypoints=4)
+JOINT_POINT_COLLISION = LossSettings(point=0.3, collision=0.05, begin=0.3, waypoints=4)
 """The paper gives no weights; these make the three losses of one size when predictions are 5 cm off."""
 
 _ROW = {"sees_clearances": False, "condition_drop": 0.1, "losses": JOINT_POINT_COLLISION}
@@ -30,7 +30,7 @@ class Config(NamedTuple):
 
 CONFIGS: dict[str, Config] = {
     "compact": Config(
-        "what ships: 48 frames, 1.7 M parameters, sees clearances and their gradients",
+        "what ships: 48 waypoints, 1.7 M parameters, sees clearances and their gradients",
         {
             "minutes": None,
             "samples": 2_400_000,
@@ -40,19 +40,19 @@ CONFIGS: dict[str, Config] = {
         },
     ),
     "paper": Config(
-        "the paper's: 254 frames, 8 layers of width 512, T = 200, batch 64, 25,000 iterations",
+        "the paper's: 254 waypoints, 8 layers of width 512, T = 200, batch 64, 25,000 iterations",
         {
             "minutes": None,
             "samples": 64 * 25_000,
             "batch": 64,
             "learning_rate": 3e-4,
-            "frames": 254,
+            "waypoints": 254,
             "turns": 0,
             "target": "absolute",
             "smooth_noise": False,
             "sampler": "ddpm",
             "sampling_steps": None,
-            "denoiser_settings": PAPER_SIZE["transformer"],
+            "denoiser_settings": TransformerSettings.paper_size(),
             **_ROW,
         },
     ),

@@ -1,19 +1,21 @@
 """Training of an auto-encoder of point clouds alone, and what can be read from the codes of any encoder."""
 
+from pathlib import Path as FilePath
+from typing import Any
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from robotdiffuse.learning.checkpoint import save_encoder
-from robotdiffuse.learning.encoders import Autoencoder, Encoder, make_encoder
-from robotdiffuse.learning.settings import settings_to_json
+from robotdiffuse.learning.encoders import make_encoder
+from robotdiffuse.learning.encoders.base import Autoencoder, Encoder
 from robotdiffuse.learning.training.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.run import TrainingRun, Validation
-from robotdiffuse.learning.versions import versions
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.learning.training.run import Validation
+from robotdiffuse.learning.training.trainee import Trainee, train
 
 READ, CHECKED = 2048, 512
 """Scenes that a linear read-out is fitted to, and further ones that it is judged by."""
@@ -31,65 +33,60 @@ def train_encoder(settings: EncoderTraining, out: str) -> dict[str, float]:
     """Train an auto-encoder; write encoder.safetensors and encoder.json into the folder `out`.
 
     The same call continues a run that was interrupted. Returns errors on fresh clouds, all in metres: those
-    of the reconstruction, see the encoder's `loss`, and those of `linear_readout`. Raises InputError if the
-    folder holds a different run, and KeyboardInterrupt, after a checkpoint, on Ctrl-C.
+    of the reconstruction, see the encoder's `loss`, and those of `linear_readout`; and `samples`. Raises as
+    `trainee.train`.
     """
     processes = Processes(settings.device)
-    torch.manual_seed(settings.seed)
-    module = make_encoder(settings.name, settings.encoder).to(processes.device)
-    assert isinstance(module, Autoencoder)  # by EncoderTraining
-    run = TrainingRun(
-        module,
-        out,
-        settings,
-        average=0.999,
-        weight_decay=0.0,
-        gradient_norm=1.0,
-        bad_steps=10,
-        identity={},
-        processes=processes,
-    )
-    most = settings.points if module.any_size else module.settings.cloud
+    return train(_EncoderTrainee(settings, processes), settings, out, processes)
 
-    def loss(rng: np.random.Generator) -> Float[Tensor, ""]:
+
+class _EncoderTrainee(Trainee):
+    title = "encoder"
+    module: Autoencoder
+
+    def __init__(self, settings: EncoderTraining, processes: Processes) -> None:
+        self.settings, self.processes, self.identity = settings, processes, {}
+        torch.manual_seed(settings.seed)
+        module = make_encoder(settings.name, settings.encoder)
+        assert isinstance(module, Autoencoder)  # by EncoderTraining
+        self.module = self._trained = module.to(processes.device)
+        self._most = settings.points if module.any_size else module.settings.cloud
+
+    def loss(self, fraction: float, rng: np.random.Generator) -> Float[Tensor, ""]:
+        settings, module, most = self.settings, self.module, self._most
         points = int(rng.integers(max(1, most // 8), most + 1)) if module.any_size else most
-        scenes = random_scenes(settings.batch, settings.max_obstacles, rng)
-        error, _ = _reconstruction(module, scenes, points, rng, processes)
+        error, _ = self._reconstruction(settings.batch, points, rng)
         theta = torch.stack([p.square().sum() for p in module.penalised()]).sum()
         return error + settings.regularization * theta
 
-    def judge(count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
-        rng = np.random.default_rng(seed)
-        with torch.no_grad():
-            scenes = random_scenes(count, settings.max_obstacles, rng)
-            return _reconstruction(module, scenes, most, rng, processes)
+    def validate(self, fraction: float) -> Validation:
+        return Validation(self._judge(128, 123)[0].item())
 
-    run.loop(loss, lambda: Validation(judge(128, 123)[0].item()), "encoder")
-    if not processes.first:
-        return processes.share(None)
-    with run.averaged(), torch.no_grad():
+    def finish(self) -> dict[str, float]:
+        settings = self.settings
         rng = np.random.default_rng(settings.seed + 1)
         scenes = random_scenes(READ, settings.max_obstacles, rng)
-        report = judge(512, settings.seed + 2)[1]
-        trained = on_cpu(module)
-        clouds = scene_clouds(trained, scenes, rng).split(256)
-        trained.standardize(torch.cat([trained.encode(part) for part in clouds]))
-        report |= linear_readout(trained, settings.max_obstacles, rng)
-        about = {"settings": settings_to_json(settings), "samples": run.at.samples, **report, **versions()}
-        save_encoder(trained, out, about)
-    return processes.share(report)
+        report = self._judge(512, settings.seed + 2)[1]
+        trained = self._trained = on_cpu(self.module)
+        with torch.no_grad():
+            clouds = scene_clouds(trained, scenes, rng).split(256)
+            trained.standardize(torch.cat([trained.encode(part) for part in clouds]))
+        return report | linear_readout(trained, settings.max_obstacles, rng)
 
+    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
+        save_encoder(self._trained, folder, training)
 
-def _reconstruction(
-    module: Autoencoder,
-    scenes: PackedScenes,
-    points: int,
-    rng: np.random.Generator,
-    processes: Processes,
-) -> tuple[Float[Tensor, ""], dict[str, float]]:
-    cloud = scene_clouds(module, scenes, rng, points).to(processes.device)
-    with processes.autocast():
-        return module.loss(cloud, rng)
+    def _judge(self, count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        with torch.no_grad():
+            return self._reconstruction(count, self._most, np.random.default_rng(seed))
+
+    def _reconstruction(
+        self, count: int, points: int, rng: np.random.Generator
+    ) -> tuple[Float[Tensor, ""], dict[str, float]]:
+        scenes = random_scenes(count, self.settings.max_obstacles, rng)
+        cloud = scene_clouds(self.module, scenes, rng, points).to(self.processes.device)
+        with self.processes.autocast():
+            return self.module.loss(cloud, rng)
 
 
 def linear_readout(encoder: Encoder, max_obstacles: int, rng: np.random.Generator) -> dict[str, float]:

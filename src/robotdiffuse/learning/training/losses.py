@@ -14,8 +14,9 @@ from torch import Tensor
 
 from robotdiffuse.collision.arrays import compile_robot
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots.kinematics import ForwardKinematics
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
+from robotdiffuse.settings import Count, NotNegative, Settings, Share
 from robotdiffuse.transforms import rotation_from_quaternion
 
 POINT_UNIT = 0.1
@@ -27,32 +28,22 @@ EPSILON = 1e-12
 
 
 @dataclass(frozen=True)
-class LossSettings:
-    joint: float = 1.0
+class LossSettings(Settings, name="losses"):
+    joint: NotNegative = 1.0
     """The paper's lambda_joint."""
-    point: float = 0.0
+    point: NotNegative = 0.0
     """lambda_point"""
-    collision: float = 0.0
+    collision: NotNegative = 0.0
     """lambda_collision"""
-    safe_distance: float = 0.05
+    safe_distance: NotNegative = 0.05
     """S of the hinge h [m]: the arm is pushed away where it is closer."""
-    begin: float = 0.0
+    begin: Share = 0.0
     """Share of the training after which L_collision sets in, rising over a tenth of it: at first predictions
     are too far off for its gradient to mean anything."""
-    points: int = 6
+    points: Count = 6
     """Points of each link's surface in L_point."""
-    frames: int = 8
-    """Frames, drawn for each batch, that L_point and L_collision look at."""
-
-    def __post_init__(self) -> None:
-        for name in ("joint", "point", "collision", "safe_distance"):
-            if getattr(self, name) < 0:
-                raise InputError(f"losses.{name} is {getattr(self, name)}; it must not be negative")
-        if not 0 <= self.begin <= 1:
-            raise InputError(f"losses.begin is {self.begin}; it must be between 0 and 1")
-        for name in ("points", "frames"):
-            if getattr(self, name) < 1:
-                raise InputError(f"losses.{name} is {getattr(self, name)}; it must be at least 1")
+    waypoints: Count = 8
+    """Waypoints, drawn for each batch, that L_point and L_collision look at."""
 
     def collision_weight(self, fraction: float) -> float:
         """lambda_collision when this share of the training is done."""
@@ -111,8 +102,8 @@ class ArmDistance:
         self._radii = spheres[:, 3]
 
     def __call__(
-        self, q: Float[Tensor, "n frames dof"], scenes: PackedScenes
-    ) -> Float[Tensor, "n frames spheres"]:
+        self, q: Float[Tensor, "n waypoints dof"], scenes: PackedScenes
+    ) -> Float[Tensor, "n waypoints spheres"]:
         """D of the paper [m], negative inside; q in [rad]. A floor counts as the plane of its top."""
         kinds, params = scenes.kinds, scenes.params
         T = self._kinematics(q)[..., self._frame, :3, :]
@@ -136,11 +127,11 @@ class ArmDistance:
 
 
 def _distance(
-    at: Float[Tensor, "n frames spheres 3"],
+    at: Float[Tensor, "n waypoints spheres 3"],
     kind: Int8[ndarray, "n"],
     row: Float32[ndarray, "n 10"],
     rotation: Float[ndarray, "n 3 3"],
-) -> Float[Tensor, "n frames spheres"]:
+) -> Float[Tensor, "n waypoints spheres"]:
     """To one obstacle for each trajectory, a sphere or a box [m]."""
 
     def tensor(array: ndarray) -> Tensor:

@@ -1,157 +1,104 @@
-"""Training of the motion predictor, with a frozen encoder or one that is trained along."""
+"""Training of the diffusion model, with a frozen encoder or one that is trained along."""
 
 import copy
-from collections.abc import Callable
+from pathlib import Path as FilePath
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from robotdiffuse.collision.arrays import robot_groups
-from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_model
+from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_network
 from robotdiffuse.learning.clearances import packed_clearances
 from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.encoders import Encoder, encoder_name, make_encoder
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
-from robotdiffuse.learning.settings import settings_to_json
-from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData, load_data
+from robotdiffuse.learning.encoders import encoder_name, make_encoder
+from robotdiffuse.learning.encoders.base import Encoder
+from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData
 from robotdiffuse.learning.training.config import PlannerTraining
-from robotdiffuse.learning.training.growing_data import GrowingData
 from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.run import TrainingRun, Validation
+from robotdiffuse.learning.training.trainee import MotionTrainee, train
 from robotdiffuse.learning.training.validation import planning_success
-from robotdiffuse.learning.versions import versions
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import ForwardKinematics
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 
 VALIDATION_SAMPLES = 4
 """Trajectories sampled for each problem of a validation."""
-HELD_OUT = 2000
-"""Most trajectories of the split for validation that are looked at."""
-
-
-def moving_links(robot: Robot) -> tuple[str, ...]:
-    """Links with collision spheres that some planned joint moves, in the order of link clearances."""
-    return tuple(link for link in robot_groups(robot) if robot.link_frame(link) > 0)
+STATISTICS = 20_000
+"""Most trajectories that scale, mean and covariance are taken of."""
 
 
 def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
-    """Train the motion predictor; write model.safetensors and model.json, all that planning needs.
+    """Train the diffusion model; write model.safetensors and model.json, all that planning needs.
 
     The same call continues a run that was interrupted. Returns `validation`, the loss on trajectories kept
     aside, `success`, the share of the motions that it samples for them by itself that are free, and
-    `samples`. Raises InputError if the data, the encoder or the folder do not fit, and KeyboardInterrupt,
-    after a checkpoint, on Ctrl-C.
-
-    While the data factory is still filling the folder, the shards that are there are used, and new ones from
-    the next checkpoint on; such a run is not reproducible, see `GrowingData`. Where torchrun started several
-    processes, all call this and get the same result, see `TrainingRun`.
+    `samples`. Raises as `trainee.train`, and InputError if the data or the encoder do not fit.
     """
     processes = Processes(settings.device)
-    robot = load_robot(settings.robot)
-    torch.manual_seed(settings.seed)
-    frozen = None if settings.jointly else load_encoder(settings.encoder)
-    encoder = frozen or make_encoder(settings.encoder, settings.encoder_settings)
-    model = MotionModel(_model_config(settings, robot, encoder))
-    # codes are made on the CPU: the frozen one stays there
-    model.encoder = copy.deepcopy(encoder)
-
-    def read(report: Callable[[str], None]) -> TrajectoryData:
-        return load_data(settings.data, robot, frozen, model.config.frames, report, settings.turns)
-
-    data = GrowingData(settings.data, read, processes)
-    kept, held_out = data.now.split(HELD_OUT)
-    hard = kept.q[~kept.trivial]
-    model.fit_statistics((hard if len(hard) else kept.q)[:20_000], settings.smooth_noise)
-    run = TrainingRun(
-        model.to(processes.device),
-        out,
-        settings,
-        average=settings.average,
-        weight_decay=settings.weight_decay,
-        gradient_norm=settings.gradient_norm,
-        bad_steps=settings.bad_steps,
-        identity={"robot": robot.name, "encoder_fingerprint": fingerprint(encoder)},
-        processes=processes,
-    )
-    # batches are made, and validations planned, on the CPU
-    here = on_cpu(model)
-
-    clearances = packed_clearances(robot, model.config)
-
-    def batches_of(rows: TrajectoryData) -> Batches:
-        return Batches(rows, here, clearances, settings.trivial_share, settings.weight_limit)
-
-    batches = batches_of(kept)
-    loss_of = _Loss(model, robot, settings, processes)
-
-    def take_in_new_data() -> None:
-        nonlocal batches, held_out
-        if data.grow():
-            kept, held_out = data.now.split(HELD_OUT)
-            batches = batches_of(kept)
-
-    def validate() -> Validation:
-        if not len(held_out):
-            return Validation(float("nan"))
-        rng = np.random.default_rng(7)
-        source = batches_of(held_out)
-        if here is not model:
-            here.load_state_dict(model.state_dict())
-        with torch.no_grad():
-            parts = [loss_of(source.draw(settings.batch, rng), run.fraction, rng).item() for _ in range(8)]
-        count = settings.validation_problems
-        success = planning_success(here, robot, held_out, count, VALIDATION_SAMPLES, rng)
-        return Validation(float(np.mean(parts)), success)
-
-    def loss(rng: np.random.Generator) -> Float[Tensor, ""]:
-        batch = batches.draw(settings.batch, rng)
-        dropped = None
-        if settings.condition_drop > 0:
-            dropped = torch.from_numpy(rng.random(settings.batch) < settings.condition_drop)
-        return loss_of(batch, run.fraction, rng, dropped)
-
-    run.loop(loss, validate, "planner", take_in_new_data)
-    if not processes.first:
-        return processes.share(None)
-    with run.averaged():
-        held_out_loss, success = validate()
-        report = {"validation": held_out_loss, "samples": float(run.at.samples)}
-        if success is not None:
-            report["success"] = success
-        about = {
-            "settings": settings_to_json(settings),
-            "data": data.now.digest,
-            "trajectories": len(data.now),
-            "encoder": fingerprint(model.encoder),
-            "minutes": round(run.at.seconds / 60, 2),
-            **report,
-            **versions(),
-        }
-        save_model(model, out, about)
-    return processes.share(report)
+    return train(_PlannerTrainee(settings, processes), settings, out, processes)
 
 
-def _model_config(settings: PlannerTraining, robot: Robot, encoder: Encoder) -> MotionModelConfig:
-    return MotionModelConfig(
-        robot=robot.name,
-        joint_names=robot.joint_names,
-        lower=tuple(robot.lower.tolist()),
-        upper=tuple(robot.upper.tolist()),
-        frame_offsets=tuple(tuple(tuple(row) for row in T) for T in robot.frame_offsets.tolist()),
-        links=moving_links(robot),
+class _PlannerTrainee(MotionTrainee):
+    title = "planner"
+
+    def __init__(self, settings: PlannerTraining, processes: Processes) -> None:
+        robot = load_robot(settings.robot)
+        torch.manual_seed(settings.seed)
+        frozen = None if settings.jointly else load_encoder(settings.encoder)
+        encoder = frozen or make_encoder(settings.encoder, settings.encoder_settings)
+        model = MotionModel(RobotIdentity.of(robot), _model_settings(settings, encoder))
+        # codes are made on the CPU: the frozen one stays there
+        model.encoder = copy.deepcopy(encoder)
+        super().__init__(settings, robot, frozen, processes)
+        self.own = settings
+        hard = self.kept.q[~self.kept.trivial]
+        model.fit_statistics((hard if len(hard) else self.kept.q)[:STATISTICS], settings.smooth_noise)
+        self.module = self.model = model.to(processes.device)
+        self.identity = {"robot": robot.name, "encoder_fingerprint": fingerprint(encoder)}
+        # batches are made, and validations planned, on the CPU
+        self._here = on_cpu(model)
+        self._clearances = packed_clearances(robot, model.settings)
+        self._loss = _Loss(model, robot, settings, processes)
+
+    def loss_of(
+        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, held_out: bool
+    ) -> Float[Tensor, ""]:
+        own = self.own
+        batches = Batches(data, self._here, self._clearances, own.trivial_share, own.weight_limit)
+        batch, dropped = batches.draw(own.batch, rng), None
+        if own.condition_drop > 0 and not held_out:
+            dropped = torch.from_numpy(rng.random(own.batch) < own.condition_drop)
+        return self._loss(batch, fraction, rng, dropped)
+
+    def success(self, rng: np.random.Generator) -> float:
+        if self._here is not self.model:
+            self._here.load_state_dict(self.model.state_dict())
+        problems = self.own.validation_problems
+        return planning_success(self._here, self.robot, self.held_out, problems, VALIDATION_SAMPLES, rng)
+
+    def about(self) -> dict[str, Any]:
+        return super().about() | {"encoder": fingerprint(self.model.encoder)}
+
+    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
+        save_network("model", self.model, folder, training)
+
+
+def _model_settings(settings: PlannerTraining, encoder: Encoder) -> MotionModelSettings:
+    return MotionModelSettings(
         encoder=encoder_name(encoder),
         encoder_settings=encoder.settings,
         denoiser=settings.denoiser,
-        denoiser_settings=settings.denoiser_settings or DENOISERS[settings.denoiser][1](),
+        denoiser_settings=settings.denoiser_settings or DENOISERS.defaults(settings.denoiser),
         null_condition=settings.condition_drop > 0,
         schedule=settings.schedule,
         sampler=settings.sampler,
         sampling_steps=settings.sampling_steps,
-        frames=settings.frames,
+        waypoints=settings.waypoints,
         parametrization=settings.parametrization,
         rows=settings.rows,
         target=settings.target,
@@ -208,10 +155,12 @@ class _Loss:
         collision_weight: float,
         rng: np.random.Generator,
     ) -> Float[Tensor, "n"]:
-        """L_point and L_collision of each sample, at a few frames."""
+        """L_point and L_collision of each sample, at a few waypoints."""
         model, losses = self.model, self.settings
-        last = model.config.frames - 1
-        frames = sorted(rng.choice(np.arange(1, last), min(losses.frames, last - 1), replace=False).tolist())
+        last = model.settings.waypoints - 1
+        waypoints = sorted(
+            rng.choice(np.arange(1, last), min(losses.waypoints, last - 1), replace=False).tolist()
+        )
         noisy, signal, noise_level, clean, base = (
             torch.from_numpy(np.ascontiguousarray(a)).to(output.device)
             for a in (batch.noisy, batch.signal, batch.noise_level, batch.clean, batch.base)
@@ -219,10 +168,10 @@ class _Loss:
         predicted = model.objective.clean(noisy, output, signal, noise_level)
         # the ends are held, whatever is predicted there
         predicted = torch.cat([clean[:, :1], predicted[:, 1:-1], clean[:, -1:]], 1)
-        q = model.joints_at(predicted, base, frames)
+        q = model.joints_at(predicted, base, waypoints)
         error = q.new_zeros(len(q))
         if self.points is not None:
-            moved = self.points(q) - self.points(model.joints_at(clean, base, frames))
+            moved = self.points(q) - self.points(model.joints_at(clean, base, waypoints))
             error = error + losses.point * (moved / POINT_UNIT).square().sum(-1).mean((1, 2))
         if self.arm is not None and collision_weight > 0:
             near = hinge(self.arm(q, batch.scenes), losses.safe_distance) / POINT_UNIT

@@ -15,10 +15,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.errors import InputError
 from robotdiffuse.learning.training.batches import fast_bf16
 
-DEVICES = ("cpu", "cuda")
 Value = TypeVar("Value")
 Module = TypeVar("Module", bound=nn.Module)
 
@@ -30,10 +29,8 @@ class Processes:
         """`device`: cpu or cuda, for every process one of its own; None: cuda if there is one.
 
         Matrices are multiplied in bf16 where the device does so fast. Raises InputError if Accelerate is not
-        installed, the device is unknown or missing, or this process has trained on another.
+        installed, the device is missing, or this process has trained on another.
         """
-        if device is not None and device not in DEVICES:
-            raise unknown_name("device", device, DEVICES)
         cuda = torch.cuda.is_available()
         if device == "cuda" and not cuda:
             raise InputError("device is cuda, but PyTorch finds no CUDA device here; use cpu")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -23,8 +23,8 @@ from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.files import alone_in, write_atomically
-from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
-from robotdiffuse.learning.settings import settings_to_json
+from robotdiffuse.learning.checkpoint import read_tensors, renamed, write_tensors
+from robotdiffuse.learning.training.config import TrainingSettings
 from robotdiffuse.learning.training.processes import Processes
 
 FREE_SETTINGS = ("minutes", "samples", "threads", "checkpoint_seconds", "data", "encoder", "device")
@@ -40,28 +40,6 @@ class Validation(NamedTuple):
     """On data that are kept aside."""
     success: float | None = None
     """Share of sampled motions that are free, of a planner's network."""
-
-
-@runtime_checkable
-class RunSettings(Protocol):
-    """What a run reads of the settings, a dataclass; see `EncoderTraining` for what they mean."""
-
-    @property
-    def samples(self) -> int | None: ...
-    @property
-    def minutes(self) -> float | None: ...
-    @property
-    def seed(self) -> int: ...
-    @property
-    def batch(self) -> int: ...
-    @property
-    def learning_rate(self) -> float: ...
-    @property
-    def warmup_steps(self) -> int: ...
-    @property
-    def threads(self) -> int: ...
-    @property
-    def checkpoint_seconds(self) -> float: ...
 
 
 LossFn = Callable[[np.random.Generator], Float[Tensor, ""]]
@@ -94,12 +72,7 @@ class TrainingRun:
         self,
         module: nn.Module,
         out: str,
-        settings: RunSettings,
-        *,
-        average: float,
-        weight_decay: float,
-        gradient_norm: float,
-        bad_steps: int,
+        settings: TrainingSettings,
         identity: dict[str, str],
         processes: Processes,
     ) -> None:
@@ -112,9 +85,12 @@ class TrainingRun:
             n: p for n, p in module.named_parameters() if p.requires_grad
         }
         self.average = {name: p.detach().clone() for name, p in self.parameters.items()}
-        self.average_decay, self.gradient_norm, self.bad_steps = average, gradient_norm, bad_steps
         self.optimizer = torch.optim.AdamW(
-            self.parameters.values(), lr=0.0, betas=(0.9, 0.99), weight_decay=weight_decay, fused=True
+            self.parameters.values(),
+            lr=0.0,
+            betas=(0.9, 0.99),
+            weight_decay=settings.weight_decay,
+            fused=True,
         )
         # the first process draws what a run of one process draws
         seed = [settings.seed, processes.index] if processes.index else settings.seed
@@ -141,7 +117,7 @@ class TrainingRun:
         loss: Callable[[np.random.Generator], Float[Tensor, ""]],
         validate: Callable[[], Validation],
         title: str,
-        after_checkpoint: Callable[[], None] | None = None,
+        after_checkpoint: Callable[[], object] | None = None,
     ) -> None:
         """Train to the end. Ctrl-C stores a checkpoint first, then raises KeyboardInterrupt.
 
@@ -187,7 +163,7 @@ class TrainingRun:
         value = loss(self.rng)
         value.backward()
         mean = self.processes.average(self.parameters.values(), value.item())
-        norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.gradient_norm)
+        norm = nn.utils.clip_grad_norm_(self.parameters.values(), self.settings.gradient_norm)
         self.at.step += 1
         self.at.samples += self._samples_per_step
         if not (math.isfinite(mean) and math.isfinite(norm.item())):
@@ -197,7 +173,7 @@ class TrainingRun:
         self.optimizer.step()
         self._losses.append(mean)
         with torch.no_grad():
-            decay = min(self.average_decay, self.at.step / (self.at.step + 10))
+            decay = min(self.settings.average, self.at.step / (self.at.step + 10))
             for name, p in self.parameters.items():
                 self.average[name].lerp_(p, 1 - decay)
 
@@ -212,7 +188,7 @@ class TrainingRun:
     def _skip(self) -> None:
         self._bad += 1
         self.at.skipped += 1
-        if self._bad < self.bad_steps:
+        if self._bad < self.settings.bad_steps:
             return
         at = self.at
         if at.rollbacks >= MAX_ROLLBACKS or not self._file.is_file():
@@ -292,7 +268,7 @@ class TrainingRun:
             for key, value in moments.get(p, {}).items():
                 tensors[f"optimizer.{key}.{name}"] = value
         notes = {
-            "settings": settings_to_json(self.settings),
+            "settings": self.settings.to_json(),
             "identity": self.identity,
             "at": asdict(self.at),
             "random": random_states[0],
@@ -349,7 +325,7 @@ class TrainingRun:
             ) from None
 
     def _check_same(self, notes: dict) -> None:
-        now, before = json.loads(json.dumps(settings_to_json(self.settings))), notes["settings"]
+        now, before = json.loads(json.dumps(self.settings.to_json())), renamed(notes["settings"])
         alone = {"processes": "1"}
         now, before = now | alone | self.identity, before | alone | notes["identity"]
         for name, value in now.items():

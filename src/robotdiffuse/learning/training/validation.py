@@ -17,7 +17,7 @@ from robotdiffuse.scenes.packed import PackedScenes
 SAMPLING_STEPS = 6
 """Of every network alike, so that all of the levels do not take longer than the training."""
 BETWEEN = 6
-"""Places that are checked in each step from frame to frame."""
+"""Places that are checked in each step from waypoint to waypoint."""
 
 
 def planning_success(
@@ -51,14 +51,14 @@ def _sampled_free(
     else:
         code = data.codes[row]
     start, goal = q[0].astype(np.float64), q[-1].astype(np.float64)
-    clearances = link_clearances(checker, model.config)
+    clearances = link_clearances(checker, model.settings)
     steps = min(SAMPLING_STEPS, model.schedule.steps)
     q = model.sample(code.astype(np.float32), start, goal, candidates, rng, clearances, steps)
     return free_in(checker, q)
 
 
-def free_in(checker: CollisionChecker, q: Float[ndarray, "n frames dof"]) -> Bool[ndarray, "n"]:
-    """Which motions are free in one scene, at their frames and at places between them."""
+def free_in(checker: CollisionChecker, q: Float[ndarray, "n waypoints dof"]) -> Bool[ndarray, "n"]:
+    """Which motions are free in one scene, at their waypoints and at places between them."""
     share = np.linspace(0, 1, BETWEEN, endpoint=False)[:, None]
     dense = q[:, :-1, None] + share * np.diff(q, axis=1)[:, :, None]
     every = np.concatenate([dense.reshape(len(q), -1, q.shape[-1]), q[:, -1:]], 1)
@@ -66,7 +66,9 @@ def free_in(checker: CollisionChecker, q: Float[ndarray, "n frames dof"]) -> Boo
     return np.all(free, axis=1, keepdims=True)[:, 0]
 
 
-def motions_free(robot: Robot, scenes: PackedScenes, q: Float[ndarray, "n frames dof"]) -> Bool[ndarray, "n"]:
+def motions_free(
+    robot: Robot, scenes: PackedScenes, q: Float[ndarray, "n waypoints dof"]
+) -> Bool[ndarray, "n"]:
     """Which motions are free, each in a scene of its own."""
     checkers = (CollisionChecker(robot, scenes.scene(i)) for i in range(len(scenes)))
     return np.array([free_in(of, motion)[0] for of, motion in zip(checkers, q[:, None], strict=True)], bool)

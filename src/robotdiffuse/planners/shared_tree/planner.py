@@ -34,12 +34,12 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motion import search_space
-from robotdiffuse.paths.shortcut import shortcut
+from robotdiffuse.paths.simplify import shortcut
+from robotdiffuse.planners.aorrtc import kernel as connect
 from robotdiffuse.planners.base import Planner, ever_finer
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
-from robotdiffuse.planners.rrt_connect import kernel as connect
-from robotdiffuse.planners.shared_tree import kernel
+from robotdiffuse.planners.shared_tree import kernel, tree
 from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Bound, Count, Natural, NotNegative, Positive, Settings
 
@@ -56,7 +56,7 @@ class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     start has, and one what the goal farthest from obstacles has."""
     step_rounds: Count = 4
     """Rounds without a path before it is lowered."""
-    reach: Positive = 1.0
+    range: Positive = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
     resolution: Positive = 0.05
     """No point of the arm moves further than this between two checks of a motion [m]."""
@@ -94,7 +94,7 @@ class SharedTreeSearch:
         self.start, self.goals = start.astype(np.float32), goals.astype(np.float32)
         self._ends = np.concatenate([self.start[None], self.goals])
         self._clearances = checker.link_clearances(self._ends).min(axis=1, initial=1.0)
-        self._tree = kernel.make_tree(self.start, self.goals, settings.capacity + len(goals))
+        self._tree = tree.make_tree(self.start, self.goals, settings.capacity + len(goals))
         self.costs: list[float] = []
         """The best cost after each round [rad], infinite while there is no path."""
         self._distances = self._safety_distances()
@@ -104,17 +104,17 @@ class SharedTreeSearch:
     @property
     def cost(self) -> float:
         """The length of the best path to any goal [rad]; infinite if there is none."""
-        return float(kernel.best_cost(self._tree))
+        return float(tree.best_cost(self._tree))
 
     @property
     def goal_costs(self) -> Float[ndarray, "k"]:
         """The length of the best path to each goal [rad]; infinite where there is none."""
-        return np.array([kernel.goal_cost(self._tree, g) for g in range(len(self.goals))])
+        return np.array([tree.goal_cost(self._tree, g) for g in range(len(self.goals))])
 
     @property
     def best_goal(self) -> int:
         """The goal that the best path leads to; -1 if there is no path."""
-        return int(kernel.best_goal(self._tree))
+        return int(tree.best_goal(self._tree))
 
     @property
     def nodes(self) -> int:
@@ -123,14 +123,14 @@ class SharedTreeSearch:
     def path(self, goal: int | None = None) -> Float[ndarray, "n dof"] | None:
         """Waypoints of the best path, or of the best one to a goal; None if there is none."""
         g = self.best_goal if goal is None else goal
-        return None if g < 0 or self._tree.goal_node[g] < 0 else kernel.path_to(self._tree, g)
+        return None if g < 0 or self._tree.goal_node[g] < 0 else tree.path_to(self._tree, g)
 
     @property
     def finished(self) -> bool:
         """Whether it is enough by the settings: no path can be shorter, or it hardly improves any more."""
         settings, costs = self.settings, self.costs
         if self.cost < np.inf:
-            if not any(kernel.goal_is_open(self._tree, g, self.cost) for g in range(len(self.goals))):
+            if not any(tree.goal_is_open(self._tree, g, self.cost) for g in range(len(self.goals))):
                 return True
             if settings.improvement > 0 and len(costs) > settings.patience:
                 before = costs[-1 - settings.patience]
@@ -182,14 +182,14 @@ class SharedTreeSearch:
         for g, goal in enumerate(self.goals):
             line = np.stack([self.start, goal])
             if motions_free(self._space, line)[0]:
-                kernel.graft(self._tree, line, g)
+                tree.graft(self._tree, line, g)
 
     def _connect(self, targets: ndarray) -> None:
         settings = self.settings
         room = 8 * settings.connect_iterations + len(targets)
         trees = connect.make_trees(self.start, self.goals[targets], room)
-        reach = np.float32(settings.reach)
-        path = connect.search(self._space, trees, reach, settings.connect_iterations, self.state)
+        longest = np.float32(settings.range)
+        path = connect.connect(self._space, trees, longest, settings.connect_iterations, self.state)
         if len(path):
             self._graft(path, int(targets[np.abs(self.goals[targets] - path[-1]).max(axis=1).argmin()]))
         elif len(targets) == 1:
@@ -197,22 +197,22 @@ class SharedTreeSearch:
 
     def _grow(self) -> None:
         settings, left = self.settings, self.settings.growth
-        reach, bias = np.float32(settings.reach), np.float32(settings.goal_bias)
+        longest, bias = np.float32(settings.range), np.float32(settings.goal_bias)
         while True:
-            left -= kernel.grow(self._space, self._tree, reach, bias, left, self.state)
+            left -= kernel.grow(self._space, self._tree, longest, bias, left, self.state)
             if left == 0 or not self._make_room(len(self.goals) + 1):
                 return
 
     def _graft(self, path: Float[ndarray, "n dof"], g: int) -> None:
         shorter = shortcut(self._space, path, self.settings.shortcuts, self.state)
         self._make_room(len(shorter))
-        kernel.graft(self._tree, shorter, g)
+        tree.graft(self._tree, shorter, g)
 
     def _make_room(self, nodes: int) -> bool:
         """Double the tree's room if less than this is left; whether that was done."""
         if self.nodes + nodes < len(self._tree.nodes):
             return False
-        self._tree = kernel.grown(self._tree, 2 * (len(self._tree.nodes) + nodes))
+        self._tree = tree.grown(self._tree, 2 * (len(self._tree.nodes) + nodes))
         return True
 
 

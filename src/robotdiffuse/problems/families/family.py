@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
 from numpy.random import Generator
@@ -14,8 +13,8 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
-from robotdiffuse.robots.kinematics import ForwardKinematics
-from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.robots.kinematics import link_origins
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.settings import Positive, Settings
@@ -120,18 +119,12 @@ def uniform_configurations(
     found = np.zeros((0, robot.dof))
     for _ in range(BATCHES):
         q = rng.uniform(robot.lower, robot.upper, (BATCH, robot.dof))
-        with torch.inference_mode():
-            xyz = _kinematics(robot).link(torch.from_numpy(q), robot.tip)[:, :3, 3].numpy()
+        xyz = link_origins(robot, q, robot.tip)
         q = q[((xyz >= region[0]) & (xyz <= region[1])).all(axis=1)]
         found = np.concatenate([found, q[checker.free(q)] if len(q) else q])
         if len(found) >= count:
             break
     return found[:count]
-
-
-@once_per_robot
-def _kinematics(robot: Robot) -> ForwardKinematics:
-    return ForwardKinematics(robot, torch.float64)
 
 
 def reaching_configurations(

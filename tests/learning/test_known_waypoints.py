@@ -1,4 +1,4 @@
-"""Sampling with known frames (noise interpolation), at chosen steps, with a chosen sampler."""
+"""Sampling with known waypoints (noise interpolation), at chosen steps, with a chosen sampler."""
 
 from dataclasses import replace
 
@@ -10,13 +10,15 @@ from numpy import ndarray
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.clearances import link_clearances
-from robotdiffuse.learning.denoisers import TransformerSettings
-from robotdiffuse.learning.encoders import PointAutoencoderSettings
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
 from robotdiffuse.learning.guidance import CollisionGuidance
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelConfig
+from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.planners.diffusion import bundled_model, encode
+from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
@@ -24,15 +26,9 @@ from robotdiffuse.scenes.shapes import Sphere
 
 ARM = box_arm()
 START, GOAL = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
-FRAMES = 16
-CONFIG = MotionModelConfig(
-    robot=ARM.name,
-    joint_names=ARM.joint_names,
-    lower=tuple(ARM.lower.tolist()),
-    upper=tuple(ARM.upper.tolist()),
-    frame_offsets=tuple(tuple(map(tuple, T)) for T in ARM.frame_offsets.tolist()),
-    links=("l1", "l2", "l3"),
-    frames=FRAMES,
+WAYPOINTS = 16
+SETTINGS = MotionModelSettings(
+    waypoints=WAYPOINTS,
     encoder_settings=PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12),
     denoiser_settings=TransformerSettings(width=16, layers=1, heads=2, hidden=32, patch=4),
 )
@@ -41,9 +37,9 @@ CONFIG = MotionModelConfig(
 def small_model(smooth: bool = True, **changes: object) -> MotionModel:
     """Random weights, statistics of random arcs."""
     torch.manual_seed(0)
-    model = MotionModel(replace(CONFIG, **changes))
+    model = MotionModel(RobotIdentity.of(ARM), replace(SETTINGS, **changes))
     torch.nn.init.normal_(model.denoiser.out.weight, std=0.2)
-    rng, t = np.random.default_rng(0), np.linspace(0, 1, FRAMES)[:, None]
+    rng, t = np.random.default_rng(0), np.linspace(0, 1, WAYPOINTS)[:, None]
     ends = rng.uniform(-1.0, 1.0, (2, 200, 1, 3))
     bumps = sum(np.sin(np.pi * k * t) * rng.normal(0, 0.5 / k**2, (200, 1, 3)) for k in range(1, 8))
     model.fit_statistics((ends[0] + t * (ends[1] - ends[0]) + bumps).astype(np.float32), smooth)
@@ -71,7 +67,7 @@ PREFIX, SUFFIX = away(START, np.array([0.0, 0.1, -0.1]), 4), away(GOAL, np.array
 @pytest.mark.parametrize("target", ["residual", "absolute"])
 @pytest.mark.parametrize("objective", ["clean", "noise", "velocity"])
 @pytest.mark.parametrize("sampler", SAMPLERS)
-def test_known_frames_are_in_the_result(smooth: bool, target: str, objective: str, sampler: str) -> None:
+def test_known_waypoints_are_in_the_result(smooth: bool, target: str, objective: str, sampler: str) -> None:
     model = small_model(smooth, target=target, objective=objective, sampler=sampler)
     q = sample(model, prefix=PREFIX, suffix=SUFFIX, eta=0.5)
     assert np.isfinite(q).all()
@@ -86,7 +82,7 @@ def test_ends_alone_are_the_default() -> None:
     assert (sample(model)[:, 3] != PREFIX[3]).any()
 
 
-def test_the_network_and_the_guide_meet_known_frames() -> None:
+def test_the_network_and_the_guide_meet_known_waypoints() -> None:
     model, told, guided = small_model(), [], []
     rng = np.random.default_rng(0)
 
@@ -106,7 +102,7 @@ def test_the_network_and_the_guide_meet_known_frames() -> None:
 
 
 def test_regression_is_that_of_smooth_noise() -> None:
-    """Noise that is drawn and conditioned on zeros has none at known frames, and less beside them."""
+    """Noise that is drawn and conditioned on zeros has none at known waypoints, and less beside them."""
     model = small_model()
     assert model.regression(model.around(PREFIX[:1], SUFFIX[-1:])) is None
     gain = model.regression(model.around(PREFIX, SUFFIX))
@@ -132,12 +128,12 @@ def test_white_noise_moves_no_other_row() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"prefix": PREFIX[1:]}, "prefix must have the start as frame 0"),
-        ({"suffix": SUFFIX[:-1]}, "suffix must have the goal as frame -1"),
+        ({"prefix": PREFIX[1:]}, "prefix must have the start as waypoint 0"),
+        ({"suffix": SUFFIX[:-1]}, "suffix must have the goal as waypoint -1"),
         ({"prefix": PREFIX[:0]}, "prefix must have the start"),
         (
             {"prefix": away(START, np.zeros(3), 13), "suffix": SUFFIX},
-            "13 and 3 frames; they must leave some of 16",
+            "13 and 3 waypoints; they must leave some of 16",
         ),
         ({"sampler": "heun"}, "unknown sampler 'heun'; known: ddim, ddpm"),
         ({"guided_share": 1.5}, "guided_share is 1.5"),
@@ -152,7 +148,7 @@ def test_control_points_know_the_ends_only() -> None:
     model = small_model(parametrization="b_spline", rows=8)
     assert (sample(model)[:, 0] == START).all()
     with pytest.raises(
-        InputError, match="prefix and suffix have 4 and 1 frames; control points can hold 1 and 1"
+        InputError, match="prefix and suffix have 4 and 1 waypoints; control points can hold 1 and 1"
     ):
         sample(model, prefix=PREFIX)
 
@@ -191,7 +187,7 @@ def test_a_sampler_by_name_is_that_of_a_checkpoint() -> None:
 
 def test_the_panda_goes_on_from_what_it_is_committed_to() -> None:
     """It moves along one plan, and is given another goal: no jump where the new plan begins."""
-    robot, model, rng = load_robot("panda"), bundled_model("panda"), np.random.default_rng(0)
+    robot, model, rng = load_robot("panda"), load_model("panda"), np.random.default_rng(0)
     assert model is not None
     checker = CollisionChecker(robot, Scene([Sphere([0.5, 0.0, 0.4], 0.15)]))
     start, goal = (np.array([side, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]) for side in (0.9, -0.9))
@@ -205,7 +201,7 @@ def test_the_panda_goes_on_from_what_it_is_committed_to() -> None:
         goal + np.array([-0.4, 0.3, 0.2, 0.0, 0.3, 0.0, 0.0]),
         16,
         rng,
-        link_clearances(checker, model.config),
+        link_clearances(checker, model.settings),
         guide=lambda q, _level: guidance(q, 4, prefix=8)[0],
         prefix=prefix,
     )

@@ -1,4 +1,4 @@
-"""How far a link can be from a joint's axis: the lever arms of the verification certificate."""
+"""Lever arms: how far a link can be from the axis of a joint, for bounds on motions."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -37,20 +37,20 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     radii = np.zeros((len(links), robot.dof))
     directions = _directions()
     support = np.full((len(links), ROWS, COLUMNS), -np.inf)
-    reach = np.zeros(len(links))
+    farthest = np.zeros(len(links))
     for j in reversed(range(robot.dof)):
         for i in np.flatnonzero(frames == j + 1):
             spheres = robot.spheres[links[i]]
             T = robot.T_frame_link(links[i])
             centers = spheres[:, :3] @ T[:3, :3].T + T[:3, 3]
             support[i] = (directions @ centers.T + spheres[:, 3]).max(-1)
-            reach[i] = (np.linalg.norm(centers, axis=1) + spheres[:, 3]).max()
+            farthest[i] = (np.linalg.norm(centers, axis=1) + spheres[:, 3]).max()
         moved = np.flatnonzero(frames > j)
         if not len(moved):
             continue
         joint = robot.planned_joints[j]
         lower, upper = joint.lower - LIMIT_SLACK, joint.upper + LIMIT_SLACK
-        h, r = support[moved], reach[moved]
+        h, r = support[moved], farthest[moved]
         if robot.prismatic[j]:
             radii[moved, j] = 1.0
             h = h + np.maximum(directions[..., 2] * lower, directions[..., 2] * upper)
@@ -64,7 +64,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
         values = h.reshape(len(moved), -1)
         h = (values[:, corners] * weights).sum(1) + residual * r[:, None]
         support[moved] = h.reshape(-1, ROWS, COLUMNS) + directions @ offset[:3, 3]
-        reach[moved] = r + np.linalg.norm(offset[:3, 3])
+        farthest[moved] = r + np.linalg.norm(offset[:3, 3])
     radii.setflags(write=False)
     return radii
 

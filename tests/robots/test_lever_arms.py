@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from helpers.example_robots import TIPS, example_robot, planar_arm
-from robotdiffuse.robots.kinematics import ForwardKinematics
-from robotdiffuse.robots.reach import motion_radii
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.robots.lever_arms import motion_radii
 from robotdiffuse.robots.robot import Robot
 
 

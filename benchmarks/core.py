@@ -1,0 +1,268 @@
+"""Quality per millisecond: first motions, lengths over time, kernel, limits, timing, collisions.
+
+    python benchmarks/core.py [--problems FOLDER --lengths FILE] [--parts first,lengths,...] [--each 25]
+
+Prints the report that is kept in benchmarks/results/core.txt. FOLDER holds MotionBenchMaker families (scene
+and request files), FILE reference lengths, {"length": {"family/number": {"best_known": ...}}}; of families
+without, the best known length is the shortest of all rows here. One thread; times are those of the process
+(CPU) unless wall time is said. Clearance 0, so that lengths compare with those of planners that keep none.
+"""
+
+import argparse
+import json
+import os
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import numpy as np
+from report import header, print_table, progress
+
+from problems import PANDA, Case
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.motion import levers, search_space
+from robotdiffuse.evaluation.methods import planned
+from robotdiffuse.evaluation.problem_sets import gather_cases
+from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.trial import Clock, tried
+from robotdiffuse.paths.timing import TimingSettings, time_parameterize
+from robotdiffuse.planners import load_planner
+from robotdiffuse.problems.families import FAMILIES, load_family
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Cylinder
+from robotdiffuse.types import Path as JointPath
+
+SEED = 20261122
+LIMITS = (0.01, 0.05, 0.1, 1.0)
+"""[s]"""
+REPEATS = 50
+"""Of each path, back and forth, in the timing of the kernel."""
+TIGHT = (0.001, 0.01, 0.05, 0.1, 1.0)
+
+
+def cases_of(folder: Path | None, each: int) -> list[Case]:
+    """So many problems of each family, evenly spread over MotionBenchMaker's."""
+    with TemporaryDirectory() as kept:
+        own = gather_cases([f"{name}_nontrivial" for name in FAMILIES], each, Path(kept), print)
+        given = [] if folder is None else gather_cases([str(folder)], None, Path(kept), print)
+    families = dict.fromkeys(case.family for case in given)
+    for family in families:
+        of = [case for case in given if case.family == family]
+        own += of[:: max(len(of) // each, 1)][:each]
+    return own
+
+
+def best_known(cases: Sequence[Case], lengths: dict, found: Sequence[Record]) -> dict[str, float]:
+    """Shortest lengths by the name of the problem [rad]: the given ones, where there are none those found."""
+    best: dict[str, float] = {}
+    for case in cases:
+        name = f"{case.family.removesuffix('_panda')}/{case.name[-4:]}"
+        if name in lengths:
+            best[case.name] = lengths[name]["best_known"]
+    for record in found:
+        if record.solved and record.name not in best:
+            best[record.name] = min(
+                r.measures["joint_length"] for r in found if r.solved and r.name == record.name
+            )
+    return best
+
+
+def by_family(cases: Sequence[Case]) -> Iterator[tuple[str, list[Case]]]:
+    for family in dict.fromkeys(case.family for case in cases):
+        yield family, [case for case in cases if case.family == family]
+    yield "all", list(cases)
+
+
+def first(cases: Sequence[Case], _lengths: dict) -> None:
+    planner = load_planner("aorrtc")
+    method = {"aorrtc": planned(planner, until="first", clearance=0.0)}
+    found = {r.name: r for r in tried(cases, method, limit=5.0, title="first")["aorrtc"]}
+    rows = []
+    for family, of in by_family(cases):
+        records = [found[case.name] for case in of]
+        paths = [1e3 * r.progress[0][0] for r in records if r.progress]
+        cpu = np.percentile([1e3 * (r.cpu or np.nan) for r in records], (50, 95))
+        rows.append((family, sum(r.solved for r in records), len(of), np.median(paths), *cpu))
+    columns = ["family", "solved", "of", "first path ms", "whole call ms", "p95"]
+    print_table(
+        "aorrtc until the first motion",
+        columns,
+        [[r[0], r[1], r[2], *(f"{x:.2f}" for x in r[3:])] for r in rows],
+    )
+
+
+def lengths(cases: Sequence[Case], known: dict) -> None:
+    names = ("aorrtc", "robotdiffuse", "rrt_connect")
+    found: dict[tuple[str, float], list[Record]] = {}
+    for limit in LIMITS:
+        methods = {name: planned(load_planner(name), until="limit", clearance=0.0) for name in names}
+        for name, records in tried(cases, methods, limit=limit, title=f"{limit:g} s").items():
+            found[name, limit] = records
+    best = best_known(cases, known, [record for records in found.values() for record in records])
+    rows = []
+    for family, of in by_family(cases):
+        inside = {case.name for case in of}
+        for name in names:
+            row = [f"{family} ({len(of)})", name]
+            for limit in LIMITS:
+                records = [r for r in found[name, limit] if r.name in inside]
+                ratios = [r.measures["joint_length"] / best[r.name] for r in records if r.solved]
+                missing = len(records) - len(ratios)
+                row.append(f"{np.mean(ratios):.4f}" + (f" ({missing} unsolved)" if missing else ""))
+            stages = [r.stage for r in found[name, LIMITS[-1]] if r.name in inside and r.solved]
+            share = sum(stage in ("network", "refinement") for stage in stages) / max(len(stages), 1)
+            rows.append([*row, f"{100 * share:.0f} %"])
+    columns = ["family", "planner", *(f"{limit:g} s" for limit in LIMITS), "network's at 1 s"]
+    notes = (
+        "mean of lengths over the best known one of the solved; rrt_connect: restarts. Wall time limits.",
+    )
+    print_table("Length over best known at equal wall time", columns, rows, notes)
+
+
+def kernel(cases: Sequence[Case], _lengths: dict) -> None:
+    """Along the free edges of aorrtc's paths, at the resolution that searches use."""
+    planner, rows = load_planner("aorrtc"), []
+    for family, of in by_family(cases):
+        spent, count = 0.0, 0
+        for case in of[:20]:
+            result = planner.plan(case.problem, 1.0, until="first", clearance=0.0)
+            if result.path is None:
+                continue
+            space = search_space(CollisionChecker(PANDA, case.problem.scene), 0.05)
+            path = result.path.positions.astype(np.float32)
+            there_and_back = np.concatenate([path, path[-2::-1]])
+            travel = np.abs(np.diff(there_and_back, axis=0)) @ levers(PANDA)
+            blocks = np.maximum(np.ceil(travel / 0.05 / 16), 1)
+            # one call for many edges, so that what a call itself takes does not count
+            edges = np.concatenate([path[:1], np.tile(there_and_back[1:], (REPEATS, 1))])
+            if not motions_free(space, edges).all():
+                continue
+            with Clock() as clock:
+                motions_free(space, edges)
+            spent, count = spent + clock.cpu, count + REPEATS * 16 * int(blocks.sum())
+        rows.append((family, f"{1e9 * spent / max(count, 1):.0f}"))
+    print_table(
+        "Collision check of free edges, self-collision included", ["family", "ns a configuration"], rows
+    )
+
+
+def limits(cases: Sequence[Case], _lengths: dict) -> None:
+    rows = []
+    for name in ("aorrtc", "robotdiffuse"):
+        planner = load_planner(name)
+        for limit in TIGHT:
+            over = []
+            for case in progress(cases, f"{name} {limit:g} s"):
+                with Clock() as clock:
+                    result = planner.plan(case.problem, limit, until="limit", clearance=0.0)
+                over.append((1e3 * (clock.wall - limit), result.solved))
+            late = np.array([o for o, _ in over])
+            solved = sum(s for _, s in over)
+            p50, p99 = np.percentile(late, (50, 99))
+            rows.append((name, f"{1e3 * limit:g}", f"{solved} of {len(cases)}", f"{p50:.1f}", f"{p99:.1f}"))
+    columns = ["planner", "limit ms", "solved", "overrun ms, median", "p99"]
+    print_table(
+        "Wall time beyond the limit, the certificate and timing of the answer included", columns, rows
+    )
+
+
+def timing(cases: Sequence[Case], _lengths: dict) -> None:
+    planner, ratios, worst, times = load_planner("aorrtc"), [], [0.0, 0.0], [[], []]
+    rng = np.random.default_rng(SEED)
+    paths: list[JointPath] = []
+    for case in progress(cases, "paths"):
+        for seed in range(500 // len(cases) + 1):
+            result = planner.plan(case.problem, 1.0, seed, until="first", clearance=0.0)
+            if result.path is not None:
+                paths.append(result.path)
+    always: Callable[[object], bool] = lambda _: True  # noqa: E731
+    for path in progress([paths[i] for i in rng.permutation(len(paths))[:500]], "timing"):
+        made = []
+        for i, solver in enumerate(("compiled", "toppra")):
+            with Clock() as clock:
+                made.append(time_parameterize(PANDA, path, always, always, TimingSettings(solver=solver)))
+            times[i].append(1e3 * clock.cpu)
+        ratios.append(made[0].duration / made[1].duration)
+        fine = time_parameterize(PANDA, path, always, always, TimingSettings(sample_time=0.001))
+        worst[0] = max(worst[0], float((np.abs(fine.velocities) / PANDA.velocity).max()))
+        worst[1] = max(worst[1], float((np.abs(fine.accelerations) / PANDA.acceleration).max()))
+    rows = [
+        ("duration over toppra's, least to most", f"{min(ratios):.5f} to {max(ratios):.5f}"),
+        ("CPU time, ms, median: compiled, toppra", f"{np.median(times[0]):.2f}, {np.median(times[1]):.2f}"),
+        ("greatest share of a velocity limit at 1 ms", f"{worst[0]:.6f}"),
+        ("greatest share of an acceleration limit at 1 ms", f"{worst[1]:.6f}"),
+    ]
+    print_table(f"Timing of {len(ratios)} paths", ["", ""], rows)
+
+
+def thin(problem: Problem, rng: np.random.Generator) -> Problem:
+    """With plates of 1 mm and rods of 2 mm across at random places, as far as the ends stay free."""
+    shapes = list(problem.scene.shapes)
+    ends = np.concatenate([problem.start[None], problem.goal.positions])  # type: ignore[union-attr]
+    for _ in range(6):
+        at, wxyz = rng.uniform([-0.7, -0.7, 0.1], [0.7, 0.7, 1.1]), rng.normal(size=4)
+        wxyz /= np.linalg.norm(wxyz)
+        shape = Box(at, [0.3, 0.3, 0.001], wxyz) if rng.random() < 0.5 else Cylinder(at, 0.001, 0.5, wxyz)
+        scene = Scene([*shapes, shape])
+        if CollisionChecker(PANDA, scene).free(ends).all():
+            shapes.append(shape)
+    return Problem(PANDA, Scene(shapes), problem.start, problem.goal)
+
+
+def steps(a: np.ndarray, b: np.ndarray) -> int:
+    return max(int(np.ceil(np.abs(b - a).max() / 0.005)), 1)
+
+
+def collisions(cases: Sequence[Case], _lengths: dict, motions: int = 400) -> None:
+    """Motions checked on meshes at 2 mrad by Coal and by PyBullet, half of them in scenes with thin
+    things."""
+    from robotdiffuse.simulation.oracle import PyBulletOracle
+
+    rng, rows = np.random.default_rng(SEED), []
+    families = [load_family(name) for name in FAMILIES]
+    for name in ("aorrtc", "robotdiffuse"):
+        planner, hits, checked, looked = load_planner(name), [0, 0], 0, 0
+        for i in progress(range(motions // 2), name):
+            problem = families[i % len(families)].draw(PANDA, np.random.default_rng([SEED, i])).problem(PANDA)
+            problem = thin(problem, rng) if i % 2 else problem
+            result = planner.plan(problem, 0.2, seed=i, clearance=0.0)
+            if result.trajectory is None:
+                continue
+            legs = pairwise(result.trajectory.positions)
+            dense = np.concatenate([np.linspace(a, b, steps(a, b)) for a, b in legs])
+            checked, looked = checked + 1, looked + len(dense)
+            hits[0] += bool(ExactCollision(PANDA, problem.scene).collides(dense).any())
+            with PyBulletOracle(PANDA, problem.scene) as oracle:
+                hits[1] += any(oracle.collides(q) for q in dense)
+        rows.append((name, checked, looked, *hits))
+    columns = ["planner", "motions", "configurations", "in collision by Coal", "by PyBullet"]
+    print_table("Returned motions on meshes", columns, rows)
+
+
+PARTS = {part.__name__: part for part in (first, lengths, kernel, limits, timing, collisions)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Quality per millisecond.")
+    parser.add_argument("--problems", type=Path, help="folder with MotionBenchMaker families")
+    parser.add_argument("--lengths", type=Path, help="reference lengths (JSON)")
+    parser.add_argument("--each", type=int, default=25, help="problems of each family (25)")
+    parser.add_argument("--parts", default=",".join(PARTS), help="of the report, parted by commas (all)")
+    arguments = parser.parse_args()
+    known = json.loads(arguments.lengths.read_text())["length"] if arguments.lengths else {}
+    print(header("numpy", "numba", "coal", "toppra"))
+    cases = cases_of(arguments.problems, arguments.each)
+    for name in ("aorrtc", "robotdiffuse", "rrt_connect"):
+        load_planner(name).plan(cases[0].problem, 30.0)  # compiles
+    for part in arguments.parts.split(","):
+        PARTS[part](cases, known)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,75 @@
+"""Which robot a network's weights are for."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from robotdiffuse.collision.arrays import robot_groups
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.settings import Settings
+
+if TYPE_CHECKING:
+    from robotdiffuse.robots.normalizer import JointNormalizer
+
+CLOSE = 1e-3
+"""Dimensions are the same within this [m], and entries of rotations."""
+
+
+@dataclass(frozen=True)
+class RobotIdentity(Settings):
+    """What weights keep of the robot that they are trained for."""
+
+    source: str
+    """Bundled name, or path to the URDF that it was read from."""
+    joint_names: tuple[str, ...]
+    lower: tuple[float, ...]
+    """Limits that joint values are normalised by [rad], [m] for prismatic joints. A robot with others will
+    do: the judge knows its own."""
+    upper: tuple[float, ...]
+    frame_offsets: tuple[tuple[tuple[float, ...], ...], ...]
+    """`Robot.frame_offsets`, to tell robots of the same joints but other measures."""
+    links: tuple[str, ...]
+    """Links with collision spheres that some planned joint moves, in the order of link clearances."""
+
+    @staticmethod
+    @once_per_robot
+    def of(robot: Robot) -> "RobotIdentity":
+        return RobotIdentity(
+            source=robot.source or robot.name,
+            joint_names=robot.joint_names,
+            lower=tuple(robot.lower.tolist()),
+            upper=tuple(robot.upper.tolist()),
+            frame_offsets=tuple(tuple(tuple(row) for row in T) for T in robot.frame_offsets.tolist()),
+            links=tuple(link for link in robot_groups(robot) if robot.link_frame(link) > 0),
+        )
+
+    @property
+    def dof(self) -> int:
+        return len(self.joint_names)
+
+    def normalizer(self) -> "JointNormalizer":
+        from robotdiffuse.robots.normalizer import JointNormalizer  # which loads PyTorch
+
+        return JointNormalizer(np.array(self.lower), np.array(self.upper))
+
+    def difference(self, robot: Robot) -> str:
+        """What the robot has that this one has not, "" if it is the same."""
+        its = RobotIdentity.of(robot)
+        if its.joint_names != self.joint_names:
+            return f"joints {', '.join(its.joint_names)}"
+        if not np.allclose(its.frame_offsets, self.frame_offsets, atol=CLOSE):
+            return "other dimensions"
+        if its.links != self.links:
+            return f"spheres on the links {', '.join(its.links)}, not {', '.join(self.links)}"
+        return ""
+
+    def check(self, robot: Robot, where: str) -> None:
+        """Raises InputError unless the weights are for this robot. `where` names them."""
+        other = self.difference(robot)
+        if other:
+            raise InputError(
+                f"{where} was trained for {self.source} with joints {', '.join(self.joint_names)}; "
+                f"the robot {robot.name} has {other}"
+            )

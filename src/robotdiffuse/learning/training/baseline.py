@@ -1,0 +1,75 @@
+"""Training of a learned baseline on the same planned trajectories as the product's own network."""
+
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import save_network
+from robotdiffuse.learning.networks import NETWORKS
+from robotdiffuse.learning.networks.base import BaselineNetwork
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.batches import TrajectoryData
+from robotdiffuse.learning.training.config import BaselineTraining
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.run import Validation
+from robotdiffuse.learning.training.trainee import MotionTrainee, train
+from robotdiffuse.robots import load_robot
+
+
+def baseline_training(name: str, given: dict[str, Any]) -> BaselineTraining:
+    """The settings of a network, and what is given beside them, which wins.
+
+    Raises InputError for an unknown name, listing the known, and for a network that is no baseline.
+    """
+    kind = NETWORKS.load(name)
+    if not issubclass(kind, BaselineNetwork):
+        raise InputError(f"{name} is no baseline; train it: robotdiffuse train {NETWORKS[name].kind}")
+    if given.get("samples") is not None:
+        given = given | {"minutes": None}
+    return BaselineTraining(name=name, **(kind.training_defaults | given))
+
+
+def train_baseline(settings: BaselineTraining, out: str) -> dict[str, float]:
+    """Train a network with its default settings; write NAME.safetensors and NAME.json into the folder `out`.
+
+    The same call continues a run that was interrupted. Returns `validation`, the loss on trajectories kept
+    aside, `success`, what it solves of them by itself, and `samples`. Raises as `trainee.train`, and
+    InputError if the data do not fit.
+    """
+    processes = Processes(settings.device)
+    return train(_BaselineTrainee(settings, processes), settings, out, processes)
+
+
+class _BaselineTrainee(MotionTrainee):
+    module: BaselineNetwork
+
+    def __init__(self, settings: BaselineTraining, processes: Processes) -> None:
+        self.title, robot = settings.name, load_robot(settings.robot)
+        torch.manual_seed(settings.seed)
+        kind, own = NETWORKS.load(settings.name), NETWORKS.defaults(settings.name)
+        self.module = kind(RobotIdentity.of(robot), own)
+        super().__init__(settings, robot, None, processes)
+        self.module.fit_statistics(self.kept)
+        self.identity = {"robot": robot.name, "network": repr(own)}
+
+    def loss_of(
+        self, data: TrajectoryData, fraction: float, rng: np.random.Generator, held_out: bool
+    ) -> Float[Tensor, ""]:
+        return self.module.loss(data, self.settings.batch, fraction, rng)
+
+    def validate(self, fraction: float) -> Validation:
+        self.module.eval()
+        validation = super().validate(fraction)
+        self.module.train()
+        return validation
+
+    def success(self, rng: np.random.Generator) -> float | None:
+        return self.module.success(self.held_out, self.robot, rng)
+
+    def save(self, folder: FilePath, training: dict[str, Any]) -> None:
+        save_network(self.title, self.module, folder, training)

@@ -1,0 +1,45 @@
+"""AORRTC: a first path by RRT-Connect, then ever shorter ones by searches below the length of the last.
+
+Each round has fresh trees, which hold no path that is not shorter than the best one known; what a round finds
+is simplified, and bounds the next.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from robotdiffuse.planners.aorrtc.search import AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planners.base import Planner
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
+from robotdiffuse.results import PlanResult
+from robotdiffuse.settings import Bound, Natural
+
+STEP = 1_000
+"""Iterations between two questions whether more of them pay."""
+
+
+@dataclass(frozen=True)
+class AORRTCSettings(SearchSettings, name="aorrtc"):
+    gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.005
+    """Until "short", the search ends when its last doubling took off a smaller share of the length ..."""
+    patience: Natural = 2_000
+    """... but not before so many iterations."""
+
+
+class AORRTC(Planner[AORRTCSettings]):
+    """Asymptotically optimal RRT-Connect (T. Wilson et al., 2025), anytime."""
+
+    name = "aorrtc"
+    settings_class = AORRTCSettings
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planners.base.Planner`."""
+        settings = self.settings
+        search = AnytimeSearch(call, ends, settings, self.name)
+        return anytime(
+            call,
+            ends,
+            search,
+            lambda: search.pays(settings.gain, settings.patience),
+            lambda: search.improve(call.search_until, STEP),
+        )

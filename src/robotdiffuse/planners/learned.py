@@ -1,0 +1,40 @@
+"""What all planners around a network share: its weights."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+from robotdiffuse.learning.weights_at_hand import check_weights
+from robotdiffuse.planners.base import Planner
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.settings import Settings
+
+
+@dataclass(frozen=True)
+class LearnedSettings(Settings):
+    weights: str | None = None
+    """Folder of trained weights; None: those that come with the package for the robot."""
+
+
+Own = TypeVar("Own", bound=LearnedSettings)
+
+
+class LearnedPlanner(Planner[Own]):
+    """A planner that needs the weights of a network."""
+
+    network_name: ClassVar[str]
+    """In NETWORKS."""
+
+    def __init__(self, settings: Own | None = None) -> None:
+        """Raises InputError if the folder that the settings name holds no weights."""
+        super().__init__(settings)
+        check_weights(self.network_name, self.settings.weights)
+
+    def network(self, robot: Robot) -> Any:
+        """The trained network for a robot. Raises InputError, naming the command that trains it, without."""
+        from robotdiffuse.learning.checkpoint import load_network  # which loads PyTorch
+
+        return load_network(self.network_name, self.settings.weights, robot)
+
+    def prepare(self, robot: Robot) -> None:
+        """See `planners.base.Planner`."""
+        self.network(robot)

@@ -1,0 +1,37 @@
+"""RRT-Connect with simplification: the fast classical planner, and with restarts the control of the
+others."""
+
+from dataclasses import dataclass
+
+from robotdiffuse.planners.aorrtc.search import SLICE, AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planners.base import Planner
+from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.ends import Ends
+from robotdiffuse.results import PlanResult
+from robotdiffuse.settings import Count, NotNegative
+
+
+@dataclass(frozen=True)
+class RRTConnectSettings(SearchSettings, name="rrt_connect"):
+    searches: Count = 2
+    """Until "short": paths found, the shortest of which is the answer."""
+    optimize_time: NotNegative = 0.0
+    """... and time spent on restarts after the first path [s]."""
+
+
+class RRTConnect(Planner[RRTConnectSettings]):
+    """Two trees grown towards each other (Kuffner and LaValle, 2000), simplified; restarts while time is
+    left."""
+
+    name = "rrt_connect"
+    settings_class = RRTConnectSettings
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planners.base.Planner`."""
+        settings = self.settings
+        search = AnytimeSearch(call, ends, settings, self.name, bounded=False)
+
+        def pays() -> bool:
+            return search.found < settings.searches or call.elapsed < search.first_at + settings.optimize_time
+
+        return anytime(call, ends, search, pays, lambda: search.improve(call.search_until, SLICE))
