@@ -251,12 +251,14 @@ def test_a_pose_is_planned_to_with_many_goals() -> None:
     np.testing.assert_allclose(link_pose(PANDA, result.path.positions[-1], "panda_hand"), T, atol=1e-5)
 
 
-def test_no_way_ends_at_the_time_limit_or_earlier() -> None:
+def test_no_way_ends_at_the_time_limit_or_when_it_was_searched_for_at_every_distance() -> None:
     walls = [Box([side * 0.65, 0.0, 0.5], [1.0, 0.02, 3.0]) for side in (1, -1)]
     sealed = Scene([*walls, Box([0.0, 0.0, 1.35], [3.0, 0.02, 1.3])])
     problem = Problem(PANDA, sealed, LEFT, JointGoal(RIGHT[None]))
-    result = SharedTreeRRTStar().plan(problem, time_limit=0.3)
-    assert result.status is Status.TIMEOUT and result.path is None and result.reason
+    for step_rounds, limit, status in ((10**9, 0.3, Status.TIMEOUT), (1, 60.0, Status.NO_PATH)):
+        settings = SharedTreeSettings(step_rounds=step_rounds, growth=10, connect_iterations=10)
+        result = SharedTreeRRTStar(settings).plan(problem, time_limit=limit)
+        assert result.status is status and result.path is None and result.reason
 
 
 @pytest.mark.parametrize(
