@@ -566,6 +566,10 @@ def test_the_grid_is_a_lower_bound() -> None:
     pick = rng.integers(len(centres), size=3000)
     gap = np.linalg.norm(centres[pick, None] - cloud[:, :3], axis=-1).min(axis=1)
     assert (found.grid[pick] <= gap + 1e-5).all()
-    known = found.nearest[pick] >= 0
-    np.testing.assert_allclose(found.grid[pick][known], gap[known], atol=1e-5)
+    exact = found.grid[pick] < found.grid_frame[7]
+    np.testing.assert_allclose(found.grid[pick][exact], gap[exact], atol=1e-5)
+    np.testing.assert_array_equal(exact, gap < found.grid_frame[7])
+    to_known = np.linalg.norm(centres[pick] - found.points[found.nearest[pick], :3], axis=-1)
+    np.testing.assert_allclose(to_known[exact], gap[exact], atol=1e-5)
+    assert (to_known - gap < 2 * np.sqrt(3) * voxel)[found.nearest[pick] >= 0].all()
     assert compile_scene(Scene()).grid.shape == (0,)

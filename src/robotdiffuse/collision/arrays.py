@@ -10,7 +10,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.collision.near_pairs import no_tables, tabulate
-from robotdiffuse.collision.points import EMPTY, build_grid, cover, thin
+from robotdiffuse.collision.points import EMPTY, PointGrid, build_grid, cover, thin
 from robotdiffuse.robots.lever_arms import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
@@ -148,18 +148,27 @@ def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> S
             case Capsule():
                 half = np.array([shape.radius, shape.radius, shape.height / 2])
                 capsules.append(_oriented(shape, half, (2,), reach)[[*range(13), 14, 11]])
-            case PointCloud():
-                points.append(thin(shape.points, shape.point_radius, reach))
-            case Triangulated():
-                points.append(cover(shape.mesh.world_vertices[shape.mesh.faces], reach))
-    cloud = np.concatenate(points) if points else EMPTY
+            case PointCloud() | Triangulated():
+                points.append(shape)
     return SceneArrays(
         np.array(spheres, np.float32).reshape(-1, 4),
         np.array(boxes, np.float32).reshape(-1, 15),
         np.array(cylinders, np.float32).reshape(-1, 15),
         np.array(capsules, np.float32).reshape(-1, 15),
-        *build_grid(cloud, radius),
+        *_grid_around(tuple(points), reach, radius),
     )
+
+
+@lru_cache(maxsize=8)
+def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, radius: float) -> PointGrid:
+    """The grid of point clouds and meshes; the same ones in another scene have the same."""
+    clouds = [
+        thin(shape.points, shape.point_radius, reach)
+        if isinstance(shape, PointCloud)
+        else cover(shape.mesh.world_vertices[shape.mesh.faces], reach)
+        for shape in shapes
+    ]
+    return build_grid(np.concatenate(clouds) if clouds else EMPTY, radius)
 
 
 def _oriented(shape: Box | Cylinder | Capsule, half: ndarray, axes: tuple[int, ...], reach: float) -> ndarray:

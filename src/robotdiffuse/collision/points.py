@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32
+from jaxtyping import Float, Float32, Int, Int32
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.point_grid import KEEP, splat
+from robotdiffuse.collision.kernels.point_grid import KEEP, make_grid
 
 MESH_SPACING = 0.02
 """Triangles of mesh obstacles are divided until no edge is longer [m]; each piece becomes a point."""
@@ -16,7 +16,7 @@ MAX_POINTS = 400_000
 """Mesh obstacles are divided more coarsely, or their pieces joined, rather than into more points."""
 EXACT = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
-BAND_VOXELS = 10
+KNOWN_VOXELS = 10
 MAX_VOXELS = 2e6
 """A grid of 8 MB still fits a processor's cache."""
 EMPTY = np.zeros((0, 4))
@@ -38,7 +38,7 @@ def thin(points: Float[ndarray, "n 3"], radius: float, reach: float) -> Float[nd
     Points farther than `reach` and what is kept beyond it are left out.
     """
     with np.errstate(over="ignore"):
-        points = points[np.linalg.norm(points, axis=1) <= reach + KEEP + radius]
+        points = points[np.einsum("ij,ij->i", points, points) <= (reach + KEEP + radius) ** 2]
     return _join(np.column_stack([points, np.full(len(points), radius)]), THINNING * radius)
 
 
@@ -47,15 +47,20 @@ def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]
     if not len(spheres):
         return EMPTY
     offsets = spheres[:, :3] - spheres[:, :3].min(axis=0)
-    # 2^20 voxels along each axis at most, so that three indices fit an integer
-    keys = (offsets / max(voxel, float(offsets.max()) / 2**20)).astype(np.int64)
-    packed = (keys[:, 0] << 42) | (keys[:, 1] << 21) | keys[:, 2]
-    _, which, counts = np.unique(packed, return_inverse=True, return_counts=True)
-    if len(counts) == len(spheres):
+    # three indices and a sphere's number fit an integer: one sort of them is faster than a sort of numbers
+    bits = len(spheres).bit_length()
+    axis = (62 - bits) // 3
+    keys = (offsets * (1 / max(voxel, float(offsets.max()) / (2**axis - 1)))).astype(np.int64)
+    key = (keys[:, 0] << (2 * axis)) | (keys[:, 1] << axis) | keys[:, 2]
+    packed = np.sort((key << bits) | np.arange(len(spheres)))
+    starts = np.flatnonzero(np.diff(packed >> bits, prepend=-1))
+    if len(starts) == len(spheres):
         return spheres
-    centres = np.stack([np.bincount(which, spheres[:, i]) / counts for i in range(3)], axis=1)
-    radii = np.zeros(len(centres))
-    np.maximum.at(radii, which, np.linalg.norm(spheres[:, :3] - centres[which], axis=1) + spheres[:, 3])
+    spheres = spheres[packed & ((1 << bits) - 1)]
+    counts = np.diff(starts, append=len(spheres))
+    centres = np.add.reduceat(spheres[:, :3], starts) / counts[:, None]
+    away = spheres[:, :3] - np.repeat(centres, counts, axis=0)
+    radii = np.maximum.reduceat(np.sqrt(np.einsum("ij,ij->i", away, away)) + spheres[:, 3], starts)
     return np.column_stack([centres, radii])
 
 
@@ -107,25 +112,33 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
             np.ones(14, np.float32),
         )
     cloud = cloud.astype(np.float32)
-    band = EXACT + radius + float(cloud[:, 3].max())
-    low = cloud[:, :3].min(axis=0) - np.float32(band)
-    extent = (cloud[:, :3].max(axis=0) - low).astype(np.float64) + band
-    voxel = np.float32(max(band / BAND_VOXELS, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
-    band = max(band, 2 * float(voxel))
+    radii = cloud[:, 3]
+    known = EXACT + radius + float(radii.max())
+    low = cloud[:, :3].min(axis=0) - np.float32(known)
+    extent = (cloud[:, :3].max(axis=0) - low).astype(np.float64) + known
+    voxel = np.float32(max(known / KNOWN_VOXELS, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
     shape = np.ceil(extent / voxel).astype(np.int32) + 1
     cells = (shape + 1) // 2
-    index = ((cloud[:, :3] - low) / (2 * voxel)).astype(np.int64)
-    where = (index[:, 0] * cells[1] + index[:, 1]) * cells[2] + index[:, 2]
-    order = np.argsort(where, kind="stable")
-    points = np.ascontiguousarray(cloud[order])
-    first = np.asarray(np.searchsorted(where[order], np.arange(int(np.prod(cells)) + 1)), np.int32)
-    squares, nearest = splat(points, low, voxel, tuple(shape.tolist()), np.float32(band))
+    index = ((cloud[:, :3] - low) / voxel).astype(np.int64)
+    cell = _flat(index // 2, cells)
+    order = np.argsort(cell * 8 + (index % 2) @ np.array([4, 2, 1]))
+    points, index, cell = np.ascontiguousarray(cloud[order]), index[order], cell[order]
+    first = np.asarray(np.searchsorted(cell, np.arange(int(np.prod(cells)) + 1)), np.int32)
+    # a sphere as large as the robot's largest is decided within the band
+    band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))
+    voxels = _flat(index, shape)
+    starts = np.flatnonzero(np.diff(voxels, prepend=-1))
+    run = np.full(int(np.prod(shape)), -1, np.int32)
+    run[voxels[starts]] = np.arange(len(starts))
+    ends = np.append(starts, len(points)).astype(np.int32)
     from scipy.ndimage import distance_transform_edt  # which takes long to import, and only clouds need
 
-    # Beyond the band: the way to the nearest voxel that is within it, less what voxels blur, and the band.
-    steps = np.asarray(distance_transform_edt((nearest < 0).reshape(shape))).ravel()
-    beyond = np.maximum(band, (steps - np.sqrt(3)) * voxel + band)
-    grid = np.where(nearest >= 0, np.sqrt(squares), beyond).astype(np.float32)
-    radii = cloud[:, 3]
+    found = distance_transform_edt((run < 0).reshape(shape), return_distances=False, return_indices=True)
+    nearest_voxel, sizes = np.asarray(found).reshape(3, -1), tuple(shape.tolist())
+    grid, nearest = make_grid(points, ends, run, nearest_voxel, low, voxel, sizes, band, np.float32(known))
     frame = [*low, voxel, 2 * voxel, radii.max(), radii.min(), band, *shape, *cells]
     return PointGrid(points, first, grid, nearest, np.array(frame, np.float32))
+
+
+def _flat(index: Int[ndarray, "n 3"], shape: Int32[ndarray, "3"]) -> Int[ndarray, "n"]:
+    return (index[:, 0] * int(shape[1]) + index[:, 1]) * int(shape[2]) + index[:, 2]

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.collision.arrays import compile_robot, compile_scene_for, robot_groups
+from robotdiffuse.collision.arrays import SceneArrays, compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels.point_grid import KEEP
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
@@ -63,9 +63,8 @@ class SignedDistance:
         ]
         self._grid: Tensor | None = None
         if len(obstacles.points):
-            radius, shape = obstacles.grid_frame[5], obstacles.grid_frame[8:11].astype(int)
-            field = np.minimum(obstacles.grid - radius, KEEP + arrays.spheres[:, 3].min()).reshape(shape)
-            self._grid = tensor(field)[None, None]
+            field = _to_points(obstacles) - obstacles.grid_frame[5]
+            self._grid = tensor(np.minimum(field, KEEP + arrays.spheres[:, 3].min()))[None, None]
         self._grid_low, self._voxel = tensor(obstacles.grid_frame[:3]), float(obstacles.grid_frame[3])
 
     def __call__(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch links"]:
@@ -172,6 +171,16 @@ class SignedDistance:
             self._grid, where, padding_mode="border", align_corners=False
         )
         return sampled[0, 0, 0]
+
+
+def _to_points(scene: SceneArrays) -> Float[ndarray, "nx ny nz"]:
+    """Distances from the grid's voxel centres to points near them, as smooth as their bounds are not."""
+    frame, shape = scene.grid_frame, scene.grid_frame[8:11].astype(int)
+    known = scene.nearest >= 0
+    at = frame[:3] + (np.stack(np.unravel_index(np.flatnonzero(known), shape), axis=1) + 0.5) * frame[3]
+    field = scene.grid.copy()
+    field[known] = np.linalg.norm(at - scene.points[scene.nearest[known], :3], axis=1)
+    return field.reshape(shape)
 
 
 def _least(distances: Float[Tensor, "spheres batch"]) -> Int[Tensor, "batch"]:

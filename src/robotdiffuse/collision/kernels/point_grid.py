@@ -1,7 +1,8 @@
 """Compiled queries to point clouds: a grid of distances answers most of them, the points themselves the rest.
 
 The grid holds, for the centre of each voxel, the distance to the nearest point (its centre) and which one it
-is, exact within a band around the points and a lower bound of the distance beyond. A query that lies e from
+is, exact within a band around the points; beyond, a lower bound of the distance, and a point not far from the
+nearest. A query that lies e from
 its voxel's centre knows the distance to within e. Where that does not decide, the points in the cells around
 are looked at. `points.py` builds the arrays, which are fields of SceneArrays.
 """
@@ -24,36 +25,126 @@ _SLACK = np.float32(1e-5)
 
 
 @njit(fastmath=True, cache=True)
-def splat(points, low, voxel, shape, band):
-    """Nearest point to every voxel centre within `band` [m]: squared distances [nx ny nz], indices or -1."""
+def make_grid(points, starts, run, nearest_voxel, low, voxel, shape, band, known):
+    """Distances from voxel centres to points, and a point each, from the nearest voxel that holds points.
+
+    Exact below `band`; beyond, a lower bound, and a point wherever one may be within `known` [m]. The points
+    starts[b] to starts[b + 1] lie in the b-th voxel that holds any, which is b in run[nx * ny * nz];
+    nearest_voxel[3, nx * ny * nz] are its indices for every voxel.
+    """
     nx, ny, nz = shape
-    squares = np.full(nx * ny * nz, band * band, np.float32)
+    balls = _balls(points, starts)
+    blur = _blur(points, low, voxel)
+    distances = np.empty(nx * ny * nz, np.float32)
     nearest = np.full(nx * ny * nz, -1, np.int32)
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                v = (i * ny + j) * nz + k
+                u, w, t = nearest_voxel[0, v], nearest_voxel[1, v], nearest_voxel[2, v]
+                b = run[(u * ny + w) * nz + t]
+                steps = np.float32((u - i) ** 2 + (w - j) ** 2 + (t - k) ** 2)
+                # no voxel with points is nearer, and no point farther off its voxel's centre
+                lower = voxel * np.sqrt(steps) - blur
+                distances[v] = max(band, lower)
+                if lower >= known:
+                    continue
+                nearest[v] = starts[b]
+                if lower >= band:
+                    continue
+                cx, cy, cz = (
+                    low[0] + (np.float32(i) + _HALF) * voxel,
+                    low[1] + (np.float32(j) + _HALF) * voxel,
+                    low[2] + (np.float32(k) + _HALF) * voxel,
+                )
+                best = band * band
+                for p in range(starts[b], starts[b + 1]):
+                    dx, dy, dz = points[p, 0] - cx, points[p, 1] - cy, points[p, 2] - cz
+                    d = dx * dx + dy * dy + dz * dz
+                    if d < best:
+                        best = d
+                        nearest[v] = p
+                distances[v] = min(np.sqrt(best), band) if best < band * band else distances[v]
+    _settle(points, starts, balls, low, voxel, shape, band, distances, nearest)
+    return distances, nearest
+
+
+@njit(fastmath=True, cache=True)
+def _balls(points, starts):
+    """A ball around the points of each voxel, centre and radius."""
+    balls = np.zeros((len(starts) - 1, 4), np.float32)
+    for b in range(len(balls)):
+        ball, share = balls[b], _ONE / np.float32(starts[b + 1] - starts[b])
+        for p in range(starts[b], starts[b + 1]):
+            for axis in range(3):
+                ball[axis] += share * points[p, axis]
+        for p in range(starts[b], starts[b + 1]):
+            dx, dy, dz = points[p, 0] - ball[0], points[p, 1] - ball[1], points[p, 2] - ball[2]
+            ball[3] = max(ball[3], np.sqrt(dx * dx + dy * dy + dz * dz) + _SLACK)
+    return balls
+
+
+@njit(fastmath=True, cache=True)
+def _blur(points, low, voxel):
+    """How far a point is from the centre of its voxel at most."""
+    most = _ZERO
     for p in range(len(points)):
-        px, py, pz = (
-            (points[p, 0] - low[0]) / voxel,
-            (points[p, 1] - low[1]) / voxel,
-            (points[p, 2] - low[2]) / voxel,
-        )
-        span = band / voxel
+        square = _ZERO
+        for axis in range(3):
+            at = (points[p, axis] - low[axis]) / voxel
+            off = at - np.floor(at) - _HALF
+            square += off * off
+        most = max(most, square)
+    return voxel * np.sqrt(most) + _SLACK
+
+
+@njit(fastmath=True, cache=True)
+def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
+    """Make distances exact that are those of some point, or the band's where there is none as near."""
+    nx, ny, nz = shape
+    for b in range(len(balls)):
+        x, y, z, radius = balls[b]
+        wide = band + radius
+        px, py, pz, span = (x - low[0]) / voxel, (y - low[1]) / voxel, (z - low[2]) / voxel, wide / voxel
         i0, i1 = max(int(px - span), 0), min(int(px + span) + 1, nx)
         j0, j1 = max(int(py - span), 0), min(int(py + span) + 1, ny)
         k0, k1 = max(int(pz - span), 0), min(int(pz + span) + 1, nz)
+        n, zero = np.int32(k1 - k0), np.float32(k0) + _HALF
         for i in range(i0, i1):
-            dx = (np.float32(i) + _HALF - px) * voxel
+            cx = low[0] + (np.float32(i) + _HALF) * voxel
             for j in range(j0, j1):
-                dy = (np.float32(j) + _HALF - py) * voxel
-                base = dx * dx + dy * dy
-                if base >= band * band:
+                cy = low[1] + (np.float32(j) + _HALF) * voxel
+                base = (cx - x) * (cx - x) + (cy - y) * (cy - y)
+                at = (i * ny + j) * nz + k0
+                if base >= wide * wide or not _any_closer(distances, at, n, base, pz - zero, voxel, radius):
                     continue
-                row = (i * ny + j) * nz
-                for k in range(k0, k1):
-                    dz = (np.float32(k) + _HALF - pz) * voxel
-                    d = base + dz * dz
-                    closer = d < squares[row + k]
-                    squares[row + k] = d if closer else squares[row + k]
-                    nearest[row + k] = p if closer else nearest[row + k]
-    return squares, nearest
+                for p in range(starts[b], starts[b + 1]):
+                    dx, dy = cx - points[p, 0], cy - points[p, 1]
+                    height = (points[p, 2] - low[2]) / voxel - zero
+                    _closer(distances, nearest, at, n, dx * dx + dy * dy, height, voxel, np.int32(p), band)
+
+
+@allocation_free(fastmath=True)
+def _any_closer(distances, at, n, base, z, voxel, radius):
+    """Whether a ball of points may hold a nearer one than what n voxels in a row know."""
+    some = np.int32(0)
+    for k in range(n):
+        dz = (np.float32(k) - z) * voxel
+        within = distances[at + k] + radius
+        some |= np.int32(base + dz * dz < within * within)
+    return some
+
+
+@allocation_free(fastmath=True)
+def _closer(distances, nearest, at, n, base, z, voxel, p, band):
+    """Let n voxels in a row know point p if it is nearest."""
+    for k in range(n):
+        dz = (np.float32(k) - z) * voxel
+        d = np.sqrt(base + dz * dz)
+        old = distances[at + k]
+        closer = d < min(old, band)
+        distances[at + k] = d if closer else old
+        nearest[at + k] = p if closer else nearest[at + k]
 
 
 @allocation_free(fastmath=True)
