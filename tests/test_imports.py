@@ -12,6 +12,7 @@ SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 MODULES = sorted(SOURCE.rglob("*.py"))
 
 CHAIN = (
+    "compile_cache",
     "errors",
     "registry",
     "settings",

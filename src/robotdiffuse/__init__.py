@@ -5,6 +5,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING
 
+from robotdiffuse.compile_cache import ensure_cache
+
 if TYPE_CHECKING:
     from robotdiffuse.data.dataset import RopDataset as RopDataset
     from robotdiffuse.errors import InputError as InputError
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from robotdiffuse.verify import verify as verify
 
 __version__ = "0.1.0"
+ensure_cache()
 
 _HOME = {
     "InputError": "robotdiffuse.errors",
