@@ -135,8 +135,8 @@ def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
     """z of a scene: its point cloud through the frozen encoder."""
-    region = model.settings.encoder_settings.region
-    return model.encode(sample_surface(checker.scene, points, rng, region), rng)
+    assert model.encoder is not None  # a prior is no network of these planners
+    return model.encode(sample_surface(checker.scene, points, rng, model.encoder.settings.region), rng)
 
 
 class Diffusion(ModelSampler[DiffusionSettings]):
