@@ -40,7 +40,7 @@ from robotdiffuse.learning.motion_model import MotionModel, one_thread
 from robotdiffuse.learning.samplers.ddpm import ancestral
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
-from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings
+from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Bound, Count, NotNegative, Positive
 
@@ -49,8 +49,6 @@ RESOLUTION = 0.02
 Guide = Callable[[ndarray, int], ndarray]
 """The mean of a denoising step [count, waypoints, dof] [rad], and how many steps are still to come (0 at
 the last one and in the steps without noise after it), to the mean after steps down the guide's costs."""
-SAMPLES_PER_GOAL = 4
-"""So many samples are drawn at least for each goal that has a share of a batch."""
 
 
 class Attempt(NamedTuple):
@@ -194,8 +192,8 @@ def shared_out(
     start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], samples: int
 ) -> tuple[Float[ndarray, "samples dof"], Float[ndarray, "samples dof"]]:
     """Start and goal of each sample: the nearest goals take turns."""
-    nearest = np.argsort(np.linalg.norm(goals - start, axis=1))[: max(samples // SAMPLES_PER_GOAL, 1)]
-    return np.repeat(start[None], samples, 0), goals[nearest[np.arange(samples) % len(nearest)]]
+    nearest = nearest_goals(start, goals, samples)
+    return np.repeat(start[None], samples, 0), nearest[np.arange(samples) % len(nearest)]
 
 
 def collision_gradient(
