@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 from report import header, print_table, progress
-from searches import Arena
+from searches import Arena, Candidates
 
 from problems import PANDA, Case, draw_cases
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
@@ -33,7 +33,7 @@ from robotdiffuse.evaluation.tables import Column
 from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial, tried
 from robotdiffuse.paths.simplify import shortcut
 from robotdiffuse.planners.aorrtc import kernel
-from robotdiffuse.planners.robotdiffuse import Candidates, RobotDiffuse, unlearned_starts
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse, unlearned_starts
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.family import Family, uniform_configurations
 from robotdiffuse.problems.problem import JointGoal
@@ -83,7 +83,7 @@ def by_bumps(arena: Arena, _seconds: float) -> Paths:
     waypoints = arena.model.settings.waypoints
     starts = [unlearned_starts(arena.start, goal, EACH, waypoints, PANDA, arena.rng) for goal in arena.goals]
     q = np.concatenate(starts).astype(np.float32)
-    return shortest_free(arena, Candidates(q, np.zeros(len(q), bool), ""))
+    return shortest_free(arena, Candidates(q, np.zeros(len(q), bool)))
 
 
 def shortest_free(arena: Arena, found: Candidates) -> Paths:

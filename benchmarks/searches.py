@@ -6,9 +6,10 @@ The control are trajectories that no network made: the straight line and random 
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
@@ -21,7 +22,7 @@ from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.paths.simplify import shortcut
 from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.planners.ends import Ends
-from robotdiffuse.planners.robotdiffuse import Candidates, RobotDiffuse, unlearned_starts
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse, unlearned_starts
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
 from robotdiffuse.problems.held_out import SEED
 from robotdiffuse.problems.problem import JointGoal
@@ -32,6 +33,17 @@ BUMPS = 4
 """Unlearned starts in a repeated batch: as many."""
 CLEARANCE, SHORTCUTS = 0.002, 80
 """Distance to obstacles that searches keep where the ends do [m]; attempts to shorten each candidate."""
+
+RESOLUTION = 0.02
+"""No point of the arm moves further than this between two checks [m]."""
+
+
+class Candidates(NamedTuple):
+    """Trajectories between the ends of a problem, not yet judged."""
+
+    q: Float[ndarray, "count waypoints dof"]
+    free: Bool[ndarray, "count"]
+    """Whether the compiled check calls them free."""
 
 
 class Arena:
@@ -50,19 +62,19 @@ class Arena:
         if self.ends.reachable:
             self.start, self.goals = self.ends.rows()
             self.clearance = self.ends.kept_clearance(CLEARANCE)
-            self.space = search_space(self.checker, planner.settings.resolution, self.clearance)
+            self.space = search_space(self.checker, RESOLUTION, self.clearance)
 
     def line(self) -> Float[ndarray, "2 dof"] | None:
         """The straight line, if it is free."""
         line = np.stack([self.start, self.goals[0]])
-        space = search_space(self.checker, self.planner.settings.resolution)
+        space = search_space(self.checker, RESOLUTION)
         return line if motions_free(space, line).all() else None
 
     def code(self) -> Float[ndarray, "code"]:
         return encode(self.model, self.checker, self.planner.settings.points, self.rng)
 
     def sampled(self, planner: RobotDiffuse, code: Float[ndarray, "code"]) -> Candidates:
-        return planner.sample(self.model, self.checker, code, self.start, self.goals, self.rng)
+        return self.told(planner.draw(self.model, self.checker, code, self.start, self.goals, self.rng))
 
     def bumps(self, number: int) -> Float[ndarray, "n waypoints dof"]:
         """The line, and as many random bumps as make up the number."""
@@ -70,7 +82,12 @@ class Arena:
         return unlearned_starts(self.start, self.goals[0], number, waypoints, self.robot, self.rng)
 
     def refined(self, q: Float[ndarray, "n waypoints dof"]) -> Candidates:
-        return self.planner.refine(self.checker, q)
+        return self.told(self.planner.refine(self.checker, q))
+
+    def told(self, q: Float[ndarray, "n waypoints dof"]) -> Candidates:
+        """Trajectories with the verdict of the compiled check."""
+        space, q = search_space(self.checker, RESOLUTION), np.ascontiguousarray(q, np.float32)
+        return Candidates(q, np.array([motions_free(space, path).all() for path in q]))
 
     def shortened(self, found: Candidates) -> Iterator[ndarray]:
         """The shortest of the free candidates after shortcuts."""
@@ -156,7 +173,7 @@ def shared_tree(arena: Arena) -> Iterator[ndarray | None]:
         safety_distance=arena.clearance,
         steps=1,
         improvement=0.0,
-        resolution=arena.planner.settings.resolution,
+        resolution=RESOLUTION,
     )
     found = SharedTreeSearch(arena.checker, arena.start, arena.goals, settings, arena.state)
     best = np.inf

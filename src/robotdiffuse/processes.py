@@ -24,6 +24,7 @@ from typing import Any
 
 from robotdiffuse import __version__
 from robotdiffuse.errors import InputError
+from robotdiffuse.registry import Added, added, take_over
 
 Results = Generator[tuple[int, Any], None, None]
 """Results of calls as they are done, each with the number of its call; to be closed, so that none goes on."""
@@ -43,7 +44,7 @@ class Workers:
         """`count` 0: this process makes the calls itself. `patience`: for those that are stopped [s]."""
         # fresh interpreters: forked ones could inherit locks of running threads
         context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(count, context, initializer=prepare_worker) if count else None
+        self._pool = ProcessPoolExecutor(count, context, prepare_worker, (added(),)) if count else None
         self._count, self._patience = count, patience
 
     def __enter__(self) -> "Workers":
@@ -94,7 +95,8 @@ class LoneWorker:
             raise BrokenProcessPool("closed")
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(1, context, _prepare_lone, (self._prepare, self._arguments))
+            given = added(), self._prepare, self._arguments
+            self._pool = ProcessPoolExecutor(1, context, _prepare_lone, given)
         try:
             with interrupts_not_passed_on():
                 job = self._pool.submit(call, *arguments)
@@ -112,8 +114,8 @@ class LoneWorker:
             end(processes, signal.SIGTERM, PATIENCE)
 
 
-def _prepare_lone(prepare: Callable[..., None], arguments: tuple) -> None:
-    prepare_worker()
+def _prepare_lone(entries: Added, prepare: Callable[..., None], arguments: tuple) -> None:
+    prepare_worker(entries)
     prepare(*arguments)
 
 
@@ -130,15 +132,20 @@ def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
     """
     left, running = list(enumerate(calls))[::-1], {}
     with ray_cluster() as ray:
-        task = ray.remote(num_cpus=1, max_retries=LOST_NODES)(call)
+        task = ray.remote(num_cpus=1, max_retries=LOST_NODES)(_on_node)
         while left or running:
             most = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
             while left and len(running) < most:
                 number, arguments = left.pop()
-                running[task.remote(*arguments)] = number
+                running[task.remote(added(), call, arguments)] = number
             done, _ = ray.wait(list(running), num_returns=1)
             for reference in done:
                 yield running.pop(reference), ray.get(reference)
+
+
+def _on_node(entries: Added, call: Callable[..., Any], arguments: tuple) -> Any:
+    take_over(entries)
+    return call(*arguments)
 
 
 CLUSTERS: dict[str, Callable[[Callable[..., Any], Sequence[tuple]], Results]] = {"ray": on_ray}
@@ -186,8 +193,9 @@ def interrupts_afterwards() -> Iterator[None]:
         signal.raise_signal(signal.SIGINT)
 
 
-def prepare_worker() -> None:
-    """A worker ends with its parent, even where that is killed."""
+def prepare_worker(entries: Added) -> None:
+    """A worker has what its parent has `added` to the tables, and ends with it, even where that is killed."""
+    take_over(entries)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

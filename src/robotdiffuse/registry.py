@@ -21,16 +21,38 @@ class Entry:
     """What entries of one table are told apart by, e.g. search, learned, hybrid for planners."""
 
 
+Added = dict[str, dict[str, Entry]]
+"""Entries by name, by what they are."""
+_tables: dict[str, "Registry"] = {}
+_taken_over: Added = {}
+
+
+def added() -> Added:
+    """What this program has added to the tables that the package has, for `take_over` in its processes."""
+    found = {what: dict(table.items() - table.own.items()) for what, table in _tables.items()}
+    return {what: entries for what, entries in found.items() if entries}
+
+
+def take_over(entries: Added) -> None:
+    """Add to all tables, those too that are made later, what the program that started this one has added."""
+    _taken_over.update(entries)
+    for what in _tables.keys() & entries.keys():
+        _tables[what].update(entries[what])
+
+
 class Registry(dict[str, Entry]):
     """Entries by name, in the order that they are listed in. A program may add its own:
 
     PLANNERS["mine"] = Entry("my_package.planner:MyPlanner", "what it does", "MySettings")
+
+    Processes that it starts have them too.
     """
 
     def __init__(self, what: str, entries: dict[str, Entry]) -> None:
         """`what` they are, in error messages: "planner"."""
-        super().__init__(entries)
-        self.what = what
+        super().__init__(entries | _taken_over.get(what, {}))
+        self.what, self.own = what, entries
+        _tables[what] = self
 
     def entry(self, name: object) -> Entry:
         """Raises InputError, listing the known names, for an unknown one."""

@@ -190,7 +190,7 @@ BAD_CALL = {
     "unknown objective": ([*TRAIN, "--objective", "score"], "known: clean, noise, velocity"),
     "unknown denoiser": ([*TRAIN, "--denoiser", "net"], "known: decoder_only, encoder_decoder, transformer"),
     "unknown parametrization": ([*TRAIN, "--parametrization", "spline"], "known: b_spline, waypoints"),
-    "unknown target": ([*TRAIN, "--target", "line"], "known: absolute, residual"),
+    "unknown target": ([*TRAIN, "--target", "line"], "known: absolute, limits, residual"),
     "rows of waypoints": ([*TRAIN, "--rows", "20"], "rows is 20"),
     "too few waypoints": ([*TRAIN, "--waypoints", "2"], "waypoints is 2"),
     "no condition at all": ([*TRAIN, "--condition-drop", "1"], "condition_drop is 1.0"),

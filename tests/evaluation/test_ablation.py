@@ -28,7 +28,8 @@ def test_every_config_makes_a_model(name: str) -> None:
     given = {"data": "data"} if "encoder" in CONFIGS[name].changes else {"data": "data", "encoder": "folder"}
     settings = planner_training(name, given)
     encoder = settings.encoder if settings.jointly else "compression_autoencoder"
-    model = MotionModel(RobotIdentity.of(PANDA), _model_settings(settings, make_encoder(encoder)))
+    made = None if settings.encoder is None else make_encoder(encoder or "")
+    model = MotionModel(RobotIdentity.of(PANDA), _model_settings(settings, made))
     assert isinstance(model.denoiser, DENOISERS.load(settings.denoiser))
     assert (settings.minutes is None) != (settings.samples is None)
 
@@ -42,7 +43,7 @@ def test_the_papers_config_has_its_figures() -> None:
     )
     assert isinstance(model.denoiser, Transformer)
     assert (model.denoiser.settings.width, model.denoiser.settings.layers) == (512, 8)
-    assert model.settings.encoder_settings.code == 60
+    assert model.settings.code == 60
 
 
 def test_what_is_given_beside_a_config_wins() -> None:

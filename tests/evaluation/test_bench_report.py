@@ -11,7 +11,8 @@ import pytest
 from robotdiffuse.cli import main
 from robotdiffuse.errors import InputError
 from robotdiffuse.evaluation.bench import figures, page, plots, report
-from robotdiffuse.evaluation.bench.figures import GAVE_UP, LATER, RAN_OUT, Bench, counting, outcome
+from robotdiffuse.evaluation.bench.folder import Bench, read_bench
+from robotdiffuse.evaluation.bench.outcomes import GAVE_UP, LATER, RAN_OUT, counting, outcome
 from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
 from robotdiffuse.evaluation.problem_sets import case_file
 from robotdiffuse.evaluation.records import RESTARTED, Record, record_of_row, record_path
@@ -163,7 +164,7 @@ def test_the_judge_may_end_after_the_limit_of_the_call_alone() -> None:
 
 
 def test_figures_of_a_small_run(small: Path) -> None:
-    bench = figures.read_bench(small)
+    bench = read_bench(small)
     assert next(iter(bench.records)) == bench.reference == "robotdiffuse"
     assert set(bench.records) == {"robotdiffuse", "mpnet", "ompl_rrt_star"}
     whole, apart = figures.sections(bench)
@@ -190,7 +191,7 @@ def test_figures_of_a_small_run(small: Path) -> None:
 
 
 def test_comscore_of_a_small_run(small: Path) -> None:
-    whole, _ = figures.sections(figures.read_bench(small), [1.0])
+    whole, _ = figures.sections(read_bench(small), [1.0])
     of = rows(whole, 1.0)
     lengths = {"robotdiffuse": 6.0, "mpnet": 6.6, "ompl_rrt_star": 9.0}
     times = {"robotdiffuse": 0.05, "mpnet": 0.51, "ompl_rrt_star": 1.0}
@@ -210,7 +211,7 @@ def test_compared_are_problems_that_all_planners_were_given_this_time_for(tmp_pa
     records += [failed("edmp", name, 1.0, 1.0) for name in names]
     folder = write(tmp_path / "run", records, {10.0: 2})
     keep_problems(folder, names)
-    (section,) = figures.sections(figures.read_bench(folder))
+    (section,) = figures.sections(read_bench(folder))
     whole = {c.limit: c for c in section.comparisons}
     assert whole[1.0].problems == 6
     assert whole[1.0].missing == ()
@@ -228,7 +229,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
         records.append(solved("robotdiffuse", "b", 1.0, [(0.1, 2.0)], seed=seed))
         one = solved("mpd", "b", 1.0, [(0.1, 2.0)], seed=seed)
         records.append(one if seed == 0 else failed("mpd", "b", 1.0, 1.0, seed=seed))
-    (section,) = figures.sections(figures.read_bench(write(tmp_path / "run", records)), [1.0])
+    (section,) = figures.sections(read_bench(write(tmp_path / "run", records)), [1.0])
     row = rows(section, 1.0)["mpd"]
     assert section.main.seeds == 3
     assert row.success == pytest.approx(4 / 6)
@@ -238,7 +239,7 @@ def test_seeds_of_a_problem_are_one_row_of_the_comparison(tmp_path: Path) -> Non
 
 
 def test_curves_end_where_they_are_no_longer_known_of_all_problems(small: Path) -> None:
-    whole, _ = figures.sections(figures.read_bench(small))
+    whole, _ = figures.sections(read_bench(small))
     curves = {curve.planner: curve for curve in whole.curves}
     assert curves["mpnet"].end == 10.0
     assert curves["ompl_rrt_star"].found.tolist() == [0.05, 0.5, 5.0]
@@ -268,7 +269,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
             solved("rrt_connect" + RESTARTED, name, 1.0, [(0.01, 2.4), (0.3, 1.8)], 0.99, restarts=90),
             solved("ompl_aorrtc", name, 1.0, [(0.01, 2.4), (0.3, 1.6)], 0.99),
         ]
-    bench = figures.read_bench(write(tmp_path / "run", records))
+    bench = read_bench(write(tmp_path / "run", records))
     assert list(bench.records)[:2] == ["robotdiffuse", "robotdiffuse+restarts"]
     section = figures.sections(bench)[-1]
     table = report.main_table(section, section.main, bench.reference)
@@ -282,7 +283,7 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     assert cells(table, "ComScore")["rrt_connect, restarted"] == "–"
     tenth = report.main_table(section, section.comparisons[0], bench.reference)
     assert cells(tenth, "ratio to robotdiffuse: hybrid, restarted")["rrt_connect, restarted"] == "1.200"
-    plain = figures.read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
+    plain = read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
     assert len(plain.records) == 4
     alone = Bench(plain.folder, plain.runs, {n: r for n, r in plain.records.items() if RESTARTED not in n})
     section = figures.sections(alone)[-1]
@@ -300,7 +301,7 @@ def test_a_call_that_used_up_its_time_stands_for_its_restarts(tmp_path: Path) ->
         solved("rrt_connect" + RESTARTED, "rop/0", 1.0, [(0.01, 2.4), (0.3, 1.8)], 0.99, restarts=90),
         failed("rrt_connect", "rop/1", 1.0, 1.0),
     ]
-    bench = figures.read_bench(write(tmp_path / "run", records))
+    bench = read_bench(write(tmp_path / "run", records))
     again = bench.records["rrt_connect" + RESTARTED]
     assert [record.name for record in again] == ["rop/0", "rop/1"]
     assert {record.planner for record in again} == {"rrt_connect+restarts"}
@@ -317,7 +318,7 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
         for r, w in (("a", 2), ("b", 1))
     ]
     (folder / "runs.jsonl").write_text("".join(json.dumps(run) + "\n" for run in runs))
-    bench = figures.read_bench(folder)
+    bench = read_bench(folder)
     (section,) = figures.sections(bench, [1.0])
     table = report.main_table(section, section.main, bench.reference)
     assert cells(table, "timed") == {
@@ -326,7 +327,7 @@ def test_rows_that_were_timed_under_other_loads_are_told_in_the_table(tmp_path: 
         "mpd": "run 2, 1 at once",
     }
     assert "Not all rows were timed alike" in table.notes[0]
-    bench = figures.read_bench(folder, ["robotdiffuse", "rrt_connect"])
+    bench = read_bench(folder, ["robotdiffuse", "rrt_connect"])
     (section,) = figures.sections(bench, [1.0])
     table = report.main_table(section, section.main, bench.reference)
     assert table.columns[-1].heading == "ComScore"
@@ -340,7 +341,7 @@ def test_runs_that_noted_nothing_with_their_calls_are_told_by_what_they_called(t
     run = RUN | {"planners": ["robotdiffuse"], "time_limit": 1.0, "count": 3, "workers": 2}
     with (folder / "runs.jsonl").open("a") as stream:
         stream.write(json.dumps(run) + "\n")
-    (section,) = figures.sections(figures.read_bench(folder), [1.0])
+    (section,) = figures.sections(read_bench(folder), [1.0])
     table = report.main_table(section, section.main, "robotdiffuse")
     assert cells(table, "timed") == {
         "robotdiffuse: hybrid": "run 1 or 2, 1 or 2 at once",
@@ -369,7 +370,7 @@ def test_a_metric_is_declared_in_one_place(
     record = solved("robotdiffuse", "rop/9", 1.0, [(0.1, 0.5)], measures=measured)
     assert record.row()["waypoint_count"] == 3
     assert record_of_row(json.loads(json.dumps(record.row()))) == record
-    bench = figures.read_bench(write(tmp_path / "run", [record]))
+    bench = read_bench(write(tmp_path / "run", [record]))
     parts = figures.sections(bench, [1.0])
     assert re.search(r"waypoint count kilo .*\n.*\n.* 0.0030 ", report.markdown(bench, parts))
     assert "waypoint count kilo" in report.latex(bench, parts)
@@ -380,7 +381,7 @@ def test_a_metric_is_declared_in_one_place(
 
 
 def test_latex_is_escaped_and_every_row_has_all_columns(small: Path) -> None:
-    bench = figures.read_bench(small)
+    bench = read_bench(small)
     text = report.latex(bench, figures.sections(bench))
     assert r"ompl\_rrt\_star" in text
     assert r"Abacus\_9 \& sons" in text
@@ -398,7 +399,7 @@ def test_the_paper_stands_beside_ours(small: Path) -> None:
         for i in range(4):
             record = solved("diffusion", f"rop/{i}", 1.0, [(0.3, 2.5)], trivial=i == 3)
             stream.write(json.dumps(record.row()) + "\n")
-    bench = figures.read_bench(small)
+    bench = read_bench(small)
     whole, _ = figures.sections(bench)
     table = report.paper_table(whole, whole.main)
     assert table is not None
@@ -441,7 +442,7 @@ def test_the_command_writes_everything(
 
 def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     keep_problems(small, [f"rop/{i}" for i in range(4)])
-    bench = figures.read_bench(small)
+    bench = read_bench(small)
     shown = page.worth_showing(bench, figures.sections(bench, [1.0]))
     titles = [motion.title for motion in shown]
     assert titles[0] == "robotdiffuse · rop/0"  # solved by all; made up as one and the same
@@ -457,16 +458,16 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
 
 def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="no records of a bench"):
-        figures.read_bench(small / "nowhere")
+        read_bench(small / "nowhere")
     with pytest.raises(InputError, match=r"'foo'.*mpnet, .*"):
-        figures.read_bench(small, ["foo"])
+        read_bench(small, ["foo"])
     with pytest.raises(InputError, match="no planner was run that long"):
-        figures.sections(figures.read_bench(small, ["ompl_rrt_star"]), [60.0])
+        figures.sections(read_bench(small, ["ompl_rrt_star"]), [60.0])
     assert main(["bench", "report", str(small), "--limits", "1,x"]) == 2
     assert "limits are '1,x'" in capsys.readouterr().err
     (small / "runs.jsonl").write_text('{"date": 1}\n')
     with pytest.raises(InputError, match=r"runs\.jsonl is damaged"):
-        figures.read_bench(small)
+        read_bench(small)
     with (small / "records" / "mpnet.jsonl").open("a") as stream:
         stream.write("{broken\n")
     assert main(["bench", "report", str(small)]) == 2
@@ -477,7 +478,7 @@ def test_an_empty_folder_says_how_to_go_on(tmp_path: Path) -> None:
     (tmp_path / "records").mkdir()
     (tmp_path / "records" / "mpnet.jsonl").touch()
     with pytest.raises(InputError, match="no records yet"):
-        figures.read_bench(tmp_path)
+        read_bench(tmp_path)
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 13, 18])

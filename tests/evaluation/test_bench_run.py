@@ -28,6 +28,7 @@ from robotdiffuse.planners.robotdiffuse import RobotDiffuse
 from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length
+from robotdiffuse.registry import Entry
 from robotdiffuse.types import Path as Motion
 from robotdiffuse.verify import verify
 
@@ -76,8 +77,6 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
 
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
-    far_side = sys.executable, str(Path(faulty_planner.__file__))
-    monkeypatch.setattr(planner_process, "FAR_SIDE", far_side)
     monkeypatch.setattr(planner_process, "PATIENCE", 6.0)
     monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
 
@@ -95,6 +94,12 @@ def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) 
     log = (tmp_path / "logs" / "faulty.log").read_text()
     assert "about to die" in log and "this is no answer" in log and "ValueError" in log
     assert run_bench(asked, quiet, quiet) == 0
+
+
+def test_a_planner_of_the_program_itself_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(PLANNERS, "mine", Entry("__main__:Mine", "for tests"))
+    with pytest.raises(InputError, match="planner mine is in the program that was started"):
+        run_bench(settings(tmp_path, "mine", count=1), quiet, quiet)
 
 
 def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

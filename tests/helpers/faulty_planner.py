@@ -1,13 +1,10 @@
-"""A planner that fails in every way that one can, by its seed; and the far side of a process that has it."""
+"""A planner that fails in every way that one can, by its seed."""
 
 import os
 import signal
-import sys
 import time
-from pathlib import Path
 
-from robotdiffuse.evaluation.bench import planner_process
-from robotdiffuse.planners import PLANNERS, Entry
+from robotdiffuse.planners import Entry
 from robotdiffuse.planners.rrt_connect import RRTConnect
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
@@ -32,8 +29,3 @@ class Faulty(RRTConnect):
 
 
 ENTRY = Entry("helpers.faulty_planner:Faulty", "for tests")
-
-if __name__ == "__main__":
-    sys.path.insert(0, str(Path(__file__).parents[1]))
-    PLANNERS["faulty"] = ENTRY
-    planner_process.main()

@@ -183,7 +183,7 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
     run = start("two", settings, out, *launcher)
     said = run.communicate(timeout=500)[0]
     assert run.returncode == 0, said
-    assert said.count("planner: 100.0%, 160 samples") == 2, "the first process alone reports"
+    assert said.count("model: 100.0%, 160 samples") == 2, "the first process alone reports"
     first, second = json.loads((out / "seen.json").read_text())
     assert first == second
     assert first["report"] == first["again"]

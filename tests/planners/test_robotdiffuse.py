@@ -10,7 +10,6 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.planners import robotdiffuse as module
 from robotdiffuse.planners.aorrtc.planner import AORRTCSettings
 from robotdiffuse.planners.aorrtc.search import SLICE, AnytimeSearch
 from robotdiffuse.planners.diffusion import encode
@@ -109,9 +108,9 @@ def test_several_goals_and_pose_goals(planner):
 
 def test_search_answers_where_the_network_gives_nothing(planner, monkeypatch):
     def nothing(self, *_arguments):
-        return module.Candidates(np.zeros((1, 2, 7), np.float32), np.zeros(1, bool), "network")
+        return np.zeros((1, 2, 7), np.float32)
 
-    monkeypatch.setattr(RobotDiffuse, "sample", nothing)
+    monkeypatch.setattr(RobotDiffuse, "draw", nothing)
     monkeypatch.setattr(RobotDiffuse, "refine", nothing)
     result = planner.plan(PROBLEM, time_limit=10.0)
     assert result.stage == "aorrtc" and result.path is not None
@@ -122,13 +121,13 @@ def test_the_first_path_comes_before_the_network_is_asked(planner, monkeypatch):
     """So time that runs out while it samples costs no plan; and what is returned is no longer."""
     began = []
 
-    def late(self, *arguments, sample=RobotDiffuse.sample):
+    def late(self, *arguments, draw=RobotDiffuse.draw):
         began.append(time.perf_counter() - start)
         time.sleep(0.3)
-        return sample(self, *arguments)
+        return draw(self, *arguments)
 
     planner.plan(PROBLEM, time_limit=10.0)
-    monkeypatch.setattr(RobotDiffuse, "sample", late)
+    monkeypatch.setattr(RobotDiffuse, "draw", late)
     start = time.perf_counter()
     result = planner.plan(PROBLEM, time_limit=1.0, until="limit")
     assert result.path is not None and verify(PROBLEM, result.path).valid
@@ -138,8 +137,8 @@ def test_the_first_path_comes_before_the_network_is_asked(planner, monkeypatch):
 
 def test_batches_have_their_share_of_the_work(monkeypatch):
     drawn = []
-    sample = RobotDiffuse.sample
-    monkeypatch.setattr(RobotDiffuse, "sample", lambda *arguments: drawn.append(1) or sample(*arguments))
+    draw = RobotDiffuse.draw
+    monkeypatch.setattr(RobotDiffuse, "draw", lambda *arguments: drawn.append(1) or draw(*arguments))
     counts = {}
     for share in (0.0, 0.5):
         drawn.clear()
@@ -154,9 +153,9 @@ def test_a_candidate_that_the_judge_refuses_is_not_returned(planner, monkeypatch
 
     def through(self, _model, _checker, _code, start, goals, _rng):
         line = start + np.linspace(0, 1, 48)[:, None] * (goals[0] - start)
-        return module.Candidates(line[None].astype(np.float32), np.ones(1, bool), "network")
+        return line[None].astype(np.float32)
 
-    monkeypatch.setattr(RobotDiffuse, "sample", through)
+    monkeypatch.setattr(RobotDiffuse, "draw", through)
     result = planner.plan(PROBLEM, time_limit=10.0)
     assert result.path is not None and result.stage != "network" and verify(PROBLEM, result.path).valid
 
@@ -199,9 +198,9 @@ def test_the_guidance_scale_reaches_the_network():
     assert model is not None
     code = encode(model, checker, 320, np.random.default_rng(0))
     plain, same, strong = (
-        RobotDiffuse(RobotDiffuseSettings(samples=2, guidance_steps=0, guidance_scale=scale))
-        .sample(model, checker, code, LEFT, RIGHT[None], np.random.default_rng(1))
-        .q
+        RobotDiffuse(RobotDiffuseSettings(samples=2, guidance_steps=0, guidance_scale=scale)).draw(
+            model, checker, code, LEFT, RIGHT[None], np.random.default_rng(1)
+        )
         for scale in (1.0, 1.0, 3.0)
     )
     assert np.array_equal(plain, same) and np.abs(strong - plain).max() > 0.01

@@ -4,32 +4,43 @@ The planners are tested with a prior whose denoiser has a closed form: bumps of 
 straight line. So the tests need no trained weights.
 """
 
+import json
+import os
+import signal
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from helpers.motion_stores import random_motions, write_motions
+from robotdiffuse.cli import main
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_network, save_network
 from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
-from robotdiffuse.learning.networks.trajectory_prior import (
-    TrajectoryPrior,
-    TrajectoryPriorSettings,
-    exponential_levels,
-    quadratic_levels,
-)
+from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.training.batches import TrajectoryData
-from robotdiffuse.planners.edmp import EDMP, ENSEMBLE, EDMPSettings, GuideSettings
-from robotdiffuse.planners.guided_prior import collision_gradient, shared_out
-from robotdiffuse.planners.mpd import MPD, MPDSettings, gaussian_process, state_precision
+from robotdiffuse.learning.training.batches import Batches, TrajectoryData
+from robotdiffuse.learning.training.configs import planner_training
+from robotdiffuse.learning.training.planner import _Loss, _model_settings
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.validation import planning_success
+from robotdiffuse.planners.edmp import EDMP, ENSEMBLE, EDMPSettings, GuideSettings, quadratic_levels
+from robotdiffuse.planners.guided_prior import collision_gradient, sample, shared_out
+from robotdiffuse.planners.mpd import (
+    MPD,
+    MPDSettings,
+    exponential_levels,
+    gaussian_process,
+    state_precision,
+)
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.packed import PackedScenes
@@ -45,7 +56,10 @@ RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
 PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
 CHECKER = CollisionChecker(PANDA, PROBLEM.scene)
-SMALL = TrajectoryPriorSettings(unet=UNetSettings(width=16, multiples=(1, 2), condition_width=16))
+TRAINING = planner_training("trajectory_prior", {"data": "", "batch": 16, "samples": 640})
+SMALL = replace(
+    _model_settings(TRAINING, None), denoiser_settings=UNetSettings(16, (1, 2), condition_width=16)
+)
 WAYPOINTS = 48
 
 
@@ -56,16 +70,20 @@ def bumps(waypoints: int) -> Float[ndarray, "inner inner"]:
     return waves @ waves.T + 1e-6 * np.eye(waypoints - 2)
 
 
-class Gaussian(TrajectoryPrior):
+class Gaussian(MotionModel):
     """The exact denoiser of straight lines with such bumps."""
 
-    def forward(
-        self, x: Float[Tensor, "batch waypoints dof"], level: Float[Tensor, "batch"]
-    ) -> Float[Tensor, "batch waypoints dof"]:
-        at = round(float(level[0]) * self.schedule.steps)
+    def denoise(
+        self,
+        features: Float[Tensor, "batch rows features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        dropped: Bool[Tensor, "batch"] | None = None,
+    ) -> Float[Tensor, "batch rows dof"]:
+        at, x = round(float(level[0]) * self.schedule.steps), features.numpy()
         signal, noise = float(self.schedule.signal[at]), float(self.schedule.noise[at])
-        inner, t = x[:, 1:-1].numpy().astype(np.float64), np.linspace(0, 1, x.shape[1])[1:-1, None]
-        line = (1 - t) * x[:, :1].numpy() + t * x[:, -1:].numpy()
+        inner, t = x[:, 1:-1].astype(np.float64), np.linspace(0, 1, x.shape[1])[1:-1, None]
+        line = (1 - t) * x[:, :1] + t * x[:, -1:]
         total = signal**2 * bumps(x.shape[1]) + noise**2 * np.eye(x.shape[1] - 2)
         seen = noise * np.linalg.solve(total, inner - signal * line)
         return torch.nn.functional.pad(torch.from_numpy(seen.astype(np.float32)), (0, 0, 1, 1))
@@ -87,13 +105,20 @@ def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
     return TrajectoryData(q.astype(np.float32), scenes, np.arange(count) % 3 == 0, None, "x", 0)
 
 
+def stay(q: ndarray, _left: int) -> ndarray:
+    """No guide."""
+    return q
+
+
 def test_the_loss_falls() -> None:
     torch.manual_seed(0)
-    network, data, rng = TrajectoryPrior(RANGES, SMALL), data_of(32), np.random.default_rng(0)
+    network, data, rng = MotionModel(RANGES, SMALL), data_of(32), np.random.default_rng(0)
+    batches = Batches(data, network, lambda _scenes, _q: np.zeros(0), 0.1, None)
+    loss_of = _Loss(network, PANDA, TRAINING, Processes("cpu"))
     optimizer = torch.optim.AdamW(network.parameters(), lr=4e-3)
     losses = []
     for _ in range(40):
-        loss = network.loss(data, 16, 0.0, rng)
+        loss = loss_of(batches.draw(16, rng), 0.0, rng)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
@@ -101,8 +126,7 @@ def test_the_loss_falls() -> None:
     # an untrained network says that there is no noise: the variance of it is 1
     assert losses[0] == pytest.approx(1.0, abs=0.1)
     assert np.mean(losses[-5:]) < 0.6
-    share = network.success(data_of(6), PANDA, rng)
-    assert share is not None and 0 <= share <= 1
+    assert 0 <= planning_success(network, PANDA, data_of(6), 4, 2, rng) <= 1
 
 
 def test_share_of_trivial_motions() -> None:
@@ -114,21 +138,11 @@ def test_share_of_trivial_motions() -> None:
         assert set(np.unique(replace(data, trivial=trivial).draw(4000, 0.2, rng))) == set(range(30))
 
 
-def test_success_needs_motions_that_are_not_trivial() -> None:
-    data = replace(data_of(4), trivial=np.ones(4, bool))
-    assert TrajectoryPrior(RANGES, SMALL).success(data, PANDA, np.random.default_rng(0)) is None
-
-
-def test_other_frames_are_refused() -> None:
-    with pytest.raises(InputError, match=r"32 waypoints and trajectory_prior.waypoints is 48"):
-        TrajectoryPrior(RANGES, SMALL).loss(data_of(4, 32), 4, 0.0, np.random.default_rng(0))
-
-
 def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> None:
     """100 steps without guide; 300 samples of several joints know the variance to a few percent."""
     starts, goals = (np.repeat(end[None], 300, 0) for end in (LEFT, RIGHT))
     levels = gaussian.schedule.sampling_levels(100)[:-1]
-    q = gaussian.sample(starts, goals, levels, np.random.default_rng(0))
+    q = sample(gaussian, starts, goals, levels, np.random.default_rng(0), stay)
     assert q is not None
     x = gaussian.normalizer.to_unit(q.astype(np.float64))
     t = np.linspace(0, 1, WAYPOINTS)[:, None]
@@ -144,13 +158,13 @@ def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> N
 
 def test_samples_hold_their_ends_exactly() -> None:
     torch.manual_seed(0)
-    network, rng = TrajectoryPrior(RANGES, SMALL), np.random.default_rng(0)
+    network, rng = MotionModel(RANGES, SMALL), np.random.default_rng(0)
     starts, goals = (rng.uniform(PANDA.lower, PANDA.upper, (3, PANDA.dof)).astype(np.float32) for _ in "ab")
 
     def guide(q: ndarray, left: int) -> ndarray:
         return q + np.float32(0.1 * (left < 2))
 
-    q = network.sample(starts, goals, np.array([255, 100, 20, 1]), rng, guide)
+    q = sample(network, starts, goals, np.array([255, 100, 20, 1]), rng, guide)
     assert q is not None and q.dtype == np.float32 and q.shape == (3, WAYPOINTS, PANDA.dof)
     assert np.array_equal(q[:, 0], starts) and np.array_equal(q[:, -1], goals)
     assert np.all(q >= PANDA.lower - 1e-5) and np.all(q <= PANDA.upper + 1e-5)
@@ -164,16 +178,16 @@ def test_the_guide_is_told_the_steps_to_come(gaussian: Gaussian) -> None:
         return q
 
     ends = LEFT[None], RIGHT[None]
-    gaussian.sample(*ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2)
+    sample(gaussian, *ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2)
     assert told == [2, 1, 0, 0, 0]
-    stopped = gaussian.sample(*ends, np.array([255, 1]), np.random.default_rng(0), guide, stop=lambda: True)
+    stopped = sample(gaussian, *ends, np.array([255, 1]), np.random.default_rng(0), guide, stop=lambda: True)
     assert stopped is None and len(told) == 5
 
 
 @pytest.mark.parametrize("levels", [[], [3, 3], [1, 2], [256, 1], [5, 0]])
 def test_levels_must_fall(gaussian: Gaussian, levels: list[int]) -> None:
     with pytest.raises(InputError, match="must fall from at most 255 to 1"):
-        gaussian.sample(LEFT[None], RIGHT[None], np.array(levels, np.int64), np.random.default_rng(0))
+        sample(gaussian, LEFT[None], RIGHT[None], np.array(levels, np.int64), np.random.default_rng(0), stay)
 
 
 @pytest.mark.parametrize("spaced", [exponential_levels, quadratic_levels])
@@ -182,7 +196,7 @@ def test_spaced_levels(spaced, steps: int) -> None:
     schedule = NoiseSchedule(ScheduleSettings(steps=255))
     levels = spaced(schedule, steps)
     assert len(levels) == steps and levels[0] == 255 and levels[-1] >= 1 and np.all(np.diff(levels) < 0)
-    with pytest.raises(InputError, match="between 2 and 255"):
+    with pytest.raises(InputError, match="between 1 and 255"):
         spaced(schedule, 256)
 
 
@@ -334,28 +348,71 @@ def test_no_time_for_a_batch(planner: MPD | EDMP) -> None:
 @pytest.mark.parametrize("kind", [MPD, EDMP])
 def test_missing_weights(kind: type[MPD | EDMP], tmp_path) -> None:
     settings = (MPDSettings if kind is MPD else EDMPSettings)(weights=str(tmp_path))
-    with pytest.raises(InputError, match="train baseline trajectory_prior"):
+    with pytest.raises(InputError, match="train planner --config trajectory_prior"):
         kind(settings).plan(PROBLEM, time_limit=1.0)  # type: ignore[arg-type]
 
 
-def test_weights_survive_a_file(tmp_path) -> None:
+def test_weights_survive_a_file(tmp_path: Path) -> None:
     torch.manual_seed(0)
-    network = TrajectoryPrior(RANGES, SMALL)
+    network = MotionModel(RANGES, SMALL)
     torch.nn.init.normal_(network.denoiser.out.weight, std=0.1)
     save_network("trajectory_prior", network, tmp_path, {})
     loaded = load_network("trajectory_prior", str(tmp_path), PANDA)
-    assert isinstance(loaded, TrajectoryPrior) and loaded.settings == SMALL
-    x, level = torch.randn(2, WAYPOINTS, PANDA.dof), torch.full((2,), 0.3)
+    assert isinstance(loaded, MotionModel) and loaded.settings == SMALL
+    given = torch.randn(2, WAYPOINTS, PANDA.dof), torch.full((2,), 0.3), torch.zeros(2, 1)
     with torch.no_grad():
-        assert torch.allclose(loaded(x, level), network(x, level), atol=0.05)
+        assert torch.allclose(loaded.denoise(*given), network.denoise(*given), atol=0.05)
     assert MPD(MPDSettings(weights=str(tmp_path))).network(PANDA) is loaded
+
+
+def test_a_prior_that_was_a_class_of_its_own_is_read(tmp_path: Path) -> None:
+    network = MotionModel(RANGES, SMALL)
+    save_network("trajectory_prior", network, tmp_path, {})
+    file = tmp_path / "trajectory_prior.json"
+    about = json.loads(file.read_text())
+    now = about["settings"]
+    about["settings"] = {"frames": 48, "unet": now["denoiser_settings"], "schedule": now["schedule"]}
+    about["settings"] |= {"trivial_share": 0.1}
+    file.write_text(json.dumps(about))
+    assert load_network("trajectory_prior", str(tmp_path), PANDA).settings == SMALL
+
+
+def test_training_stopped_and_continued_ends_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_motions(tmp_path / "data", PANDA, random_motions(PANDA, 40))
+    asked = ["train", "baseline", "trajectory_prior", "--data", str(tmp_path / "data")]
+    asked += ["--samples", "80", "--batch", "8"]
+    original, steps = _Loss.__call__, 0
+
+    def interrupted(self: _Loss, *given):
+        nonlocal steps
+        steps += 1
+        if steps == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+        return original(self, *given)
+
+    assert main([*asked, "--out", str(tmp_path / "whole")]) == 0
+    monkeypatch.setattr(_Loss, "__call__", interrupted)
+    assert main([*asked, "--out", str(tmp_path / "parts")]) == 130
+    assert main([*asked, "--out", str(tmp_path / "parts")]) == 0
+    assert "success" in capsys.readouterr().out
+    whole, parts = (
+        load_network("trajectory_prior", str(tmp_path / name), PANDA).state_dict()
+        for name in ("whole", "parts")
+    )
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
 
 
 @pytest.mark.parametrize(
     "make, message",
     [
-        (lambda: TrajectoryPriorSettings(waypoints=2), r"waypoints is 2; it must be at least 3"),
-        (lambda: TrajectoryPriorSettings(trivial_share=1.5), r"trivial_share is 1.5"),
+        (
+            lambda: replace(SMALL, encoder="pointnet"),
+            r"model.encoder is pointnet and encoder_settings are None",
+        ),
+        (lambda: replace(SMALL, denoiser="encoder_decoder"), r"denoiser is encoder_decoder"),
+        (lambda: replace(TRAINING, smooth_noise=True), r"target is limits and smooth_noise is True"),
         (lambda: MPDSettings(samples=0), r"mpd.samples is 0"),
         (lambda: MPDSettings(sampling_steps=1), r"mpd.sampling_steps is 1"),
         (lambda: MPDSettings(guided_share=2.0), r"mpd.guided_share is 2.0"),

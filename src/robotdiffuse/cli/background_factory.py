@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.processes import end, interrupts_not_passed_on, prepare_worker
+from robotdiffuse.registry import Added, added
 
 if TYPE_CHECKING:
     from robotdiffuse.generation import GenerationSettings
@@ -38,7 +39,7 @@ def filled_meanwhile(folder: str, workers: int, robot: str) -> Iterator[None]:
         return
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    factory = context.Process(target=_fill, args=(folder, workers, robot, theirs))
+    factory = context.Process(target=_fill, args=(folder, workers, robot, theirs, added()))
     # Ctrl-C is for this process, which then ends the factory
     with interrupts_not_passed_on():
         factory.start()
@@ -83,7 +84,7 @@ def _message(connection: Connection) -> str | None:
         return None
 
 
-def _fill(folder: str, workers: int, robot: str, connection: Connection) -> None:
+def _fill(folder: str, workers: int, robot: str, connection: Connection, entries: Added) -> None:
     """The factory's process: tells that it began, or its error; ends on SIGINT, and with its parent."""
     os.setpgrp()  # the terminal's Ctrl-C does not reach it
     begun = False
@@ -100,7 +101,7 @@ def _fill(folder: str, workers: int, robot: str, connection: Connection) -> None
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
         from robotdiffuse.generation import generate
 
-        prepare_worker()
+        prepare_worker(entries)
         generate(_settings(folder, robot), Path(folder), workers, progress=tell)
     except InputError as error:
         connection.send(str(error))

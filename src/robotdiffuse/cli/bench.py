@@ -11,7 +11,8 @@ from robotdiffuse.problems.families import FAMILIES
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from robotdiffuse.evaluation.bench.figures import Bench, Section
+    from robotdiffuse.evaluation.bench.figures import Section
+    from robotdiffuse.evaluation.bench.folder import Bench
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -135,7 +136,8 @@ def run_report(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
     from robotdiffuse.evaluation.bench import report
-    from robotdiffuse.evaluation.bench.figures import read_bench, sections
+    from robotdiffuse.evaluation.bench.figures import sections
+    from robotdiffuse.evaluation.bench.folder import read_bench
     from robotdiffuse.evaluation.bench.page import write_page, write_plots
     from robotdiffuse.files import write_atomically
 

@@ -45,7 +45,8 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--config",
         default="compact",
         metavar="NAME",
-        help="compact (default), paper, or a row of the paper's Table 2: table2_jpc, table2_unet, ...",
+        help="compact (default), paper, trajectory_prior (of MPD and EDMP), or a row of the paper's Table 2: "
+        "table2_jpc, table2_unet, ...",
     )
     planner.add_argument(
         "--encoder",
@@ -157,10 +158,15 @@ def run_planner(arguments: argparse.Namespace) -> int:
 
 def run_baseline(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
+    from robotdiffuse.learning.training.configs import planner_training
+    from robotdiffuse.learning.training.planner import train_planner
 
     given = _given(arguments, ("data", "robot", *SHARED))
-    settings = baseline_training(arguments.name, given)
-    _report(train_baseline(settings, arguments.out), arguments.out)
+    if arguments.name == "trajectory_prior":
+        report = train_planner(planner_training(arguments.name, given), arguments.out)
+    else:
+        report = train_baseline(baseline_training(arguments.name, given), arguments.out)
+    _report(report, arguments.out)
     return 0
 
 

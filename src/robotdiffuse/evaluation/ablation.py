@@ -228,8 +228,9 @@ def _planner_settings(settings: AblationSettings, config: str | None, guided: bo
     if config is None:
         return alone
     weights = str(FilePath(settings.out) / config)
-    points = load_model(weights, load_robot("panda")).settings.encoder_settings.cloud
-    return replace(alone, weights=weights, points=points)
+    encoder = load_model(weights, load_robot("panda")).encoder
+    assert encoder is not None  # every row has one
+    return replace(alone, weights=weights, points=encoder.settings.cloud)
 
 
 NOTES = (

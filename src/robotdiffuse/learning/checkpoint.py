@@ -96,7 +96,7 @@ def _read(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any
     if isinstance(about, dict) and about.get("format") == 1:
         about = _of_format_1(about)
     if isinstance(about, dict) and isinstance(about.get("settings"), dict):
-        about["settings"] = renamed(about["settings"])
+        about["settings"] = _of_prior(renamed(about["settings"]))
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise InputError(f"{file} is not a model description of format {FORMAT}")
     weights = folder / f"{stem}.safetensors"
@@ -113,6 +113,16 @@ def renamed(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings in which waypoints were called frames, as they are called now."""
     found = {"waypoints" if name == "frames" else name: value for name, value in settings.items()}
     return found | ({"parametrization": "waypoints"} if found.get("parametrization") == "frames" else {})
+
+
+def _of_prior(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings of a trajectory prior that was a class of its own, as those of the model that it is."""
+    if "unet" not in settings:
+        return settings
+    same = {name: settings[name] for name in ("waypoints", "schedule")}
+    parts = {"denoiser": "unet", "denoiser_settings": settings["unet"], "objective": "noise"}
+    parts |= {"encoder": None, "encoder_settings": None, "target": "limits", "sees_clearances": False}
+    return same | parts | {"sampler": "ddpm", "sampling_steps": 25}
 
 
 def _of_format_1(about: dict[str, Any]) -> dict[str, Any]:

@@ -123,14 +123,18 @@ def noise_factor(
     little white noise so that no direction is left without noise.
     """
     waypoints = residuals.shape[1]
-    inner = np.ones(waypoints)
-    inner[[0, -1]] = 0.0
+    white = white_factor(waypoints)
     if not smooth:
-        return np.diag(inner)
+        return white
     rows = np.moveaxis(residuals, 1, 2).reshape(-1, waypoints).astype(np.float64)
     covariance = rows.T @ rows / len(rows)
-    mean_variance = np.trace(covariance) / inner.sum()
+    mean_variance = np.trace(covariance) / white.sum()
     covariance = covariance / mean_variance + 1e-4 * np.eye(waypoints)
     values, vectors = np.linalg.eigh(covariance)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return inner[:, None] * root
+    return white @ root
+
+
+def white_factor(waypoints: int) -> Float[ndarray, "waypoints waypoints"]:
+    """The same for noise that is white over the waypoints between the first and the last."""
+    return np.diag(np.r_[0.0, np.ones(waypoints - 2), 0.0])

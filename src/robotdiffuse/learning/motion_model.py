@@ -27,7 +27,7 @@ from robotdiffuse.learning.parametrization import PARAMETRIZATIONS, parametrizat
 from robotdiffuse.learning.representation import TARGETS, Between, TrajectoryRows
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.samplers.sampler import Sampler
+from robotdiffuse.learning.samplers.sampler import Predict, Sampler
 from robotdiffuse.settings import Bound, Count, OneOf, Positive, Settings, SettingsOf
 
 MAX_POINTS = 2048
@@ -46,48 +46,65 @@ GuideFn = Callable[[ndarray, float], ndarray]
 values."""
 
 
-def check_gradients(sees_gradients: bool, sees_clearances: bool) -> None:
-    """Raises InputError if gradients of clearances are to be seen without clearances."""
-    if sees_gradients and not sees_clearances:
-        raise InputError("sees_gradients is True and sees_clearances is False; gradients need clearances too")
+@dataclass(frozen=True)
+class ModelParts(Settings):
+    """What a model and its training are told alike."""
+
+    waypoints: Annotated[int, Bound(least=3.0)] = 48
+    """Waypoints of a trajectory, evenly spaced along it (joint-space length; paper: 254)."""
+    denoiser: Annotated[str, OneOf(DENOISERS)] = "transformer"
+    schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+    sampler: Annotated[str, OneOf(SAMPLERS)] = "ddim"
+    """How it is sampled unless something else is asked for: ddpm (the paper's), ddim, dpm_solver or euler."""
+    sampling_steps: Count | None = 6
+    """Calls of the denoiser for a batch; None: all levels of the schedule (the paper's)."""
+    parametrization: Annotated[str, OneOf(PARAMETRIZATIONS)] = "waypoints"
+    """What the rows are that are diffused: waypoints (the paper's), or b_spline control points."""
+    rows: Count | None = None
+    """As many; None: as there are waypoints."""
+    target: Annotated[str, OneOf(TARGETS)] = "residual"
+    """What rows are relative to: the straight line from start to goal (residual), the mean of the data
+    (absolute, the paper's), or nothing: joint values in units of their limits (limits)."""
+    objective: Annotated[str, OneOf(OBJECTIVES)] = "clean"
+    """What the network predicts: clean (the paper's), noise or velocity."""
+    sees_clearances: bool = True
+    """Whether the denoiser is told the clearances of the links along the noisy trajectory (beyond the
+    paper)."""
+    sees_gradients: bool = False
+    """Whether it is told too which way the joints would take the arm too close to obstacles, see
+    `CollisionChecker.clearances_and_gradients`."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sees_gradients and not self.sees_clearances:
+            raise InputError(
+                "sees_gradients is True and sees_clearances is False; gradients need clearances too"
+            )
+        schedule = NoiseSchedule(self.schedule)
+        objective_for(self.objective, schedule)
+        if self.sampling_steps is not None:
+            schedule.sampling_levels(self.sampling_steps)
+        parametrization(self.parametrization, self.waypoints, self.rows or self.waypoints)
 
 
 @dataclass(frozen=True)
-class MotionModelSettings(Settings, name="model"):
+class MotionModelSettings(ModelParts, name="model"):
     """What the model is made of, and how it is sampled unless something else is asked for."""
 
-    waypoints: Annotated[int, Bound(least=3.0)] = 48
-    """Waypoints of a trajectory, evenly spaced along it (joint-space length)."""
     clearance_low: float = -0.1
     """Clearances are clipped to this range before the denoiser sees them [m]."""
     clearance_high: float = 0.4
-    encoder: Annotated[str, OneOf(ENCODERS)] = "point_autoencoder"
-    encoder_settings: Annotated[EncoderSettings, SettingsOf("encoder", ENCODERS)] = field(
+    encoder: Annotated[str, OneOf(ENCODERS)] | None = "point_autoencoder"
+    """Of the scene; None for a prior, which is told neither scene nor ends: it finds the ends in the noisy
+    trajectory, where they are held."""
+    encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = field(
         default_factory=PointAutoencoderSettings
     )
-    denoiser: Annotated[str, OneOf(DENOISERS)] = "transformer"
     denoiser_settings: Annotated[DenoiserSettings, SettingsOf("denoiser", DENOISERS)] = field(
         default_factory=TransformerSettings
     )
     null_condition: bool = False
     """Whether the model has a learned stand-in for a dropped condition, for classifier-free guidance."""
-    sampler: Annotated[str, OneOf(SAMPLERS)] = "ddim"
-    sampling_steps: Count | None = 6
-    """Calls of the denoiser for a batch; None: all levels of the schedule."""
-    schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
-    parametrization: Annotated[str, OneOf(PARAMETRIZATIONS)] = "waypoints"
-    """What the rows are that are diffused: waypoints, or b_spline control points."""
-    rows: Count | None = None
-    """As many; None: as there are waypoints."""
-    target: Annotated[str, OneOf(TARGETS)] = "residual"
-    """What rows are relative to: the straight line from start to goal (residual), or nothing (absolute)."""
-    objective: Annotated[str, OneOf(OBJECTIVES)] = "clean"
-    """What the network predicts: clean, noise or velocity."""
-    sees_clearances: bool = True
-    """Whether the denoiser is told the clearances of the links along the noisy trajectory."""
-    sees_gradients: bool = False
-    """Whether it is told too which way the joints would take the arm too close to obstacles, see
-    `CollisionChecker.clearances_and_gradients`."""
     gradient_margin: Positive = 0.1
     """Closer than this is too close [m]."""
     gradient_unit: Positive = 2.0
@@ -95,7 +112,23 @@ class MotionModelSettings(Settings, name="model"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_gradients(self.sees_gradients, self.sees_clearances)
+        if (self.encoder is None) != (self.encoder_settings is None):
+            raise InputError(
+                f"model.encoder is {self.encoder} and encoder_settings are {self.encoder_settings}; "
+                "either both are None or neither"
+            )
+        if self.encoder is None and self.denoiser == "encoder_decoder":
+            raise InputError("model.denoiser is encoder_decoder and encoder is None; it needs a condition")
+
+    @property
+    def network(self) -> str:
+        """The name in NETWORKS that it is kept by."""
+        return "trajectory_prior" if self.encoder is None else "model"
+
+    @property
+    def code(self) -> int:
+        """Size of z."""
+        return 0 if self.encoder_settings is None else self.encoder_settings.code
 
 
 class MotionModel(TrajectoryRows, Network):
@@ -111,9 +144,11 @@ class MotionModel(TrajectoryRows, Network):
         self.robot, self.settings = robot, settings
         self.schedule = NoiseSchedule(settings.schedule)
         self.objective = objective_for(settings.objective, self.schedule)
-        self.encoder = make_encoder(settings.encoder, settings.encoder_settings)
-        condition = settings.encoder_settings.code + 2 * self.dof
-        features = 2 * self.dof + (len(robot.links) if settings.sees_clearances else 0)
+        self.encoder = (
+            None if settings.encoder is None else make_encoder(settings.encoder, settings.encoder_settings)
+        )
+        condition = 1 if self.encoder is None else settings.code + 2 * self.dof
+        features = (1 if self.plain else 2) * self.dof + (len(robot.links) if settings.sees_clearances else 0)
         features += self.dof if settings.sees_gradients else 0
         self.denoiser: Denoiser = DENOISERS.load(settings.denoiser)(
             settings.denoiser_settings, self.rows, self.dof, features, condition
@@ -133,10 +168,15 @@ class MotionModel(TrajectoryRows, Network):
     def encode(
         self, points: Float[ndarray, "n 3"], rng: np.random.Generator | None = None
     ) -> Float[ndarray, "code"]:
-        """z of a point cloud of the obstacles' surfaces (base frame, [m]); no point at all is a scene too."""
+        """z of a point cloud of the obstacles' surfaces (base frame, [m]); no point at all is a scene too.
+
+        Of no numbers for a model without an encoder.
+        """
+        if self.encoder is None:
+            return np.zeros(0, np.float32)
         points = np.asarray(points, np.float32).reshape(-1, 3)
-        points = points[self.settings.encoder_settings.region.holds(points)]
-        most = MAX_POINTS if self.encoder.any_size else self.settings.encoder_settings.cloud
+        points = points[self.encoder.settings.region.holds(points)]
+        most = MAX_POINTS if self.encoder.any_size else self.encoder.settings.cloud
         if len(points) > most:
             rng = np.random.default_rng(0) if rng is None else rng
             points = points[rng.choice(len(points), most, replace=False)]
@@ -146,16 +186,17 @@ class MotionModel(TrajectoryRows, Network):
     def features(
         self, x: Float[ndarray, "batch rows dof"], between: Between, clearances: ClearanceFn
     ) -> Float[ndarray, "batch rows features"]:
-        """The denoiser's input for noisy rows: the rows, normalised joint values, clearances of the links and
-        gradients, each as far as it sees them."""
+        """The denoiser's input for noisy rows: the rows, normalised joint values where these are others,
+        clearances of the links and gradients, each as far as it sees them."""
         unit = self.at_sites(x, between)
+        parts = [x] if self.plain else [x, unit]
         if not self.settings.sees_clearances:
-            return np.concatenate([x, unit], axis=-1)
+            return np.concatenate(parts, axis=-1)
         low, high = self.settings.clearance_low, self.settings.clearance_high
         told = clearances(self.normalizer.from_unit(unit))
         near = np.clip(told[..., : len(self.robot.links)], low, high)
         near = (near - (low + high) / 2) * (2 / (high - low))
-        parts = [x, unit, near.astype(np.float32, copy=False)]
+        parts.append(near.astype(np.float32, copy=False))
         if self.settings.sees_gradients:
             parts.append(np.clip(told[..., -self.dof :] / np.float32(self.settings.gradient_unit), -1, 1))
         return np.concatenate(parts, axis=-1)
@@ -166,7 +207,9 @@ class MotionModel(TrajectoryRows, Network):
         start: Float[ndarray, "*batch dof"],
         goal: Float[ndarray, "*batch dof"],
     ) -> Float[ndarray, "*batch condition"]:
-        """C = [z, start, goal], normalised."""
+        """C = [z, start, goal], normalised; without an encoder one zero, for the denoisers want a number."""
+        if self.encoder is None:
+            return np.zeros((*np.shape(start)[:-1], 1), np.float32)
         ends = [self.normalizer.to_unit(np.asarray(q, np.float32)) for q in (start, goal)]
         return np.concatenate([code, *ends], axis=-1)
 
@@ -269,30 +312,20 @@ class MotionModel(TrajectoryRows, Network):
             known_waypoints("suffix", suffix, goal, -1),
         )
         between = self.around(prefix, suffix)
-        far, near = self.regression(between), self.regression(between, BLEND * self.rows)
-        condition = torch.from_numpy(self.condition(code, start, goal)).expand(count, -1)
-        levels = self.settings.schedule.steps
-        signal, noise = (a.astype(np.float32) for a in (self.schedule.signal, self.schedule.noise))
+        far = self.regression(between)
+        predicted = self.predictor(between, self.condition(code, start, goal), clearances, guidance_scale)
         unguided = steps - ceil(guided_share * steps - 1e-9)
         guided: Int[ndarray, "n"] = self.schedule.sampling_levels(steps)[unguided:-1]
-
-        def follow(x: ndarray, regression: ndarray | None) -> ndarray:
-            if regression is not None:
-                x += regression @ (self.hold(x.copy(), between) - x)
-            return self.hold(x, between)
 
         def draw_noise() -> ndarray:
             noise = self.draw_noise(count, rng)
             return noise if far is None else noise - far @ noise
 
         def predict(x: ndarray, level: int) -> ndarray:
-            x = follow(x.copy(), far)
-            inputs = torch.from_numpy(self.features(x, between, clearances))
-            at = torch.full((count,), level / levels)
-            output = self.denoise_guided(inputs, at, condition, guidance_scale).numpy()
-            clean = follow(self.objective.clean(x, output, signal[level], noise[level]), near)
+            clean = predicted(x, level)
             if guide is not None and level in guided:
-                clean = self.to_rows(guide(self.joints(clean, between), level / levels), between)
+                at = level / self.schedule.steps
+                clean = self.to_rows(guide(self.joints(clean, between), at), between)
             return clean
 
         with torch.inference_mode(), one_thread():
@@ -301,6 +334,35 @@ class MotionModel(TrajectoryRows, Network):
         np.clip(q, self.robot.lower, self.robot.upper, out=q)
         q[:, : len(prefix)], q[:, len(q[0]) - len(suffix) :] = prefix, suffix
         return q
+
+    def predictor(
+        self,
+        between: Between,
+        condition: Float[ndarray, "*batch condition"],
+        clearances: ClearanceFn,
+        guidance_scale: float = 1.0,
+    ) -> Predict:
+        """What samplers call: the clean rows predicted for noisy ones, the known rows held in both.
+
+        guidance_scale: see `denoise_guided`. To be called in inference mode.
+        """
+        far, near = self.regression(between), self.regression(between, BLEND * self.rows)
+        signal, noise = (a.astype(np.float32) for a in (self.schedule.signal, self.schedule.noise))
+        given = torch.from_numpy(condition)
+
+        def follow(x: ndarray, regression: ndarray | None) -> ndarray:
+            if regression is not None:
+                x += regression @ (self.hold(x.copy(), between) - x)
+            return self.hold(x, between)
+
+        def predict(x: ndarray, level: int) -> ndarray:
+            x = follow(x.copy(), far)
+            inputs = torch.from_numpy(self.features(x, between, clearances))
+            at = torch.full((len(x),), level / self.schedule.steps)
+            output = self.denoise_guided(inputs, at, given.expand(len(x), -1), guidance_scale).numpy()
+            return follow(self.within(self.objective.clean(x, output, signal[level], noise[level])), near)
+
+        return predict
 
 
 def known_waypoints(

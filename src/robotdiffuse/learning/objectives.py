@@ -35,14 +35,18 @@ class Objective(ABC):
     def clean_per_output(self, signal: Any, noise_level: Any) -> Any:
         """d clean / d output: what an error of the output does to the clean trajectory."""
 
-    def weight(self, schedule: NoiseSchedule, t: Int[ndarray, "n"], limit: float) -> Float[ndarray, "n"]:
-        """Weight of the squared error of the output at levels t >= 1, at most `limit`.
+    def weight(
+        self, schedule: NoiseSchedule, t: Int[ndarray, "n"], limit: float | None
+    ) -> Float[ndarray, "n"]:
+        """Weight of the squared error of the output at levels t >= 1, at most `limit`; 1 for None.
 
         It is the weight that makes the loss the same as `NoiseSchedule.weight` makes it for x_0, so that
         objectives differ in what the network outputs and not in the levels that they care for (Salimans and
         Ho 2022, section 4; Hang et al. 2023, who convert their weights so). For the noise that weight is
         without bound where little signal is left, hence the limit once more.
         """
+        if limit is None:
+            return np.ones(len(t))
         scale = self.clean_per_output(schedule.signal[t], schedule.noise[t])
         return np.minimum(schedule.weight(t, limit) * scale**2, limit)
 

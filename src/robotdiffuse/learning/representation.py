@@ -2,9 +2,10 @@
 
 A trajectory is rows x of a parametrization (waypoints or spline control points), in units of the training
 data's standard deviation, relative to a base: the straight line from start to goal (target `residual`), or
-the mean of the data (target `absolute`, the paper's). The first and the last row are start and goal and are
-held: the paper's noise interpolation, which writes them over the ends at every step. More waypoints at
-either end may be held, its prefix and suffix waypoints.
+the mean of the data (target `absolute`, the paper's). Or rows are joint values in units of their limits, with
+white noise, and nothing is taken from the data (target `limits`, as in MPD and EDMP). The first and the last
+row are start and goal and are held: the paper's noise interpolation, which writes them over the ends at every
+step. More waypoints at either end may be held, its prefix and suffix waypoints.
 """
 
 from typing import NamedTuple
@@ -16,11 +17,11 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.learning.diffusion import noise_factor
+from robotdiffuse.learning.diffusion import noise_factor, white_factor
 from robotdiffuse.learning.parametrization import Parametrization
 from robotdiffuse.robots.normalizer import JointNormalizer
 
-TARGETS = ("residual", "absolute")
+TARGETS = ("residual", "absolute", "limits")
 
 
 class Between(NamedTuple):
@@ -49,13 +50,18 @@ class TrajectoryRows(nn.Module):
             raise unknown_name("target", target, TARGETS)
         self.normalizer, self.parametrization, self.target = normalizer, parametrization, target
         self.dof, self.rows = len(normalizer.middle), parametrization.rows
-        self.register_buffer("residual_scale", torch.ones(self.dof))
+        fitted = target != "limits"
+        self.register_buffer("residual_scale", torch.ones(self.dof), persistent=fitted)
         self.register_buffer("residual_mean", torch.zeros(self.dof), persistent=target == "absolute")
-        self.register_buffer("noise_factor", torch.eye(self.rows))
+        white = torch.from_numpy(white_factor(self.rows).astype(np.float32))
+        self.register_buffer("noise_factor", white, persistent=fitted)
         self._share = np.linspace(0.0, 1.0, waypoints, dtype=np.float32)[:, None]
 
     def fit_statistics(self, q: Float[ndarray, "n waypoints dof"], smooth_noise: bool) -> None:
-        """Set scale, mean, and the covariance of the noise, from trajectories [rad]."""
+        """Set scale, mean, and the covariance of the noise, from trajectories [rad]; none of them for the
+        target `limits`."""
+        if self.target == "limits":
+            return
         self.residual_scale.fill_(1.0)
         self.residual_mean.fill_(0.0)
         if self.target == "absolute":
@@ -65,6 +71,15 @@ class TrajectoryRows(nn.Module):
         scale = np.maximum(np.sqrt((rows[:, 1:-1] ** 2).mean((0, 1))), 1e-4)
         self.residual_scale.copy_(torch.from_numpy(scale))
         self.noise_factor.copy_(torch.from_numpy(noise_factor(rows / scale, smooth_noise)))
+
+    @property
+    def plain(self) -> bool:
+        """Rows are the normalised joint values of the waypoints."""
+        return self.target == "limits" and self.parametrization.themselves
+
+    def within(self, x: Float[ndarray, "*batch rows dof"]) -> Float[ndarray, "*batch rows dof"]:
+        """Predicted rows; where rows are in units of the limits, none beyond them, for the data have none."""
+        return np.clip(x, -1.0, 1.0) if self.target == "limits" else x
 
     @property
     def _scale(self) -> ndarray:

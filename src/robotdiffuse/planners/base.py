@@ -8,16 +8,20 @@ from typing import ClassVar, Generic, TypeVar
 from robotdiffuse.collision.motion import finer
 from robotdiffuse.planners.call import Call, Request
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.results import PlanResult
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
 from robotdiffuse.settings import Settings
 from robotdiffuse.types import FIRST, SHORT
 
 Own = TypeVar("Own", bound=Settings)
-WARM_UP, SLIGHT = 0.5, 1e-3
-"""Limits of the calls of `warm_up`: a motion without obstacles, and the beginning of a search [s]."""
+WARM_UP, SLIGHT = 1.0, 1e-3
+"""Limits of the calls of `warm_up`: easy ones, and the beginning of a search [s]."""
+RADIUS = 0.08
+"""Of the balls of `warm_up` [m]."""
 
 
 class Planner(ABC, Generic[Own]):
@@ -59,12 +63,20 @@ class Planner(ABC, Generic[Own]):
         ends = usable_ends(call)
         return ends if isinstance(ends, PlanResult) else self.solve(call, ends)
 
-    def warm_up(self, problem: Problem) -> None:
+    def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
         """Load the compiled code that calls on such a problem need, or compile it on a new machine, which
-        takes about a minute; else the first call's time limit would have to do."""
-        clear = Problem(problem.robot, Scene(), problem.start, problem.goal)
-        for easy, seconds in ((clear, WARM_UP), (problem, SLIGHT)):
-            self.plan(easy, time_limit=seconds, until=FIRST)
+        takes about a minute; else the first call's time limit would have to do.
+
+        The results are of calls with nothing in the way, and with balls where the straight line is; the
+        problem itself is called on for a moment, for its kinds of obstacles.
+        """
+        robot, start, goal = problem.robot, problem.start, problem.goal
+        first = goal.positions[:1] if isinstance(goal, JointGoal) else []
+        ways = [start + share * (end - start) for end in first for share in (0.5, 0.35)]
+        balls = [Sphere(link_pose(robot, q, robot.tip)[:3, 3], RADIUS) for q in ways]
+        easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]
+        calls = [*((easier, WARM_UP) for easier in easy), (problem, SLIGHT)]
+        return [self.plan(task, seconds, until=until) for task, seconds in calls]
 
     def prepare(self, robot: Robot) -> None:
         """What is done before the clock starts: a learned planner loads its weights for the robot, and raises

@@ -23,7 +23,7 @@ from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.weights_at_hand import comes_with_package
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
-from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings
+from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
@@ -32,9 +32,6 @@ from robotdiffuse.types import Path
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
-
-SAMPLES_PER_GOAL = 4
-"""So many samples are drawn at least for each goal that has a share of a batch."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +100,8 @@ class ModelSampler(LearnedPlanner[Own]):
 
         settings = self.settings
         guidance = CollisionGuidance(checker, settings.guidance)
-        order = np.argsort(np.linalg.norm(goals - start, axis=1))
-        order = order[: max(settings.samples // SAMPLES_PER_GOAL, 1)]
-        counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(order))]
+        goals = nearest_goals(start, goals, settings.samples)
+        counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(goals))]
         clearances = clearances or link_clearances(checker, model.settings)
 
         def guide(q: ndarray, _level: float) -> ndarray:
@@ -115,7 +111,7 @@ class ModelSampler(LearnedPlanner[Own]):
             model.sample(
                 code,
                 start,
-                goals[i],
+                goal,
                 count,
                 rng,
                 clearances,
@@ -126,7 +122,7 @@ class ModelSampler(LearnedPlanner[Own]):
                 settings.sampler,
                 settings.guided_share,
             )
-            for i, count in zip(order, counts, strict=True)
+            for goal, count in zip(goals, counts, strict=True)
         ]
         return np.concatenate(parts)
 
@@ -135,8 +131,8 @@ def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
     """z of a scene: its point cloud through the frozen encoder."""
-    region = model.settings.encoder_settings.region
-    return model.encode(sample_surface(checker.scene, points, rng, region), rng)
+    assert model.encoder is not None  # a prior is no network of these planners
+    return model.encode(sample_surface(checker.scene, points, rng, model.encoder.settings.region), rng)
 
 
 class Diffusion(ModelSampler[DiffusionSettings]):

@@ -2,7 +2,7 @@
 
 No single cost and no single choice of its numbers fits all scenes. So a batch is split among an ensemble of
 guides; each guides its share, and the best of all samples is the plan. The prior is unconditional
-(`learning.networks.trajectory_prior`).
+(see `guided_prior`).
 
 Settings and the paper's values:
 
@@ -26,13 +26,21 @@ from itertools import pairwise, product
 from typing import Annotated
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
-from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior, quadratic_levels
-from robotdiffuse.planners.guided_prior import GuidedPrior, PriorSettings, collision_gradient, limited
+from robotdiffuse.learning.diffusion import NoiseSchedule
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.planners.guided_prior import (
+    GuidedPrior,
+    PriorSettings,
+    collision_gradient,
+    falling,
+    limited,
+    sample,
+)
 from robotdiffuse.settings import Bound, Count, Filled, Natural, NotNegative, Positive, Settings, Share
 
 
@@ -100,7 +108,7 @@ class EDMP(GuidedPrior[EDMPSettings]):
 
     def draw(
         self,
-        prior: TrajectoryPrior,
+        prior: MotionModel,
         checker: CollisionChecker,
         starts: Float[ndarray, "count dof"],
         goals: Float[ndarray, "count dof"],
@@ -113,7 +121,7 @@ class EDMP(GuidedPrior[EDMPSettings]):
         def guide(q: ndarray, left: int) -> ndarray:
             return self.guided(checker, q, left)
 
-        return prior.sample(starts, goals, levels, rng, guide, stop=stop)
+        return sample(prior, starts, goals, levels, rng, guide, stop=stop)
 
     def guided(
         self, checker: CollisionChecker, q: Float[ndarray, "samples waypoints dof"], left: int
@@ -128,3 +136,14 @@ class EDMP(GuidedPrior[EDMPSettings]):
             moves = limited(-guide.weight * gradient, settings.push)
             moved[share, 1:-1] += moves[:, 1:-1]
         return moved
+
+
+def quadratic_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+    """A part of the levels, falling from T, closer where there is little noise (Song et al. 2021, D.2).
+
+    For fewer steps than levels: evenly spaced ones end where there is much noise left, of which an error of
+    the network stays in the samples. Raises InputError unless there are that many levels.
+    """
+    schedule.sampling_levels(steps)
+    wanted = schedule.steps * (np.arange(1, steps + 1) / steps) ** 2
+    return falling(np.maximum(wanted.round().astype(np.int64), 1), schedule.steps)

@@ -3,10 +3,17 @@
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
 from robotdiffuse.learning.weights_at_hand import check_weights
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Settings
+
+SAMPLES_PER_GOAL = 4
+"""So many samples are drawn at least for each goal that has a share of a batch."""
 
 
 @dataclass(frozen=True)
@@ -38,3 +45,11 @@ class LearnedPlanner(Planner[Own]):
     def prepare(self, robot: Robot) -> None:
         """See `planners.base.Planner`."""
         self.network(robot)
+
+
+def nearest_goals(
+    start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], samples: int
+) -> Float[ndarray, "n dof"]:
+    """Those that have a share of a batch of so many samples, the nearest first."""
+    order = np.argsort(np.linalg.norm(goals - start, axis=1))
+    return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]

@@ -9,12 +9,11 @@ from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, load_planner
+from robotdiffuse.planners import DEFAULT_PLANNER, load_planner
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call, Request
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.processes import LoneWorker
-from robotdiffuse.registry import Entry
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Settings
@@ -47,18 +46,17 @@ def plan_many(
     unknown = set(request) - ARGUMENTS
     if unknown:
         raise InputError(f"unknown argument {min(unknown)!r}; known: {', '.join(sorted(ARGUMENTS))}")
-    entry = PLANNERS.entry(planner)
     load_planner(planner, settings, weights)
     asked = dict(request)
     if problems:
         Call(planner, problems[0], asked.pop("time_limit", 1.0), asked.pop("seed", 0), Request(**asked))
     count = min(workers or os.cpu_count() or 1, len(problems))
-    return _planned(problems, (planner, entry, settings, weights), count, request)
+    return _planned(problems, (planner, settings, weights), count, request)
 
 
 ARGUMENTS = {"time_limit", "seed", *(field.name for field in fields(Request))}
 """Of a request."""
-Loaded = tuple[str, Entry, Settings | None, str | None]
+Loaded = tuple[str, Settings | None, str | None]
 
 
 def _planned(
@@ -112,9 +110,7 @@ _state: _State | None = None
 
 def _prepare(loaded: Loaded, robots: list[Robot], request: dict[str, Any]) -> None:
     global _state
-    name, entry, settings, weights = loaded
-    PLANNERS[name] = entry  # which a program may have added
-    _state = _State(load_planner(name, settings, weights), robots, request, set())
+    _state = _State(load_planner(*loaded), robots, request, set())
 
 
 def _plan(robot: int, asked: tuple) -> PlanResult:

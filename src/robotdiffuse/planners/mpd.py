@@ -1,6 +1,6 @@
 """MPD: Motion Planning Diffusion (Carvalho et al., IROS 2023), a diffusion prior guided by cost gradients.
 
-The prior is unconditional (`learning.networks.trajectory_prior`); planning draws from the posterior given
+The prior is unconditional (see `guided_prior`); planning draws from the posterior given
 the costs: in the last part of the denoising steps the mean of each step goes some gradient steps down
 
     collision (scene and links) + joint limits + Gaussian process prior of constant velocity,
@@ -31,13 +31,24 @@ from functools import cache
 from math import ceil
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.networks.trajectory_prior import TrajectoryPrior, exponential_levels
-from robotdiffuse.planners.guided_prior import GuidedPrior, PriorSettings, collision_gradient, limited
+from robotdiffuse.learning.diffusion import NoiseSchedule
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.planners.guided_prior import (
+    GuidedPrior,
+    PriorSettings,
+    collision_gradient,
+    falling,
+    limited,
+    sample,
+)
 from robotdiffuse.settings import Count, Natural, NotNegative, Share
+
+EXPONENTIAL_BETAS = (1e-4, 1.0)
+"""Variance that the first and last step of MPD's exponential schedule add."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +83,7 @@ class MPD(GuidedPrior[MPDSettings]):
 
     def draw(
         self,
-        prior: TrajectoryPrior,
+        prior: MotionModel,
         checker: CollisionChecker,
         starts: Float[ndarray, "count dof"],
         goals: Float[ndarray, "count dof"],
@@ -87,8 +98,8 @@ class MPD(GuidedPrior[MPDSettings]):
             return self.guided(checker, q) if left < guided else q
 
         levels = exponential_levels(prior.schedule, settings.sampling_steps)
-        return prior.sample(
-            starts, goals, levels, rng, guide, settings.noise_scale, settings.quiet_steps, stop
+        return sample(
+            prior, starts, goals, levels, rng, guide, settings.noise_scale, settings.quiet_steps, stop
         )
 
     def guided(
@@ -107,6 +118,20 @@ class MPD(GuidedPrior[MPDSettings]):
             moves[:, [0, -1]] = 0.0
             q = gaussian.step((q + moves).astype(np.float32), settings.prior_weight)
         return q
+
+
+def exponential_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
+    """The levels nearest to those of MPD's exponential schedule in log signal-to-noise ratio, falling from T.
+
+    Its betas grow by a constant factor; levels that would fall together are moved apart. Raises InputError
+    unless there are that many levels.
+    """
+    schedule.sampling_levels(steps)
+    betas = np.geomspace(*EXPONENTIAL_BETAS, steps)
+    alpha_bar = np.cumprod(1 - betas)[:-1]
+    wanted = 0.5 * np.log(alpha_bar / (1 - alpha_bar))
+    nearest = np.abs(schedule.half_log_snr[1:, None] - wanted).argmin(0) + 1
+    return falling(np.append(nearest, schedule.steps), schedule.steps)
 
 
 @dataclass(frozen=True, eq=False)

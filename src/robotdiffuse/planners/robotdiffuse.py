@@ -9,15 +9,14 @@ Everything goes through the judge, and the result names the stage that its path 
 
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
-from robotdiffuse.collision.motion import search_space
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.weights_at_hand import comes_with_package
 from robotdiffuse.planners.aorrtc.planner import AORRTC, STEP, AORRTCSettings
@@ -27,10 +26,7 @@ from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, enco
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.settings import Bound, Count, Natural, Positive
-
-if TYPE_CHECKING:
-    from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.settings import Bound, Count, Natural
 
 BATCH_WORK = 8_000
 """Iterations of search that take about as long as a batch of 16 samples in two steps."""
@@ -54,18 +50,7 @@ class RobotDiffuseSettings(SamplingSettings, name="robotdiffuse"):
     network_share: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
     """Share of the work that goes to batches of the network; a batch counts as BATCH_WORK iterations of
     search."""
-    resolution: Positive = 0.02
-    """No point of the arm moves further than this between two checks of a candidate [m]."""
     search: AORRTCSettings = field(default_factory=AORRTCSettings)
-
-
-class Candidates(NamedTuple):
-    """Trajectories between the ends of a problem, not yet judged."""
-
-    q: Float[ndarray, "count waypoints dof"]
-    free: Bool[ndarray, "count"]
-    """Whether the compiled check at the planner's resolution calls them free."""
-    stage: str
 
 
 class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
@@ -112,30 +97,11 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             None if batches is None else batches.offer,
         )
 
-    def sample(
-        self,
-        model: "MotionModel",
-        checker: CollisionChecker,
-        code: Float[ndarray, "code"],
-        start: Float[ndarray, "dof"],
-        goals: Float[ndarray, "k dof"],
-        rng: np.random.Generator,
-    ) -> Candidates:
-        """The network alone: a batch of samples under guidance."""
-        return self.candidates(checker, self.draw(model, checker, code, start, goals, rng), "network")
-
-    def refine(self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]) -> Candidates:
-        """More gradient steps on trajectories, whether sampled or not."""
-        moved, _ = CollisionGuidance(checker, self.settings.guidance)(q, self.settings.refinement_steps)
-        return self.candidates(checker, moved, "refinement")
-
-    def candidates(
-        self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"], stage: str
-    ) -> Candidates:
-        """Trajectories with the verdict of the compiled check."""
-        space = search_space(checker, self.settings.resolution)
-        q = np.ascontiguousarray(q, np.float32)
-        return Candidates(q, np.array([motions_free(space, path).all() for path in q]), stage)
+    def refine(
+        self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]
+    ) -> Float[ndarray, "count waypoints dof"]:
+        """More gradient steps on trajectories, whether sampled or not; float32."""
+        return CollisionGuidance(checker, self.settings.guidance)(q, self.settings.refinement_steps)[0]
 
 
 class _Batches:
@@ -172,19 +138,19 @@ class _Batches:
         if self._code is None:
             self._code = encode(model, checker, planner.settings.points, call.rng)
         self._drawn += 1
-        sampled = planner.sample(model, checker, self._code, start, goals, call.rng)
-        if not self._take(sampled) and call.remaining > 0:
-            self._take(planner.refine(checker, sampled.q))
+        sampled = planner.draw(model, checker, self._code, start, goals, call.rng)
+        if not self._take(sampled, "network") and call.remaining > 0:
+            self._take(planner.refine(checker, sampled), "refinement")
         planner.batch_seconds = 0.5 * (planner.batch_seconds + self.call.elapsed - began)
 
-    def _take(self, candidates: Candidates) -> bool:
-        """Offer the shortest candidates that are free in the space of the search; whether there were any."""
+    def _take(self, q: Float[ndarray, "count waypoints dof"], stage: str) -> bool:
+        """Offer the shortest ones that are free in the space of the search; whether there were any."""
         space, most = self.search.space, self.planner.settings.shortened
-        free = (q for q in sorted(candidates.q, key=path_length) if motions_free(space, q).all())
-        paths = list(islice(free, most))
+        ordered = sorted(np.ascontiguousarray(q, np.float32), key=path_length)
+        paths = list(islice((path for path in ordered if motions_free(space, path).all()), most))
         for path in paths:
             if self.call.remaining > 0 or self.search.best is None:
-                self.search.offer(path, candidates.stage)
+                self.search.offer(path, stage)
         return bool(paths)
 
 

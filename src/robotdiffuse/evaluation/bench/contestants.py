@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path as FilePath
 from typing import Any
 
+from robotdiffuse.errors import InputError
 from robotdiffuse.planners import PLANNERS, load_planner, planner_settings
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Request
@@ -54,7 +55,12 @@ class Contestant:
         return vars(Request().changed(text for text in self.settings if _of_call(text)))
 
     def load(self) -> Planner:
-        """Raises InputError as `load_planner`."""
+        """Raises InputError as `load_planner`, and for a planner that a process of its own cannot import."""
+        if PLANNERS.entry(self.name).location.startswith("__main__:"):
+            raise InputError(
+                f"planner {self.name} is in the program that was started, which the processes of a bench do "
+                "not import; put it into a module of its own"
+            )
         if not self.settings:
             return load_planner(self.name, weights=self.weights)
         return load_planner(self.name, self._settings())

@@ -4,140 +4,31 @@ A report on a time limit needs no run of its own: records of a longer limit say 
 call that ended by itself says what a longer limit would have given.
 """
 
-import json
-import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from pathlib import Path as FilePath
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.evaluation.bench.curves import Curve, curves
+from robotdiffuse.evaluation.bench.folder import Bench, plain_name
+from robotdiffuse.evaluation.bench.outcomes import Calls, Key, Outcome, calls_on, counting, outcome
 from robotdiffuse.evaluation.comscore import Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases
-from robotdiffuse.evaluation.records import (
-    CRASHED,
-    ENDED,
-    OVERRAN,
-    RAISED,
-    RESTARTED,
-    Record,
-    read_records,
-    recorded,
-)
+from robotdiffuse.evaluation.records import RESTARTED, Record
 from robotdiffuse.evaluation.statistics import Paired, compare, wilson_interval
-from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.types import Status
 
 LIMITS = (0.1, 1.0, 10.0, 60.0)
 """Time limits [s] of a report beside those of its records, as far as these are longer."""
-LATE_SHARE, LATE = 0.1, 0.05
-"""A returned motion may be this share of the limit, or this time [s], late: planners stop in time, and then
-the judge takes its own."""
 ROP = ("rop", "rop_dense")
 """Sets that stand beside the paper's figures."""
 NONTRIVIAL = ", non-trivial"
-SHORTEST = 1 + 1e-6
-"""A path so many times as long as the shortest known one is as short."""
-RAN_OUT, GAVE_UP, LATER = "time ran out", "gave up before", "found one later"
-FAILURES = {
-    RAN_OUT: "no path by the end of the limit",
-    GAVE_UP: "ended without a path, long before the limit",
-    LATER: "found a path, but after the limit",
-    "scene collision": "the last path hit an obstacle",
-    "self-collision": "the last path hit the arm itself",
-    "other refusal": "the last path broke limits, missed the goal or twitched",
-    "ends refused": "start or goal said to be impossible",
-    CRASHED: "the process died",
-    OVERRAN: "the process did not answer and was killed",
-    RAISED: "an exception",
-}
-"""Why calls fail, for tables and plots."""
-REFUSED = {"scene_collision": "scene collision", "self_collision": "self-collision"}
-
-Key = tuple[str, int]
-"""A problem of a set by name, and a seed."""
-Calls = dict[Key, list[Record]]
-"""The calls of one planner on one problem set, shorter limits first."""
-
-
-@dataclass(frozen=True, eq=False)
-class Bench:
-    """What `bench run` left in a folder."""
-
-    folder: FilePath
-    runs: tuple[dict[str, Any], ...]
-    """What each run noted of itself."""
-    records: dict[str, list[Record]]
-    """By planner, in the order of PLANNERS; those that were restarted behind their plain ones."""
-
-    @property
-    def reference(self) -> str:
-        """The planner that the others are compared with: at equal time, where it was restarted."""
-        plain = DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
-        return plain + RESTARTED if plain + RESTARTED in self.records else plain
-
-    def run_of(self, record: Record) -> frozenset[str]:
-        """The numbers of the runs, from 1, that a call may be of: one, where the call was noted with it."""
-        return frozenset(
-            str(i)
-            for i, run in enumerate(self.runs, start=1)
-            if (
-                run.get("run") == record.run
-                if record.run
-                else plain_name(record.planner) in run["planners"]
-                and record.problem_set in run["problems"]
-                and record.time_limit == run["time_limit"]
-            )
-        )
-
-    @property
-    def problem_sets(self) -> list[str]:
-        return list(dict.fromkeys(r.problem_set for records in self.records.values() for r in records))
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What a call had done by a time limit."""
-
-    record: Record
-    found: float
-    """When the first path was found [s]; infinite if not by the limit."""
-    returned: float
-    """When the planner would have returned [s]: the limit for an anytime planner and if nothing was found."""
-    joint_length: float
-    """Of the best path by then [rad]; NaN without one, as what follows."""
-    link_length: float
-    """The paper's [m]; a longer path than the returned one is taken as longer by the same factor."""
-
-    @property
-    def solved(self) -> bool:
-        return self.found < np.inf
-
-    def full(self, limit: float, shortest: float) -> bool:
-        """Whether more calls within the limit could not have given a shorter path than this."""
-        nothing_shorter = self.record.trivial and self.joint_length <= SHORTEST * shortest
-        return self.record.restarts is not None or self.returned >= ENDED * limit or nothing_shorter
-
-    @property
-    def failure(self) -> str:
-        """One of FAILURES."""
-        record = self.record
-        if record.solved:
-            return LATER
-        if record.status in FAILURES:
-            return record.status
-        if record.status not in (Status.TIMEOUT.value, Status.NO_PATH.value):
-            return "ends refused"
-        if record.refused:
-            return REFUSED.get(record.refused, "other refusal")
-        return GAVE_UP if record.ended_by_itself and record.time < self.returned else RAN_OUT
 
 
 class Timed(NamedTuple):
@@ -233,25 +124,6 @@ class Comparison:
         return [m for m in METRICS.values() if any(row.measures[m.name].value < np.inf for row in self.rows)]
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A planner's success and lengths over time, by its longest calls."""
-
-    planner: str
-    calls: int
-    end: float
-    """What was found later than this [s] is known of some problems alone."""
-    found: Float[ndarray, "solved"]
-    """When first paths were found [s], sorted."""
-    anytime: bool
-    """Whether paths were improved, in more than a tenth of the solved calls on non-trivial problems."""
-    times: Float[ndarray, "t"]
-    """From half of these problems on [s]."""
-    ratios: Float[ndarray, "t"]
-    """Median at these times of joint-space length to the best known one, over the non-trivial problems that
-    it solves in the end; those not solved yet count as infinite."""
-
-
 @dataclass(frozen=True)
 class Section:
     """A problem set, or its non-trivial part."""
@@ -266,53 +138,6 @@ class Section:
     def main(self) -> Comparison:
         """With most planners and problems, and of those the longest limit."""
         return max(self.comparisons, key=lambda c: (len(c.rows) * c.problems, c.limit))
-
-
-def plain_name(planner: str) -> str:
-    """Without restarts."""
-    return planner.removesuffix(RESTARTED)
-
-
-def base_name(planner: str) -> str:
-    """In PLANNERS: without weights, settings and restarts."""
-    return re.split("[@:+]", planner, maxsplit=1)[0]
-
-
-def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench:
-    """The records of all planners of a run, or of some, those with restarts among them.
-
-    Raises InputError for a folder that `bench run` did not fill, damaged files and planners without records.
-    """
-    if planners is not None:
-        again = [name + RESTARTED for name in planners]
-        planners = [*planners, *(name for name in again if name in recorded(folder))]
-    found = read_records(folder, planners)
-    order = {name: i for i, name in enumerate(PLANNERS)}
-    names = sorted(
-        found, key=lambda n: (order.get(base_name(n), len(order)), plain_name(n), n.endswith(RESTARTED))
-    )
-    records = {name: found[name] for name in names}
-    for name in names:
-        if name.endswith(RESTARTED):
-            # the calls that had no time left for another are those of the plain planner
-            known = {record.key for record in records[name]}
-            there = [record for record in records.get(plain_name(name), ()) if record.key not in known]
-            records[name] = records[name] + [replace(record, planner=name) for record in there]
-    if not any(records.values()):
-        raise InputError(f"{folder} holds no records yet; go on with `robotdiffuse bench run`")
-    return Bench(folder, _read_runs(folder / "runs.jsonl"), records)
-
-
-def _read_runs(file: FilePath) -> tuple[dict[str, Any], ...]:
-    try:
-        lines = file.read_text().splitlines() if file.is_file() else []
-        runs = tuple(json.loads(line) for line in lines)
-        for name in ("date", "versions", "planners", "problems", "time_limit", "seeds", "count"):
-            if not all(name in run for run in runs):
-                raise ValueError(f"a run without {name}")
-        return runs
-    except (ValueError, TypeError) as error:
-        raise InputError(f"{file} is damaged: {error}; results cannot be read without it") from None
 
 
 def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Section]:
@@ -341,44 +166,12 @@ def sections(bench: Bench, limits: Sequence[float] | None = None) -> list[Sectio
             ]
             kept = tuple(c for c in comparisons if c.rows)
             if kept:
-                found.append(Section(name, problem_set, kept, _curves(part)))
+                found.append(Section(name, problem_set, kept, curves(part)))
     if not found:
         raise InputError(
             f"limits are {', '.join(f'{x:g}' for x in limits or ())} s; no planner was run that long"
         )
     return found
-
-
-def counting(records: Sequence[Record], limit: float) -> Record | None:
-    """The record that says what a planner does within a limit [s], of its calls on one problem with one seed,
-    shorter limits first: of the least limit that is as long, else one that ended by itself."""
-    for record in records:
-        if record.time_limit >= limit:
-            return record
-    return next((record for record in reversed(records) if record.ended_by_itself), None)
-
-
-def outcome(record: Record, limit: float) -> Outcome:
-    """What was done within a limit [s] that the record counts for."""
-    late = max(LATE_SHARE * limit, LATE) if record.time_limit == limit else 0.0
-    by_then = [(at, length) for at, length in record.progress if record.solved and at <= limit + late]
-    if not by_then:
-        return Outcome(record, np.inf, limit, np.nan, np.nan)
-    length, final = by_then[-1][1], record.joint_length
-    link = record.measures.get("link_length", np.nan)
-    factor = length / final if final else 1.0
-    return Outcome(record, min(by_then[0][0], limit), min(record.time, limit), length, link * factor)
-
-
-def calls_on(records: Iterable[Record], problem_set: str) -> Calls:
-    """A planner's calls on a problem set, of its records."""
-    calls: Calls = {}
-    for record in records:
-        if record.problem_set == problem_set:
-            calls.setdefault((record.name, record.seed), []).append(record)
-    for of in calls.values():
-        of.sort(key=lambda record: record.time_limit)
-    return calls
 
 
 def _limits(records: Sequence[Record]) -> list[float]:
@@ -526,39 +319,3 @@ def _row(
         memory=max((o.record.memory for o in outcomes if o.record.memory is not None), default=np.nan),
         failures=dict(Counter(o.failure for o in outcomes if not o.solved)),
     )
-
-
-def _curves(calls: dict[str, Calls]) -> tuple[Curve, ...]:
-    """On the problems that every planner has been called on."""
-    with_calls = {name: of for name, of in calls.items() if of}
-    keys = sorted(set.intersection(*(set(of) for of in with_calls.values()))) if with_calls else []
-    best = {
-        key: min(
-            (r.joint_length for of in with_calls.values() for r in of[key] if r.joint_length), default=1.0
-        )
-        for key in keys
-    }
-    if not keys:
-        return ()
-    longest = max(of[key][-1].time_limit for of in with_calls.values() for key in keys)
-    return tuple(
-        _curve(name, {key: of[key][-1] for key in keys}, best, longest) for name, of in with_calls.items()
-    )
-
-
-def _curve(planner: str, records: dict[Key, Record], best: dict[Key, float], longest: float) -> Curve:
-    """`longest`: limit of any planner [s], where the plot ends."""
-    end = min([longest, *(r.time_limit for r in records.values() if not r.ended_by_itself)])
-    done = {key: r for key, r in records.items() if outcome(r, r.time_limit).found <= end}
-    found = np.sort([min(r.progress[0][0], end) for r in done.values()])
-    hard = {key: r for key, r in done.items() if not r.trivial}
-    improved = sum(len(r.progress) > 1 for r in hard.values())
-    times = np.geomspace(1e-4, end, 240)
-    lengths = np.full((len(hard), len(times)), np.inf)
-    for row, (key, record) in zip(lengths, hard.items(), strict=True):
-        for at, length in record.progress:
-            row[times >= min(at, end)] = length / best[key]
-    with np.errstate(invalid="ignore"):
-        ratios = np.median(lengths, axis=0) if hard else np.full(len(times), np.inf)
-    known = np.isfinite(ratios)
-    return Curve(planner, len(records), end, found, improved > 0.1 * len(hard), times[known], ratios[known])

@@ -13,15 +13,9 @@ from numpy import ndarray
 
 from robotdiffuse.evaluation import look
 from robotdiffuse.evaluation.bench import plots, report
-from robotdiffuse.evaluation.bench.figures import (
-    Bench,
-    Comparison,
-    Outcome,
-    Section,
-    calls_on,
-    counting,
-    outcome,
-)
+from robotdiffuse.evaluation.bench.figures import Comparison, Section
+from robotdiffuse.evaluation.bench.folder import Bench
+from robotdiffuse.evaluation.bench.outcomes import Outcome, calls_on, counting, outcome
 from robotdiffuse.evaluation.look import card
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import Record

@@ -1,8 +1,8 @@
 """A process of its own for each planner: a crash, an endless loop or a leak there hurts nobody else.
 
-The far side is `python -m robotdiffuse.evaluation.bench.planner_process CONTESTANT`: it reads a task per
-line and writes its answers, a line each, all JSON. Warming up, for compiled code and imports, is apart from
-timing.
+The far side is `python -m robotdiffuse.evaluation.bench.planner_process CONTESTANT ADDED`, with the import
+path and the entries that this program has added to the tables. It reads a task per line and writes its
+answers, a line each, all JSON. Warming up, for compiled code and imports, is apart from timing.
 """
 
 import json
@@ -13,6 +13,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator
+from dataclasses import astuple
 from pathlib import Path as FilePath
 from typing import TextIO
 
@@ -22,17 +23,13 @@ from robotdiffuse.evaluation.records import CRASHED, OVERRAN
 from robotdiffuse.evaluation.trial import Fields, Trial
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.problems.files import problem_from_record, problem_record
-from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.processes import Companion
-from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.registry import Entry, added, take_over
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.types import SHORT
 
 FAR_SIDE = sys.executable, "-m", "robotdiffuse.evaluation.bench.planner_process"
-WARM_UP_SECONDS = 1.0
-WARM_UP_RADIUS = 0.08
-"""Of balls in the way [m]."""
 START_SECONDS = 300.0
 """Most time to start and to warm up; the first time ever, kernels are compiled."""
 PATIENCE = 20.0
@@ -48,7 +45,8 @@ class PlannerProcess:
 
     def __init__(self, contestant: Contestant, log: FilePath) -> None:
         """`log`: what the process prints is added to this file."""
-        self._far = Companion([*FAR_SIDE, contestant.text], log)
+        entries = {what: {n: astuple(e) for n, e in table.items()} for what, table in added().items()}
+        self._far = Companion([*FAR_SIDE, contestant.text, json.dumps([sys.path, entries])], log)
 
     def warm(self, trial: Trial) -> None:
         """Be ready for a trial's robot. A process that dies of it will say so when it is to plan."""
@@ -130,19 +128,13 @@ def _read(tasks: TextIO, lines: "queue.Queue[str]") -> None:
 
 
 def _warm_up(planner: Planner, problem: Problem) -> None:
-    """Calls that compile, load and fill caches: nothing in the way, and balls where the straight line is."""
-    robot, ways = problem.robot, []
-    if isinstance(problem.goal, JointGoal):
-        ways = [problem.start + share * (problem.goal.positions[0] - problem.start) for share in (0.5, 0.35)]
-    balls = [Sphere(link_pose(robot, q, robot.tip)[:3, 3], WARM_UP_RADIUS) for q in ways]
-    for shapes in ([], *([ball] for ball in balls)):
-        try:
-            warm = Problem(robot, Scene(shapes), problem.start, problem.goal)
-            result = planner.plan(warm, time_limit=WARM_UP_SECONDS)
+    """Calls that compile, load and fill caches, those of the measurements too."""
+    try:
+        for result in planner.warm_up(problem, SHORT):
             if result.path is not None and result.trajectory is not None:
-                measure_of(robot)(result.path, result.trajectory, result)
-        except Exception:  # the timed call will show it
-            traceback.print_exc()
+                measure_of(problem.robot)(result.path, result.trajectory, result)
+    except Exception:  # the timed call will show it
+        traceback.print_exc()
 
 
 def _calls(planner: Planner, problem: Problem, task: Fields, request: Fields) -> Iterator[Fields]:
@@ -160,6 +152,9 @@ def main() -> None:
     import torch
 
     torch.set_num_threads(1)
+    path, entries = json.loads(sys.argv[2])
+    sys.path += [place for place in path if place not in sys.path]
+    take_over({what: {n: Entry(*e) for n, e in table.items()} for what, table in entries.items()})
     contestant = Contestant.of(sys.argv[1])
     serve(contestant.load(), contestant.request(), sys.stdin, answers)
 

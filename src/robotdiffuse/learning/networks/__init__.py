@@ -23,9 +23,10 @@ NETWORKS = Registry(
             "MPiNetsNetworkSettings",
         ),
         "trajectory_prior": Entry(
-            _ROOM + "trajectory_prior:TrajectoryPrior",
-            "unconditional diffusion of trajectories, for MPD and EDMP",
-            "TrajectoryPriorSettings",
+            "robotdiffuse.learning.motion_model:MotionModel",
+            "the same model without an encoder, for MPD and EDMP",
+            "MotionModelSettings",
+            "planner --config trajectory_prior --data FOLDER",
         ),
     },
 )

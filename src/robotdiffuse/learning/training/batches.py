@@ -61,7 +61,7 @@ class TrajectoryData:
     trivial: Bool[ndarray, "n"]
     """The straight line from start to goal is free too."""
     codes: Float[ndarray, "n code"] | None
-    """z of each scene, float16; None where the encoder is trained along."""
+    """z of each scene, float16; None where the encoder is trained along, or there is none."""
     digest: str
     """SHA-256 of the shards, the first 16 digits."""
     validation: int
@@ -231,7 +231,7 @@ class Batches:
         model: MotionModel,
         clearances: PackedClearanceFn,
         trivial_share: float,
-        weight_limit: float,
+        weight_limit: float | None,
     ) -> None:
         self.data, self.model, self.clearances = data, model, clearances
         self.trivial_share, self.weight_limit = trivial_share, weight_limit
@@ -248,11 +248,11 @@ class Batches:
         """These rows at these noise levels."""
         data, model, schedule = self.data, self.model, self.model.schedule
         scenes = data.scenes[rows]
-        if data.codes is None:
-            codes = np.zeros((len(rows), model.settings.encoder_settings.code), np.float32)
+        codes, clouds = np.zeros((len(rows), model.settings.code), np.float32), None
+        if data.codes is not None:
+            codes = data.codes[rows].astype(np.float32)
+        elif model.encoder is not None:
             clouds = scene_clouds(model.encoder, scenes, rng)
-        else:
-            codes, clouds = data.codes[rows].astype(np.float32), None
         q = data.q[rows]
         back = rng.random(len(rows)) < 0.5
         q[back] = q[back, ::-1]

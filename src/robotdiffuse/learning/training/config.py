@@ -6,15 +6,10 @@ from typing import Annotated
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import DenoiserSettings
-from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.encoders.base import EncoderSettings
-from robotdiffuse.learning.motion_model import check_gradients
+from robotdiffuse.learning.motion_model import ModelParts
 from robotdiffuse.learning.networks import NETWORKS
-from robotdiffuse.learning.objectives import OBJECTIVES, objective_for
-from robotdiffuse.learning.parametrization import PARAMETRIZATIONS, parametrization
-from robotdiffuse.learning.representation import TARGETS
-from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.settings import (
     Bound,
@@ -115,18 +110,19 @@ class MotionTraining(TrainingSettings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlannerTraining(MotionTraining):
+class PlannerTraining(MotionTraining, ModelParts):
     """Training of the diffusion model."""
 
-    encoder: str
+    encoder: str | None
     """Folder with a trained encoder, which stays as it is; or the name of an encoder, pointnet or dgcnn, say,
-    that starts untrained and is trained along, by the planner's loss, on clouds drawn anew each time."""
+    that starts untrained and is trained along, by the planner's loss, on clouds drawn anew each time; None
+    for a prior, which sees no scene."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
     """Peak, for AdamW (paper: 3e-4)."""
     weight_decay: NotNegative = 0.01
-    weight_limit: Positive = 5.0
-    """Most that a noise level weighs in the loss, see NoiseSchedule.weight."""
+    weight_limit: Positive | None = 5.0
+    """Most that a noise level weighs in the loss, see NoiseSchedule.weight; None: all weigh the same."""
     losses: LossSettings = field(default_factory=LossSettings)
     """The paper's losses of joints, points and collision."""
     trivial_share: Share = 0.1
@@ -137,39 +133,16 @@ class PlannerTraining(MotionTraining):
     """Held-out problems that are planned, without guidance, at every checkpoint."""
     encoder_settings: Annotated[EncoderSettings | None, SettingsOf("encoder", ENCODERS)] = None
     """Of an encoder that is trained along; None: its defaults."""
-    denoiser: Annotated[str, OneOf(DENOISERS)] = "transformer"
-    """Which denoiser."""
     denoiser_settings: Annotated[DenoiserSettings | None, SettingsOf("denoiser", DENOISERS)] = None
     """None: the defaults of that denoiser."""
     condition_drop: ShareBelowOne = 0.0
     """Share of the samples whose condition [z, start, goal] is hidden from the denoiser, for classifier-free
     guidance (paper: "randomly masked", no share given; Ho and Salimans 2022: 0.1 or 0.2). 0: no guidance."""
-    schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
-    sampler: Annotated[str, OneOf(SAMPLERS)] = "ddim"
-    """That planning will use: ddpm (the paper's), ddim, dpm_solver or euler."""
-    sampling_steps: Count | None = 6
-    """Calls of the denoiser that planning will use; None: all levels of the schedule (the paper's)."""
-    parametrization: Annotated[str, OneOf(PARAMETRIZATIONS)] = "waypoints"
-    """What is diffused: waypoints (the paper's) or b_spline control points."""
-    rows: Count | None = None
-    """As many; None: as there are waypoints."""
-    target: Annotated[str, OneOf(TARGETS)] = "residual"
-    """What rows are relative to: residual, to the straight line; absolute (the paper's)."""
-    objective: Annotated[str, OneOf(OBJECTIVES)] = "clean"
-    """What the network predicts: clean (the paper's), noise or velocity."""
-    sees_clearances: bool = True
-    """Whether the denoiser is told the links' clearances along the noisy trajectory (beyond the paper)."""
-    sees_gradients: bool = False
-    """Whether it is told too which way each waypoint's joints would take the arm too close to obstacles."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_gradients(self.sees_gradients, self.sees_clearances)
-        schedule = NoiseSchedule(self.schedule)
-        objective_for(self.objective, schedule)
-        if self.sampling_steps is not None:
-            schedule.sampling_levels(self.sampling_steps)
-        parametrization(self.parametrization, self.waypoints, self.rows or self.waypoints)
+        if self.target == "limits" and self.smooth_noise:
+            raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
         if self.encoder_settings is not None:
             ENCODERS.entry(self.encoder)
 

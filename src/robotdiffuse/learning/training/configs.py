@@ -1,4 +1,5 @@
-"""Named settings of planner training: the paper's, the compact ones that ship, and the rows of its Table 2.
+"""Named settings of planner training: the paper's, the compact ones that ship, the rows of its Table 2, and
+the prior of MPD and EDMP (see `planners.guided_prior`).
 
 The rows share everything but what they compare, and a size that a CPU can train. Unlike `paper` they diffuse
 48 waypoints in patches of 4, as residuals to the straight line, with smooth noise: fewer samples teach more.
@@ -11,6 +12,8 @@ from typing import Any, NamedTuple
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.denoisers.unet import UNetSettings
+from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import LossSettings
 
@@ -67,6 +70,26 @@ CONFIGS: dict[str, Config] = {
     "table2_joint": Config("L_joint alone", {**_ROW, "losses": JOINT}),
     "table2_joint_point": Config("L_joint and L_point", {**_ROW, "losses": JOINT_POINT}),
     "table2_jpc": Config("L_joint, L_point and L_collision", _ROW),
+    "trajectory_prior": Config(
+        "the prior of MPD and EDMP, which sees no scene: temporal U-Net, T = 255, noise predicted",
+        {
+            "minutes": 40.0,
+            "learning_rate": 2e-3,
+            "weight_decay": 0.0,
+            "encoder": None,
+            "denoiser": "unet",
+            "denoiser_settings": UNetSettings(32, (1, 2, 4), 5, condition_width=64),
+            "schedule": ScheduleSettings(steps=255),
+            "sampler": "ddpm",
+            "sampling_steps": 25,
+            "target": "limits",
+            "objective": "noise",
+            "sees_clearances": False,
+            "smooth_noise": False,
+            "weight_limit": None,
+            "validation_problems": 24,
+        },
+    ),
 }
 
 

@@ -1,6 +1,7 @@
 """Training of the diffusion model, with a frozen encoder or one that is trained along."""
 
 import copy
+from dataclasses import fields
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -14,7 +15,7 @@ from robotdiffuse.learning.clearances import packed_clearances
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Encoder
-from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.motion_model import ModelParts, MotionModel, MotionModelSettings
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryData
 from robotdiffuse.learning.training.config import PlannerTraining
@@ -33,7 +34,8 @@ STATISTICS = 20_000
 
 
 def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
-    """Train the diffusion model; write model.safetensors and model.json, all that planning needs.
+    """Train the diffusion model; write model.safetensors and model.json, all that planning needs; a prior
+    is trajectory_prior.safetensors.
 
     The same call continues a run that was interrupted. Returns `validation`, the loss on trajectories kept
     aside, `success`, the share of the motions that it samples for them by itself that are free, and
@@ -44,22 +46,22 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
 
 
 class _PlannerTrainee(MotionTrainee):
-    title = "planner"
-
     def __init__(self, settings: PlannerTraining, processes: Processes) -> None:
         robot = load_robot(settings.robot)
         torch.manual_seed(settings.seed)
-        frozen = None if settings.jointly else load_encoder(settings.encoder)
-        encoder = frozen or make_encoder(settings.encoder, settings.encoder_settings)
+        frozen = encoder = None
+        if settings.encoder is not None:
+            frozen = None if settings.jointly else load_encoder(settings.encoder)
+            encoder = frozen or make_encoder(settings.encoder, settings.encoder_settings)
         model = MotionModel(RobotIdentity.of(robot), _model_settings(settings, encoder))
         # codes are made on the CPU: the frozen one stays there
         model.encoder = copy.deepcopy(encoder)
         super().__init__(settings, robot, frozen, processes)
-        self.own = settings
+        self.own, self.title = settings, model.settings.network
         hard = self.kept.q[~self.kept.trivial]
         model.fit_statistics((hard if len(hard) else self.kept.q)[:STATISTICS], settings.smooth_noise)
         self.module = self.model = model.to(processes.device)
-        self.identity = {"robot": robot.name, "encoder_fingerprint": fingerprint(encoder)}
+        self.identity = {"robot": robot.name} | self._print("encoder_fingerprint")
         # batches are made, and validations planned, on the CPU
         self._here = on_cpu(model)
         self._clearances = packed_clearances(robot, model.settings)
@@ -82,29 +84,22 @@ class _PlannerTrainee(MotionTrainee):
         return planning_success(self._here, self.robot, self.held_out, problems, VALIDATION_SAMPLES, rng)
 
     def about(self) -> dict[str, Any]:
-        return super().about() | {"encoder": fingerprint(self.model.encoder)}
+        return super().about() | self._print("encoder")
+
+    def _print(self, name: str) -> dict[str, str]:
+        return {} if self.model.encoder is None else {name: fingerprint(self.model.encoder)}
 
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
-        save_network("model", self.model, folder, training)
+        save_network(self.title, self.model, folder, training)
 
 
-def _model_settings(settings: PlannerTraining, encoder: Encoder) -> MotionModelSettings:
+def _model_settings(settings: PlannerTraining, encoder: Encoder | None) -> MotionModelSettings:
     return MotionModelSettings(
-        encoder=encoder_name(encoder),
-        encoder_settings=encoder.settings,
-        denoiser=settings.denoiser,
+        encoder=None if encoder is None else encoder_name(encoder),
+        encoder_settings=None if encoder is None else encoder.settings,
         denoiser_settings=settings.denoiser_settings or DENOISERS.defaults(settings.denoiser),
         null_condition=settings.condition_drop > 0,
-        schedule=settings.schedule,
-        sampler=settings.sampler,
-        sampling_steps=settings.sampling_steps,
-        waypoints=settings.waypoints,
-        parametrization=settings.parametrization,
-        rows=settings.rows,
-        target=settings.target,
-        objective=settings.objective,
-        sees_clearances=settings.sees_clearances,
-        sees_gradients=settings.sees_gradients,
+        **{field.name: getattr(settings, field.name) for field in fields(ModelParts)},
     )
 
 
@@ -136,7 +131,7 @@ class _Loss:
             for a in (batch.features, batch.level, batch.condition, batch.target, batch.weight)
         )
         with self.processes.autocast():
-            if batch.clouds is not None:
+            if batch.clouds is not None and model.encoder is not None:
                 z = model.encoder(batch.clouds.to(device))
                 condition = torch.cat([z, condition[:, z.shape[1] :]], 1)
             hidden = None if dropped is None else dropped.to(device)

@@ -1,4 +1,5 @@
-"""Validations that plan: what a network in training would solve by itself, without guidance or search.
+"""Validations that plan: what a network in training would solve by itself, without search, and without
+guidance unless it sees no scene.
 
 Covering spheres decide, not the judge: it is for curves of training, which compare a network with itself.
 """
@@ -9,6 +10,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.training.batches import TrajectoryData, encode_scenes
 from robotdiffuse.robots.robot import Robot
@@ -16,6 +18,8 @@ from robotdiffuse.scenes.packed import PackedScenes
 
 SAMPLING_STEPS = 6
 """Of every network alike, so that all of the levels do not take longer than the training."""
+PRIOR_GUIDANCE = 4
+"""Gradient steps that a prior, which sees no scene, is helped by at each step of the second half."""
 BETWEEN = 6
 """Places that are checked in each step from waypoint to waypoint."""
 
@@ -46,14 +50,21 @@ def _sampled_free(
     rng: np.random.Generator,
 ) -> Bool[ndarray, "candidates"]:
     q, checker = data.q[row], CollisionChecker(robot, data.scenes.scene(row))
-    if data.codes is None:
-        code = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
-    else:
+    code = np.zeros(0)
+    if data.codes is not None:
         code = data.codes[row]
+    elif model.encoder is not None:
+        code = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
+    guidance = CollisionGuidance(checker)
+
+    def guide(q: ndarray, _level: float) -> ndarray:
+        return guidance(q, PRIOR_GUIDANCE)[0]
+
     start, goal = q[0].astype(np.float64), q[-1].astype(np.float64)
     clearances = link_clearances(checker, model.settings)
     steps = min(SAMPLING_STEPS, model.schedule.steps)
-    q = model.sample(code.astype(np.float32), start, goal, candidates, rng, clearances, steps)
+    guided = guide if model.encoder is None else None
+    q = model.sample(code.astype(np.float32), start, goal, candidates, rng, clearances, steps, guided)
     return free_in(checker, q)
 
 

@@ -1,0 +1,105 @@
+"""What a call had done by a time limit, told by the record of a call with that limit or a longer one."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from robotdiffuse.evaluation.records import CRASHED, ENDED, OVERRAN, RAISED, Record
+from robotdiffuse.types import Status
+
+LATE_SHARE, LATE = 0.1, 0.05
+"""A returned motion may be this share of the limit, or this time [s], late: planners stop in time, and then
+the judge takes its own."""
+SHORTEST = 1 + 1e-6
+"""A path so many times as long as the shortest known one is as short."""
+RAN_OUT, GAVE_UP, LATER = "time ran out", "gave up before", "found one later"
+FAILURES = {
+    RAN_OUT: "no path by the end of the limit",
+    GAVE_UP: "ended without a path, long before the limit",
+    LATER: "found a path, but after the limit",
+    "scene collision": "the last path hit an obstacle",
+    "self-collision": "the last path hit the arm itself",
+    "other refusal": "the last path broke limits, missed the goal or twitched",
+    "ends refused": "start or goal said to be impossible",
+    CRASHED: "the process died",
+    OVERRAN: "the process did not answer and was killed",
+    RAISED: "an exception",
+}
+"""Why calls fail, for tables and plots."""
+REFUSED = {"scene_collision": "scene collision", "self_collision": "self-collision"}
+
+Key = tuple[str, int]
+"""A problem of a set by name, and a seed."""
+Calls = dict[Key, list[Record]]
+"""The calls of one planner on one problem set, shorter limits first."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a call had done by a time limit."""
+
+    record: Record
+    found: float
+    """When the first path was found [s]; infinite if not by the limit."""
+    returned: float
+    """When the planner would have returned [s]: the limit for an anytime planner and if nothing was found."""
+    joint_length: float
+    """Of the best path by then [rad]; NaN without one, as what follows."""
+    link_length: float
+    """The paper's [m]; a longer path than the returned one is taken as longer by the same factor."""
+
+    @property
+    def solved(self) -> bool:
+        return self.found < np.inf
+
+    def full(self, limit: float, shortest: float) -> bool:
+        """Whether more calls within the limit could not have given a shorter path than this."""
+        nothing_shorter = self.record.trivial and self.joint_length <= SHORTEST * shortest
+        return self.record.restarts is not None or self.returned >= ENDED * limit or nothing_shorter
+
+    @property
+    def failure(self) -> str:
+        """One of FAILURES."""
+        record = self.record
+        if record.solved:
+            return LATER
+        if record.status in FAILURES:
+            return record.status
+        if record.status not in (Status.TIMEOUT.value, Status.NO_PATH.value):
+            return "ends refused"
+        if record.refused:
+            return REFUSED.get(record.refused, "other refusal")
+        return GAVE_UP if record.ended_by_itself and record.time < self.returned else RAN_OUT
+
+
+def counting(records: Sequence[Record], limit: float) -> Record | None:
+    """The record that says what a planner does within a limit [s], of its calls on one problem with one seed,
+    shorter limits first: of the least limit that is as long, else one that ended by itself."""
+    for record in records:
+        if record.time_limit >= limit:
+            return record
+    return next((record for record in reversed(records) if record.ended_by_itself), None)
+
+
+def outcome(record: Record, limit: float) -> Outcome:
+    """What was done within a limit [s] that the record counts for."""
+    late = max(LATE_SHARE * limit, LATE) if record.time_limit == limit else 0.0
+    by_then = [(at, length) for at, length in record.progress if record.solved and at <= limit + late]
+    if not by_then:
+        return Outcome(record, np.inf, limit, np.nan, np.nan)
+    length, final = by_then[-1][1], record.joint_length
+    link = record.measures.get("link_length", np.nan)
+    factor = length / final if final else 1.0
+    return Outcome(record, min(by_then[0][0], limit), min(record.time, limit), length, link * factor)
+
+
+def calls_on(records: Iterable[Record], problem_set: str) -> Calls:
+    """A planner's calls on a problem set, of its records."""
+    calls: Calls = {}
+    for record in records:
+        if record.problem_set == problem_set:
+            calls.setdefault((record.name, record.seed), []).append(record)
+    for of in calls.values():
+        of.sort(key=lambda record: record.time_limit)
+    return calls
