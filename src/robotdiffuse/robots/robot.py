@@ -98,6 +98,15 @@ class Robot:
         return np.eye(4) if self.root in ("", self.base) else self.above.get(self.root)
 
     @cached_property
+    def fixed_below(self) -> dict[str, Float[ndarray, "4 4"]]:
+        """T_base_link of the base and of the links that fixed joints alone connect with it."""
+        found = {self.base: np.eye(4)}
+        for joint in self.joints:
+            if joint.kind == "fixed" and joint.parent in found:
+                found[joint.child] = found[joint.parent] @ joint.T_parent_joint
+        return found
+
+    @cached_property
     def planned_joints(self) -> tuple[Joint, ...]:
         """Movable, unlocked joints on the chain from base to tip, in order."""
         by_child = {joint.child: joint for joint in self.joints}
