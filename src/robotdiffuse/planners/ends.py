@@ -5,7 +5,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import explain_collision
+from robotdiffuse.collision.exact import ExactCollision, explain_collision
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.planners.call import Call
@@ -32,11 +32,6 @@ class Ends:
         leads = [(retreat(checker, goal), goal) for goal in goals]
         self.goals = [goal for lead, goal in leads if lead is not None]
         self.goal_leads = [lead for lead, _ in leads if lead is not None]
-
-    @property
-    def reachable(self) -> bool:
-        """Whether a search can begin and end."""
-        return self.start_lead is not None and bool(self.goals)
 
     def rows(self) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
         """Where a search begins and where it may end, in float32."""
@@ -89,8 +84,13 @@ def usable_ends(call: Call) -> Ends | PlanResult:
     if isinstance(goals, PlanResult):
         return goals
     ends = Ends(checker, call.problem.start, goals)
-    if not ends.reachable:
-        return call.unsolved("the start or every goal touches an obstacle too closely to plan from")
+    if ends.start_lead is None:
+        why = closeness(checker, call.problem.start)
+        return call.fail(Status.INVALID_START, f"the start is too close to contact to plan from: {why}")
+    if not ends.goals:
+        what = "the goal is" if len(goals) == 1 else f"all {len(goals)} goal configurations are"
+        why = closeness(checker, goals[0])
+        return call.fail(Status.INVALID_GOAL, f"{what} too close to contact to plan to: {why}")
     return ends
 
 
@@ -110,6 +110,21 @@ def retreat(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> Float[ndarra
             return None
         at = np.clip(at - RETREAT_STEP * gradient / norm, robot.lower, robot.upper)
     return None
+
+
+def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
+    """Where the covering spheres touch deepest, in words, for a configuration that the meshes call free."""
+    clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
+    worst = int(clearances.argmin())
+    link, other = [*((link, None) for link in checker.links), *checker.pairs][worst]
+    exact = ExactCollision(checker.robot, checker.scene)
+    check = [frozenset(check) for check in exact.checks].index(frozenset((link, other)))
+    [distance], [obstacle] = exact.nearest(q[None], np.array([check]), np.array([np.inf]))
+    spheres = str(obstacle) if other is None else f"those of {other}"
+    return (
+        f"the covering spheres of {link} reach {-1e3 * float(clearances[worst]):.1f} mm into {spheres}, "
+        f"though the meshes are {1e3 * float(distance):.1f} mm apart"
+    )
 
 
 def _usable_goals(call: Call, checker: CollisionChecker) -> Float[ndarray, "k dof"] | PlanResult:
