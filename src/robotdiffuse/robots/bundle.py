@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Mimic, Robot
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
 FORMAT = 2
@@ -78,6 +78,7 @@ def _to_json(robot: Robot, source: dict[str, str]) -> dict:
         "root": robot.root or robot.base,
         "above": {link: _pose_to_json(T_base_link) for link, T_base_link in robot.above.items()},
         "locked": robot.locked,
+        "poses": robot.poses,
         "joints": [_joint_to_json(joint) for joint in robot.joints],
         "spheres": {link: np.round(spheres, 6).tolist() for link, spheres in robot.spheres.items()},
         "allowed_collisions": sorted(sorted(pair) for pair in robot.allowed_collisions),
@@ -95,6 +96,8 @@ def _joint_to_json(joint: Joint) -> dict:
     }
     if joint.kind in MOVING_KINDS:
         data |= {"axis": joint.axis.tolist()} | {name: getattr(joint, name) for name in LIMITS}
+    if joint.mimic is not None:
+        data["mimic"] = list(joint.mimic)
     return data
 
 
@@ -151,6 +154,10 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
         notes=tuple(map(str, data["notes"])),
         root=str(data["root"]),
         above={str(link): _pose_from_json(pose, f"above: {link}") for link, pose in data["above"].items()},
+        poses={
+            str(name): {str(joint): float(value) for joint, value in pose.items()}
+            for name, pose in data.get("poses", {}).items()
+        },
     )
 
 
@@ -165,19 +172,12 @@ def _joint_from_json(data: dict) -> Joint:
     lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
     if not lower <= upper or not min(velocity, acceleration, jerk) > 0:
         raise ValueError(f"joint {name}: limits")
-    return Joint(
-        name,
-        kind,
-        str(data["parent"]),
-        str(data["child"]),
-        T,
-        axis,
-        lower,
-        upper,
-        velocity,
-        acceleration,
-        jerk,
-    )
+    mimic = None
+    if "mimic" in data:
+        master, multiplier, offset = data["mimic"]
+        mimic = Mimic(str(master), float(multiplier), float(offset))
+    ends, limits = (str(data["parent"]), str(data["child"])), (lower, upper, velocity, acceleration, jerk)
+    return Joint(name, kind, *ends, T, axis, *limits, mimic)
 
 
 def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:
