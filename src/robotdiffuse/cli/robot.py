@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from numpy import ndarray
 
     from robotdiffuse.robots.add import AddReport
-    from robotdiffuse.robots.robot import Robot
+    from robotdiffuse.robots.robot import Joint, Robot
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -176,9 +176,7 @@ def print_robot(robot: "Robot") -> None:
     from robotdiffuse.transforms import inverse
 
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
-    joints = [
-        (j.name, j.kind, j.lower, j.upper, j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints
-    ]
+    joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]
     spheres = sum(len(rows) for rows in robot.spheres.values())
     meshes = sum(len(pieces) for pieces in robot.meshes.values())
     pairs = [("base, tip", f"{robot.base}, {robot.tip}")]
@@ -193,6 +191,10 @@ def print_robot(robot: "Robot") -> None:
         *(("note", note) for note in robot.notes),
     ]
     show(Table.of(robot.name, columns, joints), Table.pairs("", pairs))
+
+
+def _range(joint: "Joint") -> tuple[float | None, float | None]:
+    return (None, None) if joint.kind == "continuous" else (joint.lower, joint.upper)
 
 
 def _place(T: "Float[ndarray, '4 4']") -> str:

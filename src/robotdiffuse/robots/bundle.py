@@ -11,11 +11,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Mimic, Robot
+from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
 FORMAT = 2
 """2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""
+WHOLE_TURN = 6.283
+"""A continuous joint whose limits are narrower than this is revolute [rad]: older files may hold some."""
 ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
@@ -172,6 +174,10 @@ def _joint_from_json(data: dict) -> Joint:
     lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
     if not lower <= upper or not min(velocity, acceleration, jerk) > 0:
         raise ValueError(f"joint {name}: limits")
+    if kind == "continuous" and upper - lower < WHOLE_TURN:
+        kind = "revolute"
+    elif kind == "continuous":
+        lower, upper = -TURNS, TURNS
     mimic = None
     if "mimic" in data:
         master, multiplier, offset = data["mimic"]

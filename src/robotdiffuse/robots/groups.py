@@ -6,7 +6,8 @@ from itertools import takewhile
 from pathlib import Path
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.robots.robot import MOVING_KINDS, Joint
+from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
+from robotdiffuse.robots.srdf import Srdf
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """In the name of a joint: it is a gripper's, if few joints follow it."""
@@ -100,7 +101,74 @@ class JointTree:
         return link
 
 
-def one_arm(file: Path, arms: list[Arm], groups: list[str]) -> Arm | None:
+def planned_joints(
+    file: Path, base: str, joints: list[Joint], tip: str | None, group: str | None, srdf: Srdf | None
+) -> tuple[set[str], str]:
+    """Names of the joints that are planned if they are not locked, and the tip.
+
+    `joints` are all below the base, parents before children. Raises InputError for an unknown tip or group, a
+    group that is no chain, and several arms of which none is chosen.
+    """
+    above = {joint.child: joint for joint in joints}
+    if tip is not None and tip not in (base, *above):
+        raise unknown_name(f"tip link below {base} in {file.name}", tip, [base, *above])
+    chosen: list[str] | None = None
+    if group is not None and srdf is not None and group in srdf.groups:
+        chosen = [joint.name for joint in srdf.joints(group, tuple(joints))]
+        if not chosen:
+            raise InputError(f"{srdf.path}: group {group} has no movable joint below {base}")
+        last = next(joint for joint in joints if joint.name == chosen[-1])
+        tip = tip or srdf.tip(group, tuple(joints)) or last.child
+    elif group is not None or tip is None:
+        arms = JointTree(base, joints).arms()
+        groups = [] if srdf is None else list(srdf.groups)
+        arm = _one_arm(file, arms, groups) if group is None else _named_arm(file, arms, group, groups)
+        tip = tip or (base if arm is None else arm.tip)
+    leading = [joint for joint in chain(above, tip) if joint.kind in MOVING_KINDS]
+    off = [name for name in chosen or () if name not in {joint.name for joint in leading}]
+    if off:
+        raise InputError(
+            f"{file}: group {group} is no single chain: {', '.join(off)} do not lead to {tip}; choose a "
+            f"group of one arm"
+        )
+    passive = frozenset() if srdf is None else srdf.passive
+    names = {joint.name for joint in leading if joint.mimic is None and joint.name not in passive}
+    return names if chosen is None else names & {*chosen}, tip
+
+
+def passive_notes(srdf: Srdf | None, joints: list[Joint]) -> list[str]:
+    """What a robot says of the passive joints that it holds."""
+    passive = frozenset() if srdf is None else srdf.passive
+    return [f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in passive]
+
+
+def chain(above: dict[str, Joint], tip: str) -> list[Joint]:
+    """The joints that lead to a link, from the base on; `above` is the joint above each link."""
+    joints: list[Joint] = []
+    while tip in above:
+        joints.append(above[tip])
+        tip = above[tip].parent
+    return joints[::-1]
+
+
+def refuse_linkages(file: Path, robot: Robot) -> None:
+    """Joints that follow a planned one would move, and are held: InputError if they move geometry."""
+    by_name = {joint.name: joint for joint in robot.joints}
+    above = {joint.child: joint for joint in robot.joints}
+    for joint in robot.joints:
+        leader = joint
+        while leader.mimic is not None:
+            leader = by_name[leader.mimic.joint]
+        if joint.mimic is None or leader.name in robot.locked:
+            continue
+        if any(joint in chain(above, link) for link in (*robot.meshes, robot.tip)):
+            raise InputError(
+                f"{file}: joint {joint.name} follows {leader.name}, which is planned; linkages are not "
+                f"supported: hold it with --lock {leader.name}=VALUE, or end the arm above it with --tip"
+            )
+
+
+def _one_arm(file: Path, arms: list[Arm], groups: list[str]) -> Arm | None:
     """The only arm of a robot, None if it has none; InputError, which lists them, if there are several.
 
     `groups` are names that may be chosen besides, those of its SRDF.
@@ -109,20 +177,20 @@ def one_arm(file: Path, arms: list[Arm], groups: list[str]) -> Arm | None:
         return arms[0] if arms else None
     raise InputError(
         f"{file} has {len(arms)} arms: {_listed(arms)}; choose one: robotdiffuse robot add {file.name} "
-        f"--group {names_of(arms)[0]}" + (f" (groups of its SRDF: {', '.join(groups)})" if groups else "")
+        f"--group {_names_of(arms)[0]}" + (f" (groups of its SRDF: {', '.join(groups)})" if groups else "")
     )
 
 
-def named_arm(file: Path, arms: list[Arm], name: str, groups: list[str]) -> Arm:
-    """The arm that a name of `names_of` or a tip stands for; InputError, which lists them, for others."""
-    names = names_of(arms)
+def _named_arm(file: Path, arms: list[Arm], name: str, groups: list[str]) -> Arm:
+    """The arm that a name of `_names_of` or a tip stands for; InputError, which lists them, for others."""
+    names = _names_of(arms)
     chosen = [arm for arm, its in zip(arms, names, strict=True) if name in (its, arm.tip)]
     if not chosen:
         raise unknown_name(f"group of {file}", name, [*names, *groups])
     return chosen[0]
 
 
-def names_of(arms: list[Arm]) -> list[str]:
+def _names_of(arms: list[Arm]) -> list[str]:
     """The arms' names, or their tips where two have the same name."""
     names = [arm.name for arm in arms]
     return [arm.tip if names.count(arm.name) > 1 else arm.name for arm in arms]
@@ -131,5 +199,5 @@ def names_of(arms: list[Arm]) -> list[str]:
 def _listed(arms: list[Arm]) -> str:
     return ", ".join(
         f"{name} ({len(arm.joints)} joints to {arm.tip})"
-        for name, arm in zip(names_of(arms), arms, strict=True)
+        for name, arm in zip(_names_of(arms), arms, strict=True)
     )

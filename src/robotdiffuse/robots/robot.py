@@ -6,13 +6,16 @@ from functools import cached_property, lru_cache, wraps
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
+TURNS = 3 * np.pi
+"""Planners turn continuous joints this far either way [rad]: they begin within half a turn, and end at most a
+turn from there. The joints themselves have no limits."""
 MIMIC_SLACK = 1e-6
 """How far a value given for a joint that follows another one may be from where that one puts it."""
 VARIANTS = 256
@@ -42,7 +45,7 @@ class Joint:
     axis: Float[ndarray, "3"]
     """Unit axis in the joint frame."""
     lower: float = 0.0
-    """[rad] or [m]; -pi for a continuous joint."""
+    """[rad] or [m]; for a continuous joint what planners work within, minus `TURNS`."""
     upper: float = 0.0
     velocity: float = 0.0
     """[rad/s] or [m/s]"""
@@ -165,6 +168,16 @@ class Robot:
     @cached_property
     def prismatic(self) -> tuple[bool, ...]:
         return tuple(joint.kind == "prismatic" for joint in self.planned_joints)
+
+    @cached_property
+    def continuous(self) -> Bool[ndarray, "dof"]:
+        """Which joints turn without limits, so that values a turn apart are the same."""
+        return np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool)
+
+    def turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
+        """The whole turns of continuous joints in configurations [rad]: less these, they are within half a
+        turn."""
+        return np.where(self.continuous, 2 * np.pi * np.round(q / (2 * np.pi)), 0.0)
 
     @cached_property
     def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], list[ndarray]]:

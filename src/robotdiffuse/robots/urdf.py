@@ -1,7 +1,6 @@
 """Reading a serial arm from a URDF file."""
 
 import hashlib
-import math
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,9 +12,9 @@ from numpy import ndarray
 from scipy.spatial import ConvexHull, QhullError
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.robots.groups import JointTree, named_arm, one_arm
+from robotdiffuse.robots.groups import passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.packages import Packages, urdf_text
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Mimic, Robot, following
+from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
 from robotdiffuse.robots.srdf import Srdf
 from robotdiffuse.transforms import inverse, rotation_from_rpy, transform
 
@@ -64,7 +63,7 @@ def read_urdf(
         raise unknown_name(f"base link in {tree.path.name}", base, tree.links)
     joints = tree.below(base)
     names = [base, *(joint.child for joint in joints)]
-    planned, end = _planned(tree, base, joints, tip, group, srdf)
+    planned, end = planned_joints(tree.path, base, joints, tip, group, srdf)
     meshes = tree.geometry(names)
     robot = Robot(
         name=tree.name,
@@ -72,7 +71,7 @@ def read_urdf(
         tip=end,
         joints=tuple(joints),
         meshes={link: parts for link, parts in meshes.items() if parts},
-        notes=tuple(tree.notes),
+        notes=(*tree.notes, *passive_notes(srdf, joints)),
         root=tree.root,
         above=tree.above(base),
         poses={} if srdf is None else dict(srdf.poses),
@@ -88,71 +87,8 @@ def read_urdf(
         raise InputError(
             f"{tree.path}: no movable joint between {base} and {end}; choose another --base or --tip"
         )
-    _refuse_linkages(tree, robot)
+    refuse_linkages(tree.path, robot)
     return robot
-
-
-def _planned(
-    tree: "_Tree", base: str, joints: list[Joint], tip: str | None, group: str | None, srdf: Srdf | None
-) -> tuple[set[str], str]:
-    """Names of the joints that are planned if they are not locked, and the tip."""
-    above = {joint.child: joint for joint in joints}
-    names = [base, *above]
-    known = [] if srdf is None else list(srdf.groups)
-    if tip is not None and tip not in names:
-        raise unknown_name(f"tip link below {base} in {tree.path.name}", tip, names)
-    chosen: list[str] | None = None
-    if group is not None and srdf is not None and group in srdf.groups:
-        members = srdf.joints(group, tuple(joints))
-        if not members:
-            raise InputError(f"{srdf.path}: group {group} has no movable joint below {base}")
-        chosen = [joint.name for joint in members]
-        tip = tip or srdf.tip(group, tuple(joints)) or members[-1].child
-    elif group is not None or tip is None:
-        arms = JointTree(base, joints).arms()
-        arm = one_arm(tree.path, arms, known) if group is None else named_arm(tree.path, arms, group, known)
-        tip = tip or (base if arm is None else arm.tip)
-    chain = [joint for joint in _chain(above, tip) if joint.kind in MOVING_KINDS]
-    off = [name for name in chosen or () if name not in {joint.name for joint in chain}]
-    if off:
-        raise InputError(
-            f"{tree.path}: group {group} is no single chain: {', '.join(off)} do not lead to {tip}; "
-            f"choose a group of one arm"
-        )
-    passive = frozenset() if srdf is None else srdf.passive
-    tree.notes += [f"joint {joint.name} is passive; it is held" for joint in chain if joint.name in passive]
-    return {
-        joint.name
-        for joint in chain
-        if joint.mimic is None and joint.name not in passive and (chosen is None or joint.name in chosen)
-    }, tip
-
-
-def _chain(above: dict[str, Joint], tip: str) -> list[Joint]:
-    """The joints that lead to a link, from the base on."""
-    chain: list[Joint] = []
-    while tip in above:
-        chain.append(above[tip])
-        tip = above[tip].parent
-    return chain[::-1]
-
-
-def _refuse_linkages(tree: "_Tree", robot: Robot) -> None:
-    """Joints that follow a planned one would move, and are held: refused if they move geometry."""
-    by_name = {joint.name: joint for joint in robot.joints}
-    above = {joint.child: joint for joint in robot.joints}
-    for joint in robot.joints:
-        leader = joint
-        while leader.mimic is not None:
-            leader = by_name[leader.mimic.joint]
-        if joint.mimic is None or leader.name in robot.locked:
-            continue
-        moved = [link for link in robot.meshes if joint in _chain(above, link)]
-        if moved or joint in _chain(above, robot.tip):
-            raise InputError(
-                f"{tree.path}: joint {joint.name} follows {leader.name}, which is planned; linkages are not "
-                f"supported: hold it with --lock {leader.name}=VALUE, or end the arm above it with --tip"
-            )
 
 
 def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
@@ -340,7 +276,7 @@ class _Tree:
                 text = limit.get(what, "")
                 given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit")[0])
         if joint.kind == "continuous":
-            given["lower"], given["upper"] = -math.pi, math.pi
+            given["lower"], given["upper"] = -TURNS, TURNS
         if "lower" not in given and "upper" not in given:
             raise InputError(
                 f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
