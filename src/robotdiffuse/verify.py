@@ -191,6 +191,7 @@ class Verifier:
 
     def _limits(self, q: ndarray, clock: ndarray) -> Violation | None:
         excess = np.maximum(self.robot.lower - q, q - self.robot.upper)
+        excess[:, self.robot.continuous] = 0.0
         bad = np.flatnonzero((excess > self.settings.limit_slack).any(axis=1))
         if not len(bad):
             return None
@@ -239,7 +240,9 @@ class Verifier:
     def _goal(self, end: ndarray, time: float) -> Violation | None:
         goal, settings = self.problem.goal, self.settings
         if isinstance(goal, JointGoal):
-            off = float(np.abs(goal.positions - end).max(axis=1).min(initial=np.inf))
+            differences = goal.positions - end
+            differences -= self.robot.turns(differences)
+            off = float(np.abs(differences).max(axis=1).min(initial=np.inf))
             if off <= settings.goal_tolerance:
                 return None
             message = f"the motion ends {off:.3g} from the nearest goal configuration (largest joint error)"

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.made_arms import chain, row, written
 from robotdiffuse.cli import main
 from robotdiffuse.cli.background_factory import filled_meanwhile
 from robotdiffuse.data.manifest import read_manifest, write_manifest
@@ -24,6 +25,8 @@ from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
 from robotdiffuse.planners import PLANNERS, planner_settings
 from robotdiffuse.results import PlanResult, load_result
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.allowed_collisions import SamplingSettings
 from robotdiffuse.types import Status
 
 ROOT = Path(__file__).parents[2]
@@ -353,6 +356,38 @@ def test_help_and_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--time-limit" in capsys.readouterr().out
     assert run("--version") == 0
     assert capsys.readouterr().out.startswith("robotdiffuse 0.")
+
+
+def test_robot_add_with_srdf_and_robot_list(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pairs that an SRDF or the command allows, the comparison with sampling, progress without a terminal."""
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    monkeypatch.setattr("robotdiffuse.robots.add.SamplingSettings", lambda: SamplingSettings(samples=100))
+    file = written(tmp_path, chain("base", row("j", 4), xyz="0 0 0.07", limits='lower="-3" upper="3"'))
+    pairs = ("base", "j4_link", "User"), ("base", "j3_link", "Never"), ("base", "j1_link", "Adjacent")
+    rows = (f'<disable_collisions link1="{a}" link2="{b}" reason="{why}"/>' for a, b, why in pairs)
+    (tmp_path / "made.srdf").write_text(f"<robot name='made'>{''.join(rows)}</robot>")
+
+    assert run("robot", "add", str(file), "--allow", "j1_link", "j4_link") == 0
+    told = capsys.readouterr()
+    assert "made.srdf sees differently" in told.out and "User" in told.out and "named 1" in told.out
+    assert "0 of 6: spheres of base" in told.err and "6 of 6: done" in told.err
+    allowed = load_robot("made").allowed_collisions
+    assert frozenset(("j1_link", "j4_link")) in allowed
+    assert frozenset(("base", "j4_link")) not in allowed  # found beside: compared, not taken
+
+    given = ("--srdf", str(tmp_path / "made.srdf"), "--name", "by_srdf")
+    assert run("robot", "add", str(file), *given) == 0
+    capsys.readouterr()
+    assert frozenset(("base", "j4_link")) in load_robot("by_srdf").allowed_collisions
+    assert run("robot", "add", str(file), "--allow", "base", "moon") == 2
+    assert "unknown link in allow 'moon'" in capsys.readouterr().err
+
+    assert run("robot", "list") == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in ("panda", "made", "by_srdf"))
+    assert len(repr(load_robot("panda")).splitlines()) <= 10
 
 
 def test_robot_info(capsys: pytest.CaptureFixture[str]) -> None:

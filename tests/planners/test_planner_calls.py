@@ -1,5 +1,7 @@
 """What a call of a planner notes on the way: shorter and shorter paths, and what the judge refused."""
 
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -85,3 +87,16 @@ def test_compiling_takes_no_time_of_the_call_and_is_noted() -> None:
     assert counted < 0.5 * waited
     [note] = call.fail(Status.TIMEOUT, "").notes
     assert "compiled for" in note and "does not count" in note
+
+
+def test_a_solved_call_imports_no_toppra_and_no_matplotlib() -> None:
+    """toppra, which imports matplotlib, once cost the first call over a second; it is for who selects it."""
+    code = (
+        "import sys, numpy as np, robotdiffuse as rd\n"
+        f"start = np.array({START.tolist()})\n"
+        "problem = rd.Problem(rd.load_robot('panda'), rd.Scene([]), start, start + 0.2)\n"
+        "assert rd.plan(problem, time_limit=10.0).solved\n"
+        "print([name for name in ('toppra', 'matplotlib') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.strip() == "[]", done.stdout + done.stderr

@@ -10,6 +10,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.learning.weights_at_hand import comes_with_package
 from robotdiffuse.planners.aorrtc.planner import AORRTCSettings
 from robotdiffuse.planners.aorrtc.search import SLICE, AnytimeSearch
 from robotdiffuse.planners.diffusion import encode
@@ -204,6 +205,14 @@ def test_the_guidance_scale_reaches_the_network():
         for scale in (1.0, 1.0, 3.0)
     )
     assert np.array_equal(plain, same) and np.abs(strong - plain).max() > 0.01
+
+
+def test_locked_joints_that_the_network_does_not_know_keep_the_weights():
+    """Fingers at another opening; an arm joint that is held leaves the network fewer joints."""
+    for opening in (0.0, 0.065):
+        robot = load_robot("panda", locked={"panda_finger_joint1": opening})
+        assert comes_with_package("model", robot) and RobotDiffuse().model(robot) is not None
+    assert not comes_with_package("model", load_robot("panda", locked={"panda_joint7": 0.3}))
 
 
 def test_settings_and_weights_are_checked(tmp_path):

@@ -1,5 +1,7 @@
 """RRT-Connect: every solution is verified, ends are exact, the same seed gives the same path."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.simplify import shortcut
+from robotdiffuse.planners import ends
 from robotdiffuse.planners.aorrtc import kernel
 from robotdiffuse.planners.ends import retreat
 from robotdiffuse.planners.rrt_connect import RRTConnect, RRTConnectSettings
@@ -120,6 +123,22 @@ def test_retreat_from_contact_of_the_spheres():
     lead = retreat(checker, READY)
     assert lead is not None and checker.free(lead[None])[0]
     assert np.abs(lead - READY).max() < 0.3
+
+
+@pytest.mark.parametrize("end", ["start", "goal"])
+def test_ends_too_close_to_contact_name_link_obstacle_and_depth(end, monkeypatch):
+    """Free by the meshes, not by the spheres, and no way out: once a timeout at once that named nothing."""
+    ahead = link_pose(PANDA, READY, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
+    radii = np.arange(0.1, 0.05, -0.0002)
+    scenes = (Scene([Sphere(ahead, radius, name="ball")]) for radius in radii)
+    scene = next(scene for scene in scenes if explain_collision(PANDA, scene, READY) is None)
+    monkeypatch.setattr(ends, "RETREAT_STEPS", 1)
+    rows = (READY, LEFT) if end == "start" else (LEFT, READY)
+    result = RRTConnect().plan(Problem(PANDA, scene, rows[0], rows[1]))
+    assert result.status is (Status.INVALID_START if end == "start" else Status.INVALID_GOAL)
+    told = re.search(r"spheres of (\w+) reach ([\d.]+) mm into ball, .* are ([\d.]+) mm apart", result.reason)
+    assert told and told[1].startswith("panda_") and result.reason.startswith(f"the {end} is too close")
+    assert float(told[2]) > 0 and float(told[3]) >= 0
 
 
 def test_start_in_collision_names_link_and_obstacle():

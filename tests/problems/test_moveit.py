@@ -191,6 +191,60 @@ def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_pat
     assert isinstance(shape, Sphere) and shape.center.tolist() == [1, 0, 0]
 
 
+def place(data: dict[str, Any], robot: Robot | None = None) -> list[float]:
+    [shape] = moveit_scene(data, moveit_frames(data, robot), Path()).shapes
+    assert isinstance(shape, Sphere)
+    return shape.center.round(9).tolist()
+
+
+def at(frame: str, **more: object) -> dict[str, Any]:
+    pose = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
+    return scene_data(**ball(header={"frame_id": frame}, primitive_poses=[pose])) | more
+
+
+def state(frame: str, *translations: list[float]) -> dict[str, Any]:
+    transforms = [{"translation": xyz, "rotation": [0, 0, 0, 1]} for xyz in translations]
+    floating = {"header": {"frame_id": frame}, "joint_names": ["virtual"], "transforms": transforms}
+    return {"robot_state": {"multi_dof_joint_state": floating}}
+
+
+def test_scene_in_a_frame_that_the_robot_is_placed_in(tmp_path: Path) -> None:
+    """Objects in `odom`, where multi_dof_joint_state says that the root stands; `world` is then unknown."""
+    robot = mounted(tmp_path, "fixed")
+    base_in_root = np.array([1, 2, 0.8])
+    turn = rotation_about(Z, np.pi / 2).T
+    expected = (turn @ (-np.array([3.0, 0, 0]) - base_in_root)).round(9).tolist()
+    for frame in ("odom", "/odom", ""):
+        assert place(at(frame, **state("odom", [3, 0, 0])), robot) == expected
+    panda = load_robot("panda")
+    with pytest.raises(InputError, match=r"unknown frame_id of header: 'world'; known: odom, panda_link0"):
+        place(at("world", **state("odom", [3, 0, 0])), panda)
+    for named in ("world", "panda_link0", ""):
+        assert place(at("world", **state(named, [3, 0, 0])), panda) == [-3, 0, 0]
+    with pytest.raises(InputError, match="has 2 transforms; it must have one"):
+        place(at("world", **state("odom", [3, 0, 0], [0, 0, 0])), panda)
+
+
+def test_links_of_the_robot_are_frames_where_they_stand(tmp_path: Path) -> None:
+    """Also a link called world that is not the root; a file cannot place a link of the robot anew."""
+    text = MOUNTED.format(kind="fixed").replace(
+        '<link name="world"/>',
+        """<link name="map"/><link name="world"/><link name="camera"/>
+        <joint name="on" type="fixed"><parent link="map"/><child link="world"/><origin xyz="0 0 7"/></joint>
+        <joint name="eye" type="fixed"><parent link="base"/><child link="camera"/>
+        <origin xyz="0 0 1"/></joint>""",
+    )
+    (tmp_path / "arm.urdf").write_text(text)
+    robot = read_urdf(tmp_path / "arm.urdf", base="base")
+    assert place(at("camera"), robot) == [0, 0, 1]
+    assert place(at("world"), robot) == [-2, 1, -0.8]
+    assert place(at(""), robot) == [-2, 1, -7.8]
+    fixed = {"transform": {"translation": [9, 9, 9], "rotation": [0, 0, 0, 1]}, "child_frame_id": "stand"}
+    assert place(at("stand", fixed_frame_transforms=[fixed]), robot) == [0, 0, -0.3]
+    with pytest.raises(InputError, match=r"unknown frame_id of header: 'arm'; known: base, camera, map"):
+        place(at("arm"), robot)
+
+
 def test_pose_of_the_object_alone_is_enough() -> None:
     entry = ball(pose={"position": [0, 0, 2], "orientation": [0, 0, 0, 1]})
     del entry["primitive_poses"]

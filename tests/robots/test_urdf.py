@@ -16,7 +16,7 @@ from robotdiffuse.robots.add import add_robot
 from robotdiffuse.robots.allowed_collisions import SamplingSettings
 from robotdiffuse.robots.bundle import read_bundle, read_source, write_bundle
 from robotdiffuse.robots.limits import read_limits, with_limits
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import TURNS, Robot
 from robotdiffuse.robots.sphere_fitting import covered
 from robotdiffuse.robots.urdf import content_hash, read_urdf
 
@@ -55,8 +55,8 @@ def test_joints_limits_and_geometry(tmp_path: Path) -> None:
     robot = read_urdf(urdf(tmp_path))
     assert (robot.name, robot.base, robot.tip) == ("tiny", "base", "fore")
     assert robot.joint_names == ("turn", "bend")
-    np.testing.assert_allclose(robot.lower, [-2, -np.pi])
-    np.testing.assert_allclose(robot.upper, [1, np.pi])
+    np.testing.assert_allclose(robot.lower, [-2, -TURNS])
+    np.testing.assert_allclose(robot.upper, [1, TURNS])
     np.testing.assert_allclose(robot.velocity, [1.5, 1.0])
     np.testing.assert_allclose(robot.acceleration, [6, 4])
     np.testing.assert_allclose(robot.jerk, [60, 40])
@@ -75,8 +75,7 @@ def test_gripper_is_left_out_and_locked(tmp_path: Path) -> None:
     robot = read_urdf(urdf(tmp_path, ARM.replace("</robot>", GRIPPER)))
     assert robot.tip == "palm"
     assert robot.joint_names == ("turn", "bend")
-    assert robot.locked == {"grip": 0.01, "grip2": 0.0}
-    assert any("grip2" in note for note in robot.notes)
+    assert robot.locked == {"grip": 0.01, "grip2": 0.01}
     robot = read_urdf(urdf(tmp_path, ARM.replace("</robot>", GRIPPER)), locked={"grip": 0.03, "turn": 0.5})
     assert robot.joint_names == ("bend",) and robot.locked["grip"] == 0.03
 

@@ -43,6 +43,14 @@ def assignment(text: str) -> tuple[str, float]:
     return name, value
 
 
+def folder(text: str) -> tuple[str, str]:
+    """NAME=FOLDER."""
+    name, _, path = text.partition("=")
+    if not name or not path:
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=FOLDER")
+    return name, path
+
+
 def not_negative(text: str) -> float:
     """A finite number of at least 0."""
     value = _number(text)

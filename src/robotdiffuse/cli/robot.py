@@ -1,15 +1,19 @@
 """robotdiffuse robot info, robotdiffuse robot add"""
 
 import argparse
+import sys
+from collections import Counter
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import assignment, natural
+from robotdiffuse.cli.arguments import assignment, folder, natural
+from robotdiffuse.errors import InputError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from robotdiffuse.robots.robot import Robot
+    from robotdiffuse.robots.add import AddReport
+    from robotdiffuse.robots.robot import Joint, Robot
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -17,6 +21,13 @@ def add(commands: argparse._SubParsersAction) -> None:
         "robot", help="show or prepare a robot", description="Show a robot, or prepare one for planning."
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
+
+    listing = actions.add_parser(
+        "list",
+        help="the robots that problems can name",
+        description="List the bundled robots and those that were added.",
+    )
+    listing.set_defaults(run=run_list)
 
     info = actions.add_parser(
         "info", help="joints, limits and collision model", description="Show what is known of a robot."
@@ -30,9 +41,12 @@ def add(commands: argparse._SubParsersAction) -> None:
         description="Fit covering spheres to the collision meshes of a URDF and find the pairs of links that "
         "need no check; write it all to a folder that problems can name.",
     )
-    make.add_argument("urdf", metavar="URDF", help="URDF file of a serial arm")
+    make.add_argument("urdf", metavar="URDF", help="URDF or xacro file of an arm")
     make.add_argument("--name", metavar="NAME", help="name that problems use (default: the URDF's)")
     make.add_argument("--out", metavar="FOLDER", help="where to write it (default: the user's robots)")
+    make.add_argument(
+        "--group", metavar="NAME", help="group of the SRDF, or arm, that is planned (default: the only arm)"
+    )
     make.add_argument("--base", metavar="LINK", help="first link of the arm (default: the root)")
     make.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where a gripper begins)")
     make.add_argument(
@@ -44,11 +58,53 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="hold a joint at a value [rad or m]; repeatable",
     )
     make.add_argument(
+        "--srdf",
+        metavar="FILE",
+        help="SRDF with groups, poses, passive joints and pairs of links to allow (default: groups, poses "
+        "and passive joints of the one beside the URDF)",
+    )
+    make.add_argument(
+        "--allow",
+        nargs=2,
+        action="append",
+        default=[],
+        metavar=("LINK", "LINK"),
+        help="two links that need no check against each other; repeatable",
+    )
+    make.add_argument(
+        "--package",
+        type=folder,
+        action="append",
+        default=[],
+        metavar="NAME=FOLDER",
+        help="where a package:// is (default: ROS_PACKAGE_PATH, AMENT_PREFIX_PATH, upwards of the URDF)",
+    )
+    make.add_argument(
         "--limits", metavar="FILE", help="joint limits in the form of MoveIt's joint_limits.yaml"
     )
     make.add_argument("--licence", metavar="TEXT", help="licence of the URDF's geometry, kept as a note")
     make.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
     make.set_defaults(run=run_add)
+
+
+def run_list(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.evaluation.tables import Column, Table, show
+    from robotdiffuse.learning.weights_at_hand import comes_with_package
+    from robotdiffuse.robots import known_robots, load_robot
+
+    rows = []
+    for name, place in known_robots().items():
+        try:
+            robot = load_robot(name)
+        except InputError as error:
+            rows.append((name, None, None, None, "", str(error)))
+            continue
+        spheres = sum(len(part) for part in robot.spheres.values())
+        weights = "yes" if comes_with_package("model", robot) else "no"
+        rows.append((name, robot.dof, spheres, len(robot.checked_pairs()), weights, str(place)))
+    columns = ("robot", "joints", "spheres", "checked pairs", "weights", Column("folder", left=True))
+    show(Table.of("", columns, rows))
+    return 0
 
 
 def run_info(arguments: argparse.Namespace) -> int:
@@ -68,6 +124,13 @@ def run_add(arguments: argparse.Namespace) -> int:
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("reading")
+
+        def progress(what: str, step: int, steps: int) -> None:
+            if console.is_terminal:
+                bar.update(task, description=what, completed=step, total=steps)
+            else:
+                print(f"{step} of {steps}: {what}", file=sys.stderr, flush=True)
+
         report = add_robot(
             arguments.urdf,
             name=arguments.name,
@@ -78,16 +141,34 @@ def run_add(arguments: argparse.Namespace) -> int:
             out=arguments.out,
             licence=arguments.licence or "see the URDF",
             seed=arguments.seed,
-            progress=lambda what, step, steps: bar.update(
-                task, description=what, completed=step, total=steps
-            ),
+            group=arguments.group,
+            srdf=arguments.srdf,
+            allow=[tuple(pair) for pair in arguments.allow],
+            packages=dict(arguments.package),
+            progress=progress,
         )
     columns = ("link", "spheres", Column("sticking out", "mm", ".1f", scale=1e3), "covered")
     rows = [(of.link, of.spheres, of.stick_out, "yes" if of.covered else "no") for of in report.links]
     show(Table.of("", columns, rows))
+    _print_pairs(report)
     print_robot(report.robot)
     print(f"wrote {report.folder}")
     return 0
+
+
+def _print_pairs(report: "AddReport") -> None:
+    """How many pairs of links are allowed for which reason, and where the SRDF sees it otherwise."""
+    from robotdiffuse.evaluation.tables import Column, Table, show
+
+    reasons = Counter(pair.reason for pair in report.pairs)
+    counted = ", ".join(f"{reason} {count}" for reason, count in sorted(reasons.items()))
+    show(Table.pairs("", [("pairs of links", counted)]))
+    if report.srdf is None:
+        return
+    columns = ("link", "link", "by sampling", Column("colliding", "%", ".1f", scale=100.0), "by the SRDF")
+    rows = [(*pair.links, pair.sampled, pair.colliding, pair.srdf) for pair in report.differences]
+    title = f"pairs that {report.srdf.name} sees differently"
+    show(Table.of(title, columns, rows) if rows else Table.pairs("", [(title, "none")]))
 
 
 def print_robot(robot: "Robot") -> None:
@@ -95,9 +176,7 @@ def print_robot(robot: "Robot") -> None:
     from robotdiffuse.transforms import inverse
 
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
-    joints = [
-        (j.name, j.kind, j.lower, j.upper, j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints
-    ]
+    joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]
     spheres = sum(len(rows) for rows in robot.spheres.values())
     meshes = sum(len(pieces) for pieces in robot.meshes.values())
     pairs = [("base, tip", f"{robot.base}, {robot.tip}")]
@@ -112,6 +191,10 @@ def print_robot(robot: "Robot") -> None:
         *(("note", note) for note in robot.notes),
     ]
     show(Table.of(robot.name, columns, joints), Table.pairs("", pairs))
+
+
+def _range(joint: "Joint") -> tuple[float | None, float | None]:
+    return (None, None) if joint.kind == "continuous" else (joint.lower, joint.upper)
 
 
 def _place(T: "Float[ndarray, '4 4']") -> str:

@@ -5,13 +5,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import explain_collision
+from robotdiffuse.collision.exact import ExactCollision, explain_collision
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.planners.call import Call
 from robotdiffuse.problems.problem import JointGoal, PoseGoal
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Status
 
 GOAL_COUNT = 10
@@ -21,22 +22,27 @@ END_MARGIN = 0.0005
 RETREAT_STEP = 0.01
 """Step of the way out of contact of the covering spheres [rad]."""
 RETREAT_STEPS = 100
+BEYOND_ENDS = np.pi / 2
+"""How far a continuous joint may turn beyond start and goals in a search [rad]."""
 
 
 class Ends:
-    """Start and goals that the spheres call free, with the ends near contact that they stand for."""
+    """Start and goals that the spheres call free, with the ends near contact that they stand for.
+
+    A continuous joint begins within half a turn here; `complete` adds the whole turns that it really has. A
+    goal stands for its images, see `images`.
+    """
 
     def __init__(self, checker: CollisionChecker, start: ndarray, goals: ndarray) -> None:
+        robot = self._robot = checker.robot
         self.checker = checker
-        self.start, self.start_lead = start, retreat(checker, start)
-        leads = [(retreat(checker, goal), goal) for goal in goals]
+        self._turns = robot.turns(start)
+        self.start = start - self._turns
+        self.start_lead = retreat(checker, self.start)
+        ways = [image for goal in goals for image in images(robot, self.start, goal)]
+        leads = [(retreat(checker, image), image) for image in ways]
         self.goals = [goal for lead, goal in leads if lead is not None]
         self.goal_leads = [lead for lead, _ in leads if lead is not None]
-
-    @property
-    def reachable(self) -> bool:
-        """Whether a search can begin and end."""
-        return self.start_lead is not None and bool(self.goals)
 
     def rows(self) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
         """Where a search begins and where it may end, in float32."""
@@ -58,11 +64,18 @@ class Ends:
         start, goals = self.rows()
         ends = np.concatenate([start[None], goals])
         if clearance <= 0:
-            return search_space(self.checker, resolution)
+            return self._within(search_space(self.checker, resolution), ends)
         has = self.checker.link_clearances(ends).min(axis=1, initial=1.0)
         close = has < clearance + END_MARGIN
         near = np.column_stack([ends[close], np.maximum(has[close] - END_MARGIN, 0.0)])
-        return search_space(self.checker, resolution, clearance, near)
+        return self._within(search_space(self.checker, resolution, clearance, near), ends)
+
+    def _within(self, space: Space, ends: Float[ndarray, "k dof"]) -> Space:
+        """The space with continuous joints kept within BEYOND_ENDS of what the ends take up."""
+        turning = self._robot.continuous
+        lower = np.where(turning, np.maximum(space.lower, ends.min(axis=0) - BEYOND_ENDS), space.lower)
+        upper = np.where(turning, np.minimum(space.upper, ends.max(axis=0) + BEYOND_ENDS), space.upper)
+        return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
     def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
         """The path with its exact ends in float64 in place of, or before and after, those of the search."""
@@ -75,7 +88,24 @@ class Ends:
             rows.insert(2, self.goal_leads[i][None])
         if not np.array_equal(self.start_lead, self.start):
             rows.insert(1, self.start_lead[None])
-        return np.concatenate(rows)
+        return np.concatenate(rows) + self._turns if self._turns.any() else np.concatenate(rows)
+
+
+def images(
+    robot: Robot, start: Float[ndarray, "dof"], goal: Float[ndarray, "dof"]
+) -> list[Float[ndarray, "dof"]]:
+    """The values that stand for a goal in joint space, where continuous joints do not wrap.
+
+    First those nearest to the start, then those with one of the continuous joints the other way round: an
+    obstacle may block the short way.
+    """
+    nearest = goal - robot.turns(goal - start)
+    found = [nearest]
+    for j in np.flatnonzero(robot.continuous):
+        other = nearest.copy()
+        other[j] -= np.copysign(2 * np.pi, nearest[j] - start[j])
+        found.append(other)
+    return found
 
 
 def usable_ends(call: Call) -> Ends | PlanResult:
@@ -89,8 +119,13 @@ def usable_ends(call: Call) -> Ends | PlanResult:
     if isinstance(goals, PlanResult):
         return goals
     ends = Ends(checker, call.problem.start, goals)
-    if not ends.reachable:
-        return call.unsolved("the start or every goal touches an obstacle too closely to plan from")
+    if ends.start_lead is None:
+        why = closeness(checker, call.problem.start)
+        return call.fail(Status.INVALID_START, f"the start is too close to contact to plan from: {why}")
+    if not ends.goals:
+        what = "the goal is" if len(goals) == 1 else f"all {len(goals)} goal configurations are"
+        why = closeness(checker, goals[0])
+        return call.fail(Status.INVALID_GOAL, f"{what} too close to contact to plan to: {why}")
     return ends
 
 
@@ -110,6 +145,21 @@ def retreat(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> Float[ndarra
             return None
         at = np.clip(at - RETREAT_STEP * gradient / norm, robot.lower, robot.upper)
     return None
+
+
+def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
+    """Where the covering spheres touch deepest, in words, for a configuration that the meshes call free."""
+    clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
+    worst = int(clearances.argmin())
+    link, other = [*((link, None) for link in checker.links), *checker.pairs][worst]
+    exact = ExactCollision(checker.robot, checker.scene)
+    check = [frozenset(check) for check in exact.checks].index(frozenset((link, other)))
+    [distance], [obstacle] = exact.nearest(q[None], np.array([check]), np.array([np.inf]))
+    spheres = str(obstacle) if other is None else f"those of {other}"
+    return (
+        f"the covering spheres of {link} reach {-1e3 * float(clearances[worst]):.1f} mm into {spheres}, "
+        f"though the meshes are {1e3 * float(distance):.1f} mm apart"
+    )
 
 
 def _usable_goals(call: Call, checker: CollisionChecker) -> Float[ndarray, "k dof"] | PlanResult:

@@ -202,7 +202,8 @@ def _moveit_problem(scene_file: Path, robot: Robot | None) -> Problem:
 
 
 def _requested(robot: Robot, scene: Scene, request: MoveItRequest, clearance: float | None = None) -> Problem:
-    held = {j.name for j in robot.joints if j.kind in MOVING_KINDS} - {*robot.joint_names}
+    held = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
+    held -= {*robot.joint_names}
     locked = {name: value for name, value in request.start.items() if name in held}
     robot = robot.with_locked(locked)
 

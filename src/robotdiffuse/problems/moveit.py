@@ -47,10 +47,10 @@ def read_moveit_scene(file: str | Path, robot: Robot | None = None) -> Scene:
     """The collision objects of a planning scene, in the frame of the robot's base.
 
     Where the root of the robot's URDF stands is taken from robot_state.multi_dof_joint_state, where its base
-    is from there from the robot (None: base and root are one), frames from fixed_frame_transforms. The
-    allowed collision matrix is not used: the robot brings its own. Raises InputError, naming file and
-    object, for a missing or damaged file, unknown frames, and shapes without a counterpart (cone, plane,
-    octomap).
+    is from there from the robot (None: base and root are one), frames from fixed_frame_transforms and from
+    the links that stand still with the base. The allowed collision matrix is not used: the robot brings its
+    own. Raises InputError, naming file and object, for a missing or damaged file, unknown frames, and shapes
+    without a counterpart (cone, plane, octomap).
     """
     data = read_yaml(file)
     try:
@@ -62,23 +62,30 @@ def read_moveit_scene(file: str | Path, robot: Robot | None = None) -> Scene:
 class MoveItFrames(dict[str, ndarray]):
     """T_base_frame of the frames that objects of a planning scene may be given in; '' is the scene's own.
 
-    A frame that is not there raises InputError, which says what is known, or why the place of the robot's
-    base in the scene is not.
+    These are the scene's own frame, the frames that the file defines, and the links that fixed joints connect
+    with the robot's base. A frame that is not there raises InputError, which says what is known, or why the
+    place of the robot's base in the scene is not.
     """
 
-    def __init__(self, robot: Robot | None, T_world_root: Float[ndarray, "4 4"]) -> None:
-        super().__init__({} if robot is None else robot.above | {robot.base: np.eye(4)})
+    def __init__(
+        self, robot: Robot | None, T_own_root: Float[ndarray, "4 4"], own: tuple[str, ...] = ("", "world")
+    ) -> None:
+        """`own` are the names of the scene's own frame, T_own_root is where the URDF's root stands in it."""
+        super().__init__({} if robot is None else robot.above | robot.fixed_below)
+        self.links = frozenset(self)
+        """Frames of the robot, which a file cannot place anew."""
         T_base_root = np.eye(4) if robot is None else robot.T_base_root
         self.lost = ""
         """Why the scene's own frame is not known; empty if it is."""
         if T_base_root is not None:
-            self[""] = self["world"] = T_base_root @ inverse(T_world_root)
+            T_base_own = T_base_root @ inverse(T_own_root)
+            self.update({name: T_base_own for name in own if name not in self.links})
         elif robot is not None:
             self.lost = f"a joint moves {robot.base} in {robot.root}"
 
     def of(self, where: str, entry: dict[str, Any]) -> Float[ndarray, "4 4"]:
         """T_base_frame of the frame that the header of an entry names."""
-        name = _mapping(f"{where}.header", entry.get("header")).get("frame_id") or ""
+        name = str(_mapping(f"{where}.header", entry.get("header")).get("frame_id") or "").removeprefix("/")
         if name in self:
             return self[name]
         known = [frame for frame in self if frame]
@@ -91,22 +98,33 @@ class MoveItFrames(dict[str, ndarray]):
 
 
 def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
-    """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`."""
+    """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`.
+
+    The scene's own frame is the one that robot_state.multi_dof_joint_state places the robot in, `world` if it
+    says none. Raises InputError if it places more than the robot's root, which one transform does.
+    """
     state = _mapping("robot_state", _mapping("a planning scene", data).get("robot_state"))
     _refuse_attached(state)
     floating = _mapping("multi_dof_joint_state", state.get("multi_dof_joint_state"))
     transforms = _list("multi_dof_joint_state.transforms", floating.get("transforms"))
-    T_world_root = np.eye(4)
+    T_own_root = np.eye(4)
+    if len(transforms) > 1:
+        raise InputError(
+            f"multi_dof_joint_state has {len(transforms)} transforms; it must have one, of the robot's root"
+        )
     if transforms:
-        T_world_root = _pose("multi_dof_joint_state.transforms[0]", transforms[0], "translation", "rotation")
-    frames = MoveItFrames(robot, T_world_root)
+        T_own_root = _pose("multi_dof_joint_state.transforms[0]", transforms[0], "translation", "rotation")
+    header = _mapping("multi_dof_joint_state.header", floating.get("header"))
+    named = str(header.get("frame_id") or "").removeprefix("/")
+    root = "" if robot is None else robot.root or robot.base
+    frames = MoveItFrames(robot, T_own_root, ("", "world" if named in ("", root) else named))
     fixed = _list("fixed_frame_transforms", _mapping("a planning scene", data).get("fixed_frame_transforms"))
     for i, entry in enumerate(fixed):
         where = f"fixed_frame_transforms[{i}]"
         entry = _mapping(where, entry)
-        child = str(entry.get("child_frame_id", ""))
+        child = str(entry.get("child_frame_id", "")).removeprefix("/")
         T = _pose(f"{where}.transform", entry.get("transform"), "translation", "rotation")
-        if not frames.lost and (robot is None or child != robot.base):
+        if not frames.lost and child not in frames.links:
             frames[child] = frames.of(where, entry) @ T
     return frames
 

@@ -3,7 +3,6 @@
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, no_type_check
@@ -79,10 +78,10 @@ class PoseGoal:
 class Problem:
     """`goal` may be given as a configuration, a list of them, a JointGoal or a PoseGoal.
 
-    Values up to `LIMIT_SLACK` beyond a joint limit are clamped and continuous joints are wrapped into
-    [-pi, pi], each with a note. Raises InputError for everything else that no planner could work with:
-    wrong lengths, values that are not finite or out of limits, a goal frame that the robot does not move.
-    Collisions of start and goal are found by the planners.
+    Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note; those of continuous joints are
+    kept as they are, and whole turns of a goal do not matter. Raises InputError for everything else that no
+    planner could work with: wrong lengths, values that are not finite or out of limits, a goal frame that the
+    robot does not move. Collisions of start and goal are found by the planners.
     """
 
     robot: Robot
@@ -162,11 +161,7 @@ def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float
     if not np.isfinite(value):
         raise InputError(f"{field}: {joint.name} is {value}; it must be a finite number [{unit}]")
     if joint.kind == "continuous":
-        if abs(value) <= np.pi:
-            return float(value)
-        wrapped = math.remainder(value, 2 * math.pi)
-        notes.append(f"{field}: {joint.name} wrapped from {float(value)!r} to {wrapped!r} rad")
-        return wrapped
+        return float(value)
     within = float(np.clip(value, joint.lower, joint.upper))
     if abs(value - within) > LIMIT_SLACK:
         raise InputError(

@@ -38,7 +38,7 @@ def _by_name(name: str) -> Robot:
         return _read(DATA / name, None)
     added = _added()
     if name not in added:
-        raise unknown_name("robot", name, [*ROBOTS, *added])
+        raise unknown_name("robot", name, known_robots())
     return _read(added[name], name)
 
 
@@ -65,6 +65,11 @@ def _read_state(folder: Path, source: str | None, *_states: tuple[int, int, int]
 def _digest(folder: Path, _state: tuple[int, int, int] | None) -> str | None:
     """Of the URDF that the robot in a folder was made from."""
     return read_source(folder).get("sha256")
+
+
+def known_robots() -> dict[str, Path]:
+    """Folders of the bundled robots and of those that were added, by the names that problems use."""
+    return _added() | {name: DATA / name for name in ROBOTS}
 
 
 def _added() -> dict[str, Path]:

@@ -2,14 +2,17 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.robots.allowed_collisions import (
+    BY_SRDF,
+    CHECKED,
+    NAMED,
     PairReport,
     SamplingSettings,
     allowed_pairs,
@@ -20,7 +23,8 @@ from robotdiffuse.robots.interfaces import face_allowances, stick_out_of_arm
 from robotdiffuse.robots.limits import read_limits, with_limits
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
-from robotdiffuse.robots.urdf import content_hash, read_urdf
+from robotdiffuse.robots.srdf import Srdf, read_srdf, srdf_beside
+from robotdiffuse.robots.urdf import content_hash, read_urdf, robot_name
 
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, the number of the step and the number of steps."""
@@ -40,6 +44,19 @@ class LinkReport:
 
 
 @dataclass(frozen=True)
+class PairDifference:
+    """Two links that sampling and an SRDF see differently."""
+
+    links: tuple[str, str]
+    sampled: str
+    """The reason by sampling, or checked."""
+    colliding: float
+    """Share of the configurations in which the meshes collide."""
+    srdf: str
+    """The SRDF's reason, or checked."""
+
+
+@dataclass(frozen=True)
 class AddReport:
     """What `add_robot` made."""
 
@@ -48,6 +65,10 @@ class AddReport:
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
     seconds: float
+    srdf: Path | None = None
+    """The SRDF that was given, or found beside the URDF."""
+    differences: tuple[PairDifference, ...] = ()
+    """Where sampling and the SRDF differ."""
 
     @property
     def sphere_count(self) -> int:
@@ -76,24 +97,38 @@ def add_robot(
     sampling: SamplingSettings | None = None,
     seed: int = 0,
     progress: Progress | None = None,
+    group: str | None = None,
+    srdf: str | Path | None = None,
+    allow: Sequence[tuple[str, str]] = (),
+    packages: dict[str, str | Path] | None = None,
 ) -> AddReport:
     """Read a URDF (see read_urdf), fit spheres, find allowed collisions, write the robot folder.
 
     `name` defaults to the URDF's; `out`, the folder, to `user_robots() / name`; `limits` is a file in the
     form of MoveIt's joint_limits.yaml. The same input and seed give the same robot. Raises InputError for
     bad input.
+
+    Groups, poses and passive joints are those of `srdf`, or of the SRDF found beside the URDF. Pairs of links
+    that need no check are found by sampling and compared with the SRDF's; a given `srdf` allows its pairs
+    too, one that was found does not. `allow` are further pairs.
     """
     begin = time.perf_counter()
     report = progress or (lambda what, step, steps: None)
-    robot = read_urdf(urdf, base, tip, locked)
+    semantics, found = _semantics(urdf, srdf, packages)
+    robot = read_urdf(urdf, base, tip, locked, group, semantics, packages)
+    for link in {link for pair in allow for link in pair} - {*robot.link_names}:
+        raise unknown_name("link in allow", link, robot.link_names)
     name = name or robot.name
     if not name or Path(name).name != name or name.startswith("."):
-        raise InputError(f"robot name is {name!r}; it must be usable as the name of a folder")
+        raise InputError(f"robot name is {name!r}; it must be usable as a folder's name: give --name NAME")
     robot = replace(robot, name=name)
     if limits is not None:
         robot = with_limits(robot, read_limits(limits))
     if not robot.meshes:
-        raise InputError(f"{urdf}: no link has collision geometry; nothing could be checked")
+        raise InputError(
+            f"{urdf}: no link has collision geometry, nor a visual one that could stand for it; nothing "
+            f"could be checked: give its links <collision> elements"
+        )
     settings = spheres or SphereSettings()
     steps = len(robot.meshes) + 1
     fitted, links = {}, []
@@ -108,9 +143,37 @@ def add_robot(
     report("pairs of links", steps - 1, steps)
     robot = replace(robot, spheres=fitted)
     pairs = find_allowed_collisions(robot, sampling or SamplingSettings(), np.random.default_rng(seed))
+    known = {} if semantics is None else semantics.allowed
+    differences = tuple(
+        PairDifference(pair.links, pair.reason, pair.colliding, known.get(frozenset(pair.links), CHECKED))
+        for pair in pairs
+        if semantics is not None and (pair.reason == CHECKED) == (frozenset(pair.links) in known)
+    )
+    pairs = _also_allowed(pairs, {frozenset(pair) for pair in allow}, NAMED)
+    pairs = _also_allowed(pairs, set(known) if srdf is not None else set(), BY_SRDF)
     robot = replace(robot, allowed_collisions=allowed_pairs(pairs))
     folder = user_robots() / name if out is None else Path(out)
-    source = {"urdf": Path(urdf).name, "sha256": content_hash(urdf), "licence": licence}
+    source = {"urdf": Path(urdf).name, "sha256": content_hash(urdf, packages), "licence": licence}
     write_bundle(robot, folder, source)
     report("done", steps, steps)
-    return AddReport(read_bundle(folder), folder, tuple(links), pairs, time.perf_counter() - begin)
+    seconds = time.perf_counter() - begin
+    return AddReport(read_bundle(folder), folder, tuple(links), pairs, seconds, found, differences)
+
+
+def _semantics(
+    urdf: str | Path, srdf: str | Path | None, packages: dict[str, str | Path] | None
+) -> tuple[Srdf | None, Path | None]:
+    """What the given SRDF says, or the one beside the URDF, and which one it is."""
+    if srdf is not None:
+        return read_srdf(srdf), Path(srdf)
+    found = srdf_beside(urdf, robot_name(urdf, packages))
+    return (None, None) if found is None else (read_srdf(found), found)
+
+
+def _also_allowed(
+    pairs: tuple[PairReport, ...], allowed: set[frozenset[str]], reason: str
+) -> tuple[PairReport, ...]:
+    return tuple(
+        replace(pair, reason=reason) if pair.reason == CHECKED and frozenset(pair.links) in allowed else pair
+        for pair in pairs
+    )

@@ -16,6 +16,8 @@ from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
 from robotdiffuse.transforms import rotation_about
 
 ADJACENT, ALWAYS, NEVER, DEFAULT, CHECKED = "adjacent", "always", "never", "default", "checked"
+NAMED, BY_SRDF = "named", "srdf"
+"""Reasons from outside: the pair was named by who adds the robot, or an SRDF allows it."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class PairReport:
 
     links: tuple[str, str]
     reason: str
-    """adjacent, always, never or default (allowed), or checked."""
+    """adjacent, always, never, default, named or srdf (allowed), or checked."""
     colliding: float
     """Share of the configurations in which the meshes collide."""
 
@@ -153,7 +155,7 @@ class _Links:
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
-        self.joints = [joint for joint in robot.joints if joint.kind in MOVING_KINDS]
+        self.joints = [j for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None]
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
         self.hulls = {link: [coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
@@ -165,12 +167,19 @@ class _Links:
 
     def poses(self, q: Float[ndarray, "n d"]) -> dict[str, Float[ndarray, "n 4 4"]]:
         """T_base_link by link."""
-        column = {joint.name: i for i, joint in enumerate(self.joints)}
+        values = {joint.name: q[:, i] for i, joint in enumerate(self.joints)}
+
+        def value(joint: Joint) -> Float[ndarray, "n"]:
+            if joint.mimic is None:
+                return values[joint.name]
+            return joint.mimic.multiplier * value(by_name[joint.mimic.joint]) + joint.mimic.offset
+
+        by_name = {joint.name: joint for joint in self.robot.joints}
         poses = {self.robot.base: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
         for joint in self.robot.joints:
             T = poses[joint.parent] @ joint.T_parent_joint
-            if joint.name in column:
-                T = T @ _motions(joint.axis, joint.kind == "prismatic", q[:, column[joint.name]])
+            if joint.kind in MOVING_KINDS:
+                T = T @ _motions(joint.axis, joint.kind == "prismatic", value(joint))
             poses[joint.child] = T
         return poses
 

@@ -11,11 +11,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
+from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
 FORMAT = 2
 """2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""
+WHOLE_TURN = 6.283
+"""A continuous joint whose limits are narrower than this is revolute [rad]: older files may hold some."""
 ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
@@ -78,6 +80,7 @@ def _to_json(robot: Robot, source: dict[str, str]) -> dict:
         "root": robot.root or robot.base,
         "above": {link: _pose_to_json(T_base_link) for link, T_base_link in robot.above.items()},
         "locked": robot.locked,
+        "poses": robot.poses,
         "joints": [_joint_to_json(joint) for joint in robot.joints],
         "spheres": {link: np.round(spheres, 6).tolist() for link, spheres in robot.spheres.items()},
         "allowed_collisions": sorted(sorted(pair) for pair in robot.allowed_collisions),
@@ -95,6 +98,8 @@ def _joint_to_json(joint: Joint) -> dict:
     }
     if joint.kind in MOVING_KINDS:
         data |= {"axis": joint.axis.tolist()} | {name: getattr(joint, name) for name in LIMITS}
+    if joint.mimic is not None:
+        data["mimic"] = list(joint.mimic)
     return data
 
 
@@ -151,6 +156,10 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
         notes=tuple(map(str, data["notes"])),
         root=str(data["root"]),
         above={str(link): _pose_from_json(pose, f"above: {link}") for link, pose in data["above"].items()},
+        poses={
+            str(name): {str(joint): float(value) for joint, value in pose.items()}
+            for name, pose in data.get("poses", {}).items()
+        },
     )
 
 
@@ -165,19 +174,16 @@ def _joint_from_json(data: dict) -> Joint:
     lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
     if not lower <= upper or not min(velocity, acceleration, jerk) > 0:
         raise ValueError(f"joint {name}: limits")
-    return Joint(
-        name,
-        kind,
-        str(data["parent"]),
-        str(data["child"]),
-        T,
-        axis,
-        lower,
-        upper,
-        velocity,
-        acceleration,
-        jerk,
-    )
+    if kind == "continuous" and upper - lower < WHOLE_TURN:
+        kind = "revolute"
+    elif kind == "continuous":
+        lower, upper = -TURNS, TURNS
+    mimic = None
+    if "mimic" in data:
+        master, multiplier, offset = data["mimic"]
+        mimic = Mimic(str(master), float(multiplier), float(offset))
+    ends, limits = (str(data["parent"]), str(data["child"])), (lower, upper, velocity, acceleration, jerk)
+    return Joint(name, kind, *ends, T, axis, *limits, mimic)
 
 
 def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:

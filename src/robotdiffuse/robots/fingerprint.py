@@ -27,6 +27,8 @@ def robot_fingerprint(robot: Robot) -> str:
     for joint in robot.joints:
         limits = [getattr(joint, name) for name in LIMITS]
         add([joint.name, joint.kind, joint.parent, joint.child], joint.T_parent_joint, joint.axis, limits)
+        if joint.mimic is not None:
+            add(joint.mimic.joint, joint.mimic[1:])
     for link in sorted(robot.spheres):
         add(link, robot.spheres[link])
     for link in sorted(robot.meshes):

@@ -44,7 +44,9 @@ def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
             above, T_above_parent = through.parent, through.T_parent_joint @ T_above_parent
         if link not in (above, joint.child) or not {above, joint.child} <= set(robot.meshes):
             continue
-        values = np.linspace(joint.lower, joint.upper, ANGLES) if joint.kind in MOVING_KINDS else [0.0]
+        turn = joint.kind == "continuous"
+        ends = (-np.pi, np.pi) if turn else (joint.lower, joint.upper)
+        values = np.linspace(*ends, ANGLES) if joint.kind in MOVING_KINDS else [0.0]
         T = np.stack([T_above_parent @ joint.T_parent_joint @ joint.motion(float(q)) for q in values])
         other = joint.child if link == above else above
         found.append(Neighbour(other, T if link == above else np.stack([inverse(t) for t in T])))

@@ -47,7 +47,8 @@ def read_limits(file: str | Path) -> dict[str, dict[str, float]]:
 
 
 def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
-    """The robot with other limits; acceleration and jerk follow a new velocity unless they are given too."""
+    """The robot with other limits; acceleration and jerk follow a new velocity unless they are given too. A
+    continuous joint that is given a position is revolute from then on, within half a turn either way."""
     movable = {joint.name: joint for joint in robot.joints if joint.kind in MOVING_KINDS}
     for name in limits:
         if name not in movable:
@@ -84,6 +85,8 @@ def _changed(joint: Joint, fields: dict[str, float]) -> Joint:
         fields = fields | {"acceleration": ACCELERATION_PER_VELOCITY * fields["velocity"]}
     if "acceleration" in fields and "jerk" not in fields:
         fields = fields | {"jerk": JERK_PER_ACCELERATION * fields["acceleration"]}
+    if joint.kind == "continuous" and {"lower", "upper"} & fields.keys():
+        joint = replace(joint, kind="revolute", lower=-math.pi, upper=math.pi)
     lower, upper = fields.get("lower", joint.lower), fields.get("upper", joint.upper)
     if lower > upper:
         raise InputError(f"joint_limits of {joint.name}: min_position {lower} is above max_position {upper}")

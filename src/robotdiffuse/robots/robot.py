@@ -3,20 +3,33 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache, wraps
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
+TURNS = 3 * np.pi
+"""Planners turn continuous joints this far either way [rad]: they begin within half a turn, and end at most a
+turn from there. The joints themselves have no limits."""
+MIMIC_SLACK = 1e-6
+"""How far a value given for a joint that follows another one may be from where that one puts it."""
 VARIANTS = 256
 """Robots with joints locked at values that are kept, the last ones used: about 0.1 MB each."""
 
 T = TypeVar("T")
+
+
+class Mimic(NamedTuple):
+    """How a joint follows another one: its value is multiplier * the other's + offset."""
+
+    joint: str
+    multiplier: float = 1.0
+    offset: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,12 +45,14 @@ class Joint:
     axis: Float[ndarray, "3"]
     """Unit axis in the joint frame."""
     lower: float = 0.0
-    """[rad] or [m]; -pi for a continuous joint."""
+    """[rad] or [m]; for a continuous joint what planners work within, minus `TURNS`."""
     upper: float = 0.0
     velocity: float = 0.0
     """[rad/s] or [m/s]"""
     acceleration: float = 0.0
     jerk: float = 0.0
+    mimic: Mimic | None = None
+    """The joint that this one follows, held as that one is."""
 
     def motion(self, q: float) -> Float[ndarray, "4 4"]:
         """T_joint_child for the joint value q."""
@@ -56,7 +71,7 @@ class ConvexMesh:
     faces: Int[ndarray, "f 3"]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Robot:
     """A serial arm: the joints between base and tip that are not locked are planned.
 
@@ -85,6 +100,8 @@ class Robot:
     above: dict[str, Float[ndarray, "4 4"]] = field(default_factory=dict)
     """T_base_link of the links above the base that fixed joints connect with it, the root among them unless a
     joint moves the base about."""
+    poses: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Named poses of an SRDF, values by joint [rad] or [m]."""
     source: str | None = None
     """The file or the name that `load_robot` got, unless bundled: how problem files name the robot."""
 
@@ -96,6 +113,15 @@ class Robot:
     def T_base_root(self) -> Float[ndarray, "4 4"] | None:
         """Where the URDF's root is seen from the base; None if a movable joint lies between them."""
         return np.eye(4) if self.root in ("", self.base) else self.above.get(self.root)
+
+    @cached_property
+    def fixed_below(self) -> dict[str, Float[ndarray, "4 4"]]:
+        """T_base_link of the base and of the links that fixed joints alone connect with it."""
+        found = {self.base: np.eye(4)}
+        for joint in self.joints:
+            if joint.kind == "fixed" and joint.parent in found:
+                found[joint.child] = found[joint.parent] @ joint.T_parent_joint
+        return found
 
     @cached_property
     def planned_joints(self) -> tuple[Joint, ...]:
@@ -144,6 +170,16 @@ class Robot:
         return tuple(joint.kind == "prismatic" for joint in self.planned_joints)
 
     @cached_property
+    def continuous(self) -> Bool[ndarray, "dof"]:
+        """Which joints turn without limits, so that values a turn apart are the same."""
+        return np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool)
+
+    def turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
+        """The whole turns of continuous joints in configurations [rad]: less these, they are within half a
+        turn."""
+        return np.where(self.continuous, 2 * np.pi * np.round(q / (2 * np.pi)), 0.0)
+
+    @cached_property
     def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], list[ndarray]]:
         links: dict[str, tuple[int, ndarray]] = {self.base: (0, np.eye(4))}
         offsets: list[ndarray] = []
@@ -188,16 +224,24 @@ class Robot:
     def with_locked(self, locked: dict[str, float]) -> "Robot":
         """The same robot with some joints held at values (a planned joint may be named too).
 
-        Raises InputError for an unknown or fixed joint or a value that is not finite. Values beyond the
-        URDF's limits are accepted: gripper openings in published problems exceed them.
+        Joints that mimic others follow them. Raises InputError for an unknown or fixed joint, a value that is
+        not finite, or one of a mimic joint that its master does not say. Values beyond the URDF's limits are
+        accepted: gripper openings in published problems exceed them.
         """
-        movable = [joint.name for joint in self.joints if joint.kind in MOVING_KINDS]
+        movable = {joint.name: joint for joint in self.joints if joint.kind in MOVING_KINDS}
         for name, value in locked.items():
             if name not in movable:
                 raise unknown_name("joint in locked", name, movable)
             if not np.isfinite(value):
                 raise InputError(f"locked: {name} is {value}; it must be a finite number")
-        held = self.locked | {name: float(value) for name, value in locked.items()}
+        held = following(self.joints, self.locked | {name: float(value) for name, value in locked.items()})
+        for name, value in locked.items():
+            mimic = movable[name].mimic
+            if mimic is not None and abs(held[name] - value) > MIMIC_SLACK:
+                raise InputError(
+                    f"locked: {name} is {value:g}; it follows {mimic.joint}, which puts it at "
+                    f"{held[name]:g}; lock {mimic.joint}"
+                )
         return _variant(self.unlocked, tuple(sorted(held.items()))) if held != self.locked else self
 
     @property
@@ -205,9 +249,42 @@ class Robot:
         """The robot that `with_locked` made this one of; itself if it was not made so."""
         return self.__dict__.get("_unlocked", self)
 
+    def __repr__(self) -> str:
+        def row(values: ndarray) -> str:
+            return ", ".join(f"{value:.4g}" for value in values)
+
+        joints = ", ".join(self.joint_names)
+        spheres = sum(len(rows) for rows in self.spheres.values())
+        held = ", ".join(f"{name} = {value:g}" for name, value in list(self.locked.items())[:6])
+        more = f" and {len(self.locked) - 6} more" if len(self.locked) > 6 else ""
+        lines = [
+            f"Robot {self.name!r}: {self.dof} planned joints from {self.base} to {self.tip}",
+            f"  joints  {joints}",
+            f"  lower   {row(self.lower)}",
+            f"  upper   {row(self.upper)}",
+            f"  locked  {held}{more}" if held else "",
+            f"  {spheres} spheres on {len(self.spheres)} of {len(self.link_names)} links, "
+            f"{len(self.checked_pairs())} checked pairs of links",
+            f"  {len(self.notes)} notes: robot.notes" if self.notes else "",
+        ]
+        return "\n".join(line for line in lines if line)
+
     def __getstate__(self) -> dict[str, Any]:
         """What is pickled: the robot, and nothing that was compiled for it."""
         return {f.name: getattr(self, f.name) for f in fields(self)}
+
+
+def following(joints: tuple[Joint, ...], locked: dict[str, float]) -> dict[str, float]:
+    """The values of locked joints, with those that follow a locked one where it puts them."""
+    by_name = {joint.name: joint for joint in joints}
+
+    def value(name: str) -> float | None:
+        mimic = by_name[name].mimic if name in by_name else None
+        led = None if mimic is None else value(mimic.joint)
+        return locked.get(name) if mimic is None or led is None else mimic.multiplier * led + mimic.offset
+
+    values = {name: value(name) for name in (*locked, *(joint.name for joint in joints if joint.mimic))}
+    return {name: number for name, number in values.items() if number is not None}
 
 
 @lru_cache(maxsize=VARIANTS)

@@ -1,7 +1,6 @@
 """Reading a serial arm from a URDF file."""
 
 import hashlib
-import math
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,7 +12,10 @@ from numpy import ndarray
 from scipy.spatial import ConvexHull, QhullError
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
+from robotdiffuse.robots.groups import passive_notes, planned_joints, refuse_linkages
+from robotdiffuse.robots.packages import Packages, urdf_text
+from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
+from robotdiffuse.robots.srdf import Srdf
 from robotdiffuse.transforms import inverse, rotation_from_rpy, transform
 
 KINDS = (*MOVING_KINDS, "fixed")
@@ -23,8 +25,6 @@ ACCELERATION_PER_VELOCITY = 4.0
 """URDF has no acceleration limit: full speed after a quarter of a second [1/s]."""
 JERK_PER_ACCELERATION = 10.0
 """Nor one for jerk: full acceleration after a tenth of a second [1/s]."""
-GRIPPER_DEPTH = 3
-"""A branching is a gripper's if no path below it has more movable joints than this."""
 HULL_NOTE = 1.05
 """Hulls larger than their mesh by more than this factor are noted."""
 
@@ -34,55 +34,60 @@ def read_urdf(
     base: str | None = None,
     tip: str | None = None,
     locked: dict[str, float] | None = None,
+    group: str | None = None,
+    srdf: Srdf | None = None,
+    packages: dict[str, str | Path] | None = None,
 ) -> Robot:
-    """A robot from a URDF file, with convex collision meshes and without spheres.
+    """A robot from a URDF or xacro file, with convex collision meshes and without spheres.
 
     `base` is the root of the tree by default; where it stands in the root's frame is kept, for scenes that
-    are given there, while links above it are left out. The default tip: from the base, follow the subtree
-    with the most movable joints in a row, as far as the link where the gripper branches off (two or more
-    subtrees with movable joints, none with more than three in a row); without a gripper, on to the deepest
-    link. So it is panda_hand for a Panda with fingers. Movable joints off the chain from base to tip are
-    locked, at zero clipped into their limits unless `locked` names another value; joints on the chain may be
-    locked too.
+    are given there, while links above it are left out. `group` names a group of the SRDF, or an arm by what
+    the names of its joints begin with; `tip` a link. Without both, the robot must have one arm: from the base
+    as far as the link where a gripper or a hand begins (`robots.groups` tells how these are known), else to
+    the deepest link. So it is panda_hand for a Panda with fingers.
+
+    Planned are the movable joints of the group, or all from base to tip; less passive ones and those that
+    mimic others. All other joints are locked: at what `locked` says, in a pose of the SRDF, or at zero
+    clipped into their limits; mimic joints where the joint that they follow puts them.
 
     Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity and 10 / s times the
     acceleration (see limits.py to set them). Collision elements become convex hulls in the link's frame;
-    cylinders and spheres become polyhedra around them. Mimic joints count as independent, with a note.
+    cylinders, capsules and spheres become polyhedra around them. If no link has any, visual ones are taken,
+    with a note. `packages` are folders of packages by name, see `robots.packages`.
 
     Raises InputError, one line that names the file, for anything missing or contradictory in it.
     """
-    tree = _Tree(Path(path))
+    tree = _Tree(Path(path), packages or {})
     base = base or tree.root
     if base not in tree.links:
         raise unknown_name(f"base link in {tree.path.name}", base, tree.links)
     joints = tree.below(base)
     names = [base, *(joint.child for joint in joints)]
-    if tip is None:
-        tip = _default_tip(base, joints)
-    elif tip not in names:
-        raise unknown_name(f"tip link below {base} in {tree.path.name}", tip, names)
-    meshes = {link: tree.meshes(link) for link in names}
+    planned, end = planned_joints(tree.path, base, joints, tip, group, srdf)
+    meshes = tree.geometry(names)
     robot = Robot(
         name=tree.name,
         base=base,
-        tip=tip,
+        tip=end,
         joints=tuple(joints),
         meshes={link: parts for link, parts in meshes.items() if parts},
-        notes=tuple(tree.notes),
+        notes=(*tree.notes, *passive_notes(srdf, joints)),
         root=tree.root,
         above=tree.above(base),
+        poses={} if srdf is None else dict(srdf.poses),
     )
-    on_chain = {joint.name for joint in robot.planned_joints if joint.lower < joint.upper}
+    resting = {} if srdf is None else srdf.resting()
     rest = {
-        joint.name: float(np.clip(0.0, joint.lower, joint.upper))
+        joint.name: float(np.clip(resting.get(joint.name, 0.0), joint.lower, joint.upper))
         for joint in joints
-        if joint.kind in MOVING_KINDS and joint.name not in on_chain
+        if joint.kind in MOVING_KINDS and (joint.name not in planned or joint.lower == joint.upper)
     }
-    robot = replace(robot, locked=rest).with_locked(locked or {})
+    robot = replace(robot, locked=following(robot.joints, rest)).with_locked(locked or {})
     if robot.dof == 0:
         raise InputError(
-            f"{tree.path}: no movable joint between {base} and {tip}; choose another base or tip"
+            f"{tree.path}: no movable joint between {base} and {end}; choose another --base or --tip"
         )
+    refuse_linkages(tree.path, robot)
     return robot
 
 
@@ -100,34 +105,20 @@ def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
     return ConvexMesh(vertices, faces)
 
 
-def content_hash(path: str | Path) -> str:
-    """SHA-256 of a URDF file and of the collision meshes it names: equal if the robot is."""
-    tree = _Tree(Path(path))
-    digest = hashlib.sha256(tree.path.read_bytes())
+def robot_name(path: str | Path, packages: dict[str, str | Path] | None = None) -> str:
+    """What a URDF or xacro file calls its robot."""
+    return _Tree(Path(path), packages or {}).name
+
+
+def content_hash(path: str | Path, packages: dict[str, str | Path] | None = None) -> str:
+    """SHA-256 of a URDF, compiled if it is a xacro file, and of the collision meshes it names: equal if the
+    robot is."""
+    tree = _Tree(Path(path), packages or {})
+    digest = hashlib.sha256(tree.text)
     for element in tree.links.values():
-        for mesh in element.findall("collision/geometry/mesh"):
-            digest.update(tree.resolve(mesh.get("filename", "")).read_bytes())
+        for mesh in element.findall(f"{tree.kind}/geometry/mesh"):
+            digest.update(tree.packages.file(mesh.get("filename", "")).read_bytes())
     return digest.hexdigest()
-
-
-def _default_tip(base: str, joints: list[Joint]) -> str:
-    children: dict[str, list[Joint]] = {}
-    for joint in joints:
-        children.setdefault(joint.parent, []).append(joint)
-    moving: dict[str, int] = {}
-    depth: dict[str, int] = {}
-    for joint in reversed(joints):
-        child, parent = joint.child, joint.parent
-        steps = int(joint.kind in MOVING_KINDS)
-        moving[parent] = max(moving.get(parent, 0), moving.get(child, 0) + steps)
-        depth[parent] = max(depth.get(parent, 0), depth.get(child, 0) + 1)
-    link = base
-    while link in children:
-        ways = {j.child: moving.get(j.child, 0) + (j.kind in MOVING_KINDS) for j in children[link]}
-        if sum(way > 0 for way in ways.values()) > 1 and max(ways.values()) <= GRIPPER_DEPTH:
-            break
-        link = max(ways, key=lambda child: (ways[child], depth.get(child, 0)))
-    return link
 
 
 @dataclass
@@ -135,19 +126,27 @@ class _Tree:
     """The links and joints of one URDF file, checked as they are read."""
 
     path: Path
+    folders: dict[str, str | Path]
+    """Of packages by name."""
     notes: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        self.packages = Packages(self.path, self.folders)
+        self.text = urdf_text(self.path, self.packages)
         try:
-            root = ET.parse(self.path).getroot()
-        except OSError as error:
-            raise InputError(f"cannot read the URDF {self.path}: {error.strerror}") from None
+            root = ET.fromstring(self.text)
         except ET.ParseError as error:
             raise InputError(f"{self.path} is not well-formed XML: {error}") from None
         if root.tag != "robot":
-            raise InputError(f"{self.path} is not a URDF: its root element is <{root.tag}>, not <robot>")
+            raise InputError(
+                f"{self.path} is not a URDF: its root element is <{root.tag}>, not <robot>; "
+                f"convert other formats to URDF first"
+            )
         self.name = root.get("name") or self.path.stem
         self.links = {self._name(link, "link"): link for link in root.findall("link")}
+        solid = any(link.find("collision") is not None for link in self.links.values())
+        self.kind = "collision" if solid else "visual"
+        """The elements of links that are their geometry."""
         self.elements = {self._name(joint, "joint"): joint for joint in root.findall("joint")}
         self.parents: dict[str, str] = {}
         """The joint above each link but the root."""
@@ -156,13 +155,17 @@ class _Tree:
             parent, child = self._end(name, element, "parent"), self._end(name, element, "child")
             if child in self.parents:
                 raise InputError(
-                    f"{self.path}: link {child} has two parent joints ({self.parents[child]}, {name})"
+                    f"{self.path}: link {child} has two parent joints ({self.parents[child]}, {name}); a "
+                    f"URDF is a tree: leave one out, and let the joints that close the loop mimic others"
                 )
             self.parents[child] = name
             self.children.setdefault(parent, []).append(name)
         roots = [link for link in self.links if link not in self.parents]
         if len(roots) != 1:
-            raise InputError(f"{self.path}: a URDF has one root link, this one has {len(roots)}: {roots[:5]}")
+            raise InputError(
+                f"{self.path}: a URDF has one root link, this one has {len(roots)}"
+                + (f" ({', '.join(roots[:5])}); connect them with fixed joints" if roots else ": a loop")
+            )
         self.root = roots[0]
 
     def _name(self, element: ET.Element, what: str) -> str:
@@ -222,7 +225,11 @@ class _Tree:
         what = f"joint {name}"
         kind = element.get("type", "")
         if kind not in KINDS:
-            raise InputError(f"{self.path}: {what} has type {kind!r}; supported: {', '.join(KINDS)}")
+            child = self._end(name, element, "child")
+            raise InputError(
+                f"{self.path}: {what} has type {kind!r}; supported: {', '.join(KINDS)}; "
+                f"--base {child} plans what is on {child} as it stands"
+            )
         axis_element = element.find("axis")
         axis = np.array([1.0, 0.0, 0.0])
         if axis_element is not None and kind != "fixed":
@@ -230,8 +237,6 @@ class _Tree:
             if np.linalg.norm(axis) < 1e-6:
                 raise InputError(f"{self.path}: {what}: its axis is zero")
             axis = axis / np.linalg.norm(axis)
-        if element.find("mimic") is not None:
-            self.notes.append(f"{what} mimics another one; taken as independent")
         joint = Joint(
             name=name,
             kind=kind,
@@ -239,8 +244,30 @@ class _Tree:
             child=self._end(name, element, "child"),
             T_parent_joint=self._origin(element, what),
             axis=axis,
+            mimic=None if kind == "fixed" else self._mimic(name, element),
         )
         return joint if kind == "fixed" else self._with_limits(joint, element.find("limit"))
+
+    def _mimic(self, name: str, element: ET.Element) -> Mimic | None:
+        followed = element.find("mimic")
+        if followed is None:
+            return None
+        leaders, leader, last = [name], followed, followed
+        while leader is not None:
+            leaders.append(leader.get("joint", ""))
+            if leaders[-1] not in self.elements or leaders[-1] in leaders[:-1]:
+                raise InputError(
+                    f"{self.path}: joint {leaders[-2]} mimics {leaders[-1]!r}; it must be another joint of "
+                    f"the file that does not follow it"
+                )
+            last, leader = leader, self.elements[leaders[-1]].find("mimic")
+        if self.elements[leaders[-1]].get("type") == "fixed" or last is None:
+            self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; taken as independent")
+            return None
+        what = f"joint {name}: mimic"
+        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{what} multiplier")
+        offset = self._numbers(followed.get("offset", "0"), 1, f"{what} offset")
+        return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
 
     def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
         given: dict[str, float] = {}
@@ -249,7 +276,7 @@ class _Tree:
                 text = limit.get(what, "")
                 given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit")[0])
         if joint.kind == "continuous":
-            given["lower"], given["upper"] = -math.pi, math.pi
+            given["lower"], given["upper"] = -TURNS, TURNS
         if "lower" not in given and "upper" not in given:
             raise InputError(
                 f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
@@ -267,16 +294,29 @@ class _Tree:
             joint, lower=lower, upper=upper, velocity=velocity, acceleration=acceleration, jerk=jerk
         )
 
-    def meshes(self, link: str) -> tuple[ConvexMesh, ...]:
-        """Hulls of the link's collision elements, in its frame."""
+    def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
+        """Hulls of the links' collision elements by link, in its frame; of their visual ones if no link of
+        the file has any of the others."""
+        parts = {link: self._meshes(link) for link in links}
+        if self.kind == "visual" and any(parts.values()):
+            self.notes.append("no link has collision geometry; the visual geometry is taken")
+        elif any(parts.values()):
+            shown = [
+                link for link in links if not parts[link] and self.links[link].find("visual") is not None
+            ]
+            if shown:
+                self.notes.append(f"links without collision geometry are not checked: {', '.join(shown)}")
+        return parts
+
+    def _meshes(self, link: str) -> tuple[ConvexMesh, ...]:
         parts = []
-        for element in self.links[link].findall("collision"):
+        for element in self.links[link].findall(self.kind):
             geometry = element.find("geometry")
             shape = next(iter(geometry), None) if geometry is not None else None
             if shape is None:
-                raise InputError(f"{self.path}: link {link}: a <collision> has no geometry")
+                raise InputError(f"{self.path}: link {link}: a <{self.kind}> has no geometry")
             points = self._points(shape, link)
-            T = self._origin(element, f"link {link}: collision")
+            T = self._origin(element, f"link {link}: {self.kind}")
             parts.append(convex_hull(points @ T[:3, :3].T + T[:3, 3]))
         return tuple(parts)
 
@@ -291,9 +331,10 @@ class _Tree:
         if shape.tag == "box":
             return np.array(trimesh.creation.box(positive("size", 3)).vertices)
         if shape.tag == "sphere":
-            ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
-            inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
-            return np.array(ball.vertices) * positive("radius", 1) / inner
+            return _ball() * positive("radius", 1)
+        if shape.tag == "capsule":
+            ball, half = _ball() * positive("radius", 1), float(positive("length", 1)[0]) / 2
+            return np.concatenate([ball + np.array([0, 0, z]) for z in (-half, half)])
         if shape.tag == "cylinder":
             angle = np.arange(32) * np.pi / 16
             ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -302,10 +343,13 @@ class _Tree:
             return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
         if shape.tag == "mesh":
             return self._mesh_points(shape, link)
-        raise InputError(f"{self.path}: link {link}: collision shape <{shape.tag}> is not known")
+        raise InputError(
+            f"{self.path}: link {link}: {self.kind} shape <{shape.tag}> is not known; known: box, capsule, "
+            f"cylinder, mesh, sphere"
+        )
 
     def _mesh_points(self, shape: ET.Element, link: str) -> Float[ndarray, "n 3"]:
-        file = self.resolve(shape.get("filename", ""))
+        file = self.packages.file(shape.get("filename", ""))
         try:
             mesh = trimesh.load(file, force="mesh")
         except Exception as error:  # trimesh's readers raise whatever they meet
@@ -319,16 +363,9 @@ class _Tree:
         scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"link {link}: mesh scale")
         return hull.vertices * scale
 
-    def resolve(self, filename: str) -> Path:
-        """The file of a package://, file:// or relative name; packages are looked for upwards of the URDF."""
-        start = self.path.resolve().parent
-        name = filename.removeprefix("file://")
-        package = filename.startswith("package://")
-        if package:
-            name = filename.removeprefix("package://")
-        tails = [Path(name), Path(*Path(name).parts[1:])] if package else [Path(name)]
-        for folder in (start, *start.parents) if package else (start,):
-            for tail in tails:
-                if (folder / tail).is_file():
-                    return folder / tail
-        raise InputError(f"{self.path}: mesh file {filename!r} is not there (looked from {start} upwards)")
+
+def _ball() -> Float[ndarray, "n 3"]:
+    """A polyhedron about the unit ball."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+    inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
+    return np.array(ball.vertices) / inner

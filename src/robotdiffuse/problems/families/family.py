@@ -119,6 +119,7 @@ def uniform_configurations(
     found = np.zeros((0, robot.dof))
     for _ in range(BATCHES):
         q = rng.uniform(robot.lower, robot.upper, (BATCH, robot.dof))
+        q -= robot.turns(q)
         xyz = link_origins(robot, q, robot.tip)
         q = q[((xyz >= region[0]) & (xyz <= region[1])).all(axis=1)]
         found = np.concatenate([found, q[checker.free(q)] if len(q) else q])

@@ -1,0 +1,111 @@
+"""Files that a URDF names, in packages too, and the URDF that a xacro file stands for."""
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from robotdiffuse.errors import InputError
+
+MOST_PACKAGES = 32
+"""Packages of a xacro file that are looked for one after the other."""
+MISSING = re.compile(r"Package not found: (\S+)")
+"""What xacrodoc says of a package."""
+
+
+@dataclass(frozen=True)
+class Packages:
+    """Where the packages that a URDF names are looked for.
+
+    A package's folder is taken from `folders`, then from ROS_PACKAGE_PATH and AMENT_PREFIX_PATH, then it is
+    any folder from the URDF's upwards that has the file, with the package's name before it or without.
+    """
+
+    urdf: Path
+    folders: dict[str, str | Path]
+
+    def folder(self, name: str) -> Path | None:
+        """The folder of a package by option, environment, or its name upwards of the URDF."""
+        if name in self.folders:
+            return Path(self.folders[name])
+        ros, ament = _folders("ROS_PACKAGE_PATH"), _folders("AMENT_PREFIX_PATH")
+        start = self.urdf.resolve().parent
+        candidates = [
+            *(root for root in ros if root.name == name),
+            *(root / name for root in ros),
+            *(prefix / "share" / name for prefix in ament),
+            *(folder for folder in (start, *start.parents) if folder.name == name),
+            *(folder / name for folder in (start, *start.parents)),
+        ]
+        return next((folder for folder in candidates if folder.is_dir()), None)
+
+    def file(self, filename: str) -> Path:
+        """The file of a package://, file:// or relative name; InputError, with what helps, without."""
+        start = self.urdf.resolve().parent
+        if not filename.startswith("package://"):
+            found = start / filename.removeprefix("file://")
+            if found.is_file():
+                return found
+            raise InputError(
+                f"{self.urdf}: mesh file {filename!r} is not there; put it there, or take its element out"
+            )
+        package, _, rest = filename.removeprefix("package://").partition("/")
+        folder = self.folder(package)
+        upwards = [up / tail for up in (start, *start.parents) for tail in (f"{package}/{rest}", rest)]
+        candidates = [*([] if folder is None else [folder / rest]), *upwards]
+        for candidate in candidates:
+            if candidate.is_file():
+                return candidate
+        raise InputError(
+            f"{self.urdf}: mesh file {filename!r} is not there (looked from {start} upwards); say where the "
+            f"package is: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
+        )
+
+
+def _folders(variable: str) -> list[Path]:
+    return [Path(folder) for folder in os.environ.get(variable, "").split(os.pathsep) if folder]
+
+
+def urdf_text(path: Path, packages: Packages) -> bytes:
+    """The URDF in a file, or the one that a xacro file stands for, compiled by xacrodoc.
+
+    Raises InputError if it cannot be read or compiled, or for a xacro file without xacrodoc.
+    """
+    try:
+        text = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"cannot read the URDF {path}: {error.strerror}") from None
+    return _compiled(path, packages) if path.suffix == ".xacro" or b"<xacro:" in text else text
+
+
+def _compiled(path: Path, packages: Packages) -> bytes:
+    try:
+        from xacrodoc import XacroDoc
+        from xacrodoc import packages as known
+    except ImportError:
+        raise InputError(
+            f"{path} is a xacro file; install what compiles it, pip install 'robotdiffuse[xacro]', or "
+            f"compile it elsewhere: xacro {path.name} > {path.name.split('.')[0]}.urdf"
+        ) from None
+    known.reset()
+    known.update_package_cache(packages.folders)
+    for _ in range(MOST_PACKAGES):
+        try:
+            return XacroDoc.from_file(path.resolve(), resolve_packages=False).dom.toxml("utf-8")
+        except Exception as error:  # xacro raises whatever it meets, and wraps what was raised within it
+            why = " ".join(str(error).split())
+            missing = MISSING.search(why)
+            if missing is None:
+                raise InputError(
+                    f"{path}: xacro cannot compile it ({why}); compile it with its arguments: xacro "
+                    f"{path.name} NAME:=VALUE > {path.name.split('.')[0]}.urdf"
+                ) from None
+            name = missing[1]
+            folder = packages.folder(name)
+            if folder is None:
+                raise InputError(
+                    f"{path}: package {name!r} is not found; say where it is: --package {name}=FOLDER, or "
+                    f"ROS_PACKAGE_PATH"
+                ) from None
+            known.update_package_cache({name: folder})
+    raise InputError(f"{path}: it names more than {MOST_PACKAGES} packages")
