@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,7 +17,7 @@ from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.transforms import rotation_about, transform
 from robotdiffuse.types import Path, Trajectory
 from robotdiffuse.verify import (
@@ -197,7 +198,7 @@ def test_self_collision_between_waypoints() -> None:
 
 
 def meshes_asked(*shapes: Shape) -> int:
-    """How many distances of meshes it takes to judge the swing among these."""
+    """How many distances Coal is asked for to judge the swing among these."""
     asked: list[int] = []
 
     class Counting(ExactCollision):
@@ -213,11 +214,14 @@ def meshes_asked(*shapes: Shape) -> int:
 
 def test_meshes_decide_where_spheres_are_too_coarse() -> None:
     shelf = Box(vector(0.6, 0, -0.032 - 0.05), vector(1.5, 1.5, 0.1))
-    report = judge(SWING, shelf)
-    assert report.valid
-    assert meshes_asked(shelf) > 0
-    assert report.min_clearance is not None
-    assert 0.001 <= report.min_clearance <= 0.002
+    sides = trimesh.creation.box(shelf.size)
+    surface = Mesh(np.asarray(sides.vertices), np.asarray(sides.faces), shelf.center)
+    for shape, by_coal in ((shelf, False), (surface, True)):
+        report = judge(SWING, shape)
+        assert report.valid
+        assert bool(meshes_asked(shape)) == by_coal
+        assert report.min_clearance is not None
+        assert 0.001 <= report.min_clearance <= 0.002
     touching = Box(vector(0.6, 0, -0.03005 - 0.05), vector(1.5, 1.5, 0.1))
     assert refused(judge(SWING, touching), "scene_collision").time == 0
     assert judge(SWING[:1], touching, contact=1e-5).valid

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy import ndarray
 
-from robotdiffuse.collision.exact import describe_contact
+from robotdiffuse.collision.hulls import describe_contact
 from robotdiffuse.collision.motion import Contact, ContinuousCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import JointGoal, Problem

@@ -17,10 +17,19 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
+from robotdiffuse.collision.hulls import (
+    Check,
+    Part,
+    Solid,
+    checks_of,
+    describe_contact,
+    parts_of,
+    solids_of,
+)
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated
 from robotdiffuse.transforms import transform
 
 CHUNK = 8192
@@ -29,16 +38,6 @@ BEYOND = 1e-6
 """A positive distance [m]: `collides` need not know any that is larger."""
 MOST_CONTACTS = 200
 """Triangles or points of one obstacle that the depth of a link is looked for at; 1,000 take 5 ms."""
-
-
-class Check(NamedTuple):
-    """One thing to check: a link against the scene (`other` None), or two links against each other."""
-
-    link: str
-    other: str | None
-
-    def __str__(self) -> str:
-        return f"{self.link} against {self.other or 'the scene'}"
 
 
 class Distance(NamedTuple):
@@ -50,18 +49,16 @@ class Distance(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """A convex part of a link, in the coordinates of the frame that the link is fixed to."""
+    """A convex part of a link as Coal has it."""
 
     geometry: coal.CollisionGeometry
     frame: int
     T_frame_piece: Float[ndarray, "4 4"] | None
     """None: the geometry is in frame coordinates already."""
-    center: Float[ndarray, "3"]
-    radius: float
 
 
 class _Obstacle(NamedTuple):
-    """A scene shape and a box, rounded by `round`, that bounds it (exactly for sphere, box and capsule)."""
+    """A scene shape as Coal has it."""
 
     name: str
     geometry: coal.CollisionGeometry
@@ -70,9 +67,6 @@ class _Obstacle(NamedTuple):
     """A triangle mesh or points rather than a solid."""
     inflation: float
     """The radius of each point of a point cloud [m]."""
-    T_base_box: Float[ndarray, "4 4"]
-    half: Float[ndarray, "3"]
-    round: float
 
 
 def forward_frames(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n frames 4 4"]:
@@ -98,93 +92,59 @@ def _surface(vertices: ndarray, faces: ndarray) -> coal.BVHModelOBBRSS:
     return model
 
 
+def _piece(part: Part) -> _Piece:
+    if len(part.faces):
+        return _Piece(_convex(part.vertices, part.faces), part.frame, None)
+    return _Piece(coal.Sphere(part.rounding), part.frame, transform(part.center))
+
+
 @once_per_robot
 def _pieces(robot: Robot) -> dict[str, tuple[_Piece, ...]]:
-    """Convex parts of every link that has geometry."""
-    pieces: dict[str, tuple[_Piece, ...]] = {}
-    for link in robot.link_names:
-        frame, T = robot.link_frame(link), robot.T_frame_link(link)
-        parts: list[_Piece] = []
-        for mesh in robot.meshes.get(link, ()):
-            vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
-            center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-            radius = float(np.linalg.norm(vertices - center, axis=1).max())
-            parts.append(_Piece(_convex(vertices, mesh.faces), frame, None, center, radius))
-        if not parts:
-            for x, y, z, radius in robot.spheres.get(link, np.zeros((0, 4))).tolist():
-                center = T[:3, :3] @ np.array([x, y, z]) + T[:3, 3]
-                parts.append(_Piece(coal.Sphere(radius), frame, transform(center), center, radius))
-        if parts:
-            pieces[link] = tuple(parts)
-    return pieces
+    return {link: tuple(map(_piece, parts)) for link, parts in parts_of(robot).items()}
 
 
 @once_per_robot
 def _balls(robot: Robot) -> dict[str, tuple[int, ndarray, ndarray]]:
-    """Of the pieces of each link: its frame, and the centres [k, 3] and radii [k] of balls around them."""
+    """Of the parts of each link: its frame, and the centres [k, 3] and radii [k] of balls around them."""
     return {
         link: (parts[0].frame, np.stack([p.center for p in parts]), np.array([p.radius for p in parts]))
-        for link, parts in _pieces(robot).items()
+        for link, parts in parts_of(robot).items()
     }
-
-
-@once_per_robot
-def _checks(robot: Robot) -> tuple[tuple[str, ...], tuple[tuple[str, str], ...]]:
-    """The moving links, and the pairs of links that may not collide."""
-    links = list(_pieces(robot))
-    moving = tuple(link for link in links if robot.link_frame(link) > 0)
-    pairs = tuple(
-        (a, b)
-        for i, a in enumerate(links)
-        for b in links[i + 1 :]
-        if robot.link_frame(a) != robot.link_frame(b) and frozenset((a, b)) not in robot.allowed_collisions
-    )
-    return moving, pairs
 
 
 def _transform3(T: ndarray) -> coal.Transform3s:
     return coal.Transform3s(T[:3, :3], T[:3, 3])
 
 
-def _bounded(shape: Shape, vertices: ndarray, faces: ndarray, inflation: float) -> _Obstacle:
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
-    geometry, identity = _surface(vertices, faces), coal.Transform3s.Identity()
-    T_base_box = transform((low + high) / 2)
-    return _Obstacle(shape.name, geometry, identity, True, inflation, T_base_box, (high - low) / 2, inflation)
-
-
-def _obstacle(shape: Shape) -> _Obstacle | None:
-    """The Coal object of a shape; None for an empty point cloud."""
+def _obstacle(solid: Solid) -> _Obstacle:
+    """The Coal object of a shape."""
+    shape = solid.shape
     match shape:
         case Sphere():
-            T = transform(shape.center)
-            geometry, half, rounding = coal.Sphere(shape.radius), np.zeros(3), shape.radius
+            geometry = coal.Sphere(shape.radius)
         case Box():
-            T, half, rounding = pose(shape), shape.size / 2, 0.0
             geometry = coal.Box(*shape.size)
         case Cylinder():
-            T, half, rounding = pose(shape), np.array([shape.radius, shape.radius, shape.height / 2]), 0.0
             geometry = coal.Cylinder(shape.radius, shape.height)
         case Capsule():
-            T, half, rounding = pose(shape), np.array([0.0, 0.0, shape.height / 2]), shape.radius
             geometry = coal.Capsule(shape.radius, shape.height)
         case Triangulated():
-            return _bounded(shape, shape.mesh.world_vertices, shape.mesh.faces, 0.0)
+            geometry = _surface(shape.mesh.world_vertices, shape.mesh.faces)
         case PointCloud():
-            if len(shape.points) == 0:
-                return None
             # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
-            triangles = np.repeat(np.arange(len(shape.points))[:, None], 3, axis=1)
-            return _bounded(shape, shape.points, triangles, shape.point_radius)
+            geometry = _surface(shape.points, np.repeat(np.arange(len(shape.points))[:, None], 3, axis=1))
         case _:
             raise TypeError(f"no collision geometry for a {type(shape).__name__}")
-    return _Obstacle(shape.name, geometry, _transform3(T), False, 0.0, T, half, rounding)
+    # surfaces are given in the base frame
+    T = coal.Transform3s.Identity() if solid.bounds else _transform3(solid.T_base_box)
+    inflation = solid.rounding if solid.bounds else 0.0
+    return _Obstacle(shape.name, geometry, T, solid.bounds, inflation)
 
 
 @lru_cache(maxsize=16)
 def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
     """Kept for a few scenes: the tree over 100,000 points takes half a second."""
-    return tuple(o for o in map(_obstacle, scene.shapes) if o is not None)
+    return tuple(map(_obstacle, solids_of(scene)))
 
 
 @dataclass(frozen=True)
@@ -211,11 +171,11 @@ class ExactCollision:
     """Moving links against the scene, then the pairs of links."""
 
     def __init__(self, robot: Robot, scene: Scene) -> None:
-        self.robot = robot
-        self._pieces = _pieces(robot)
-        self._obstacles = _obstacles(scene)
-        self.links, self.pairs = _checks(robot)
-        self.checks = (*(Check(link, None) for link in self.links), *(Check(a, b) for a, b in self.pairs))
+        self.robot, self._solids = robot, solids_of(scene)
+        self._pieces, self._obstacles = _pieces(robot), _obstacles(scene)
+        self.checks = checks_of(robot)
+        self.links = tuple(check.link for check in self.checks if check.other is None)
+        self.pairs = tuple((a, b) for a, b in self.checks if b is not None)
         self._request = coal.DistanceRequest()
         self._request.enable_signed_distance = True
         self._first_contact, self._contacts = coal.CollisionRequest(), coal.CollisionRequest()
@@ -226,13 +186,12 @@ class ExactCollision:
     @cached_property
     def _boxes(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """Of the obstacles' boxes: R_box_base [o,3,3], centres [o,3], half sizes [o,3] and roundings [o]."""
-        T = np.stack([o.T_base_box for o in self._obstacles])
-        half = np.stack([o.half for o in self._obstacles])
+        T = np.stack([solid.T_base_box for solid in self._solids])
         return (
             np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),
             np.ascontiguousarray(T[:, :3, 3]),
-            half,
-            np.array([o.round for o in self._obstacles]),
+            np.stack([solid.half + solid.disc * np.array([1.0, 1.0, 0.0]) for solid in self._solids]),
+            np.array([solid.rounding for solid in self._solids]),
         )
 
     @cached_property
@@ -368,11 +327,3 @@ def explain_collision(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> s
     if worst is None or worst.distance > 0:
         return None
     return describe_contact(worst.link, str(worst.other), -worst.distance, worst.other in robot.link_names)
-
-
-def describe_contact(link: str, other: str, depth: float, itself: bool) -> str:
-    """'panda_link5 is 3.2 cm inside sphere_2', or for two links of the robot (`itself`) 'overlap by'."""
-    length = f"{depth * 100:.1f} cm" if depth >= 0.01 else f"{depth * 1000:.1f} mm"
-    if depth < 5e-5:
-        return f"{link} touches {other}"
-    return f"{link} and {other} overlap by {length}" if itself else f"{link} is {length} inside {other}"

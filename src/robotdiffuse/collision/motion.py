@@ -1,14 +1,17 @@
 """Collision of motions: the space that searches check them in, and the judge's certificate.
 
-The certificate says that a motion is free between its waypoints too, or where it first is not. While the
-joints move by dq, no point of link l moves further than sum_j rho[l, j] |dq_j| (`motion_radii`). So a piece
-of the motion is free for link l if its clearance at some configuration exceeds that bound from there to both
-ends; otherwise the piece is split. Of two links, the further one is seen from the nearer one, so only the
-joints between them count. Clearances come from the covering spheres, many configurations at once, and from
-the exact meshes where the spheres are too coarse.
+The certificate says that a motion is free between its waypoints too, or where it first is not. A piece of the
+motion is free for a link if a lower bound of its clearance along the piece is positive; otherwise the piece is
+split. The bound comes from the clearance in the piece's middle, the velocity there towards what is near, and a
+bound on what the arm's curved way can add (`kernels/sweep.py`). Of two links, the further one is seen from the
+nearer one, so only the joints between them count. Clearances are those of the covering spheres, many
+configurations at once (`kernels/swept_spheres.py`); where the spheres are too coarse, of the convex meshes, by
+planes that part them (`kernels/hulls.py`). Coal says the distances to surfaces and clouds of points, and whether
+bodies touch.
 """
 
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +20,11 @@ from numpy import ndarray
 
 from robotdiffuse.collision.arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.checker import CollisionChecker
-from robotdiffuse.collision.exact import Check, ExactCollision
+from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.collision.hulls import Check, checks_of, hulls_of, solid_arrays, solids_of
 from robotdiffuse.collision.kernels import sweep as kernel
 from robotdiffuse.collision.kernels.motions import Space
-from robotdiffuse.collision.kernels.sweep import CAP, PAIR, SCENE, Checks, Motion, Pieces
+from robotdiffuse.collision.kernels.sweep import CAP, PAIR, SCENE, Arm, Checks, Motion, Pieces, Round
 from robotdiffuse.robots.lever_arms import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
@@ -97,83 +101,88 @@ class ContinuousCollision:
         """Meshes nearer than `contact` [m] touch. Pieces are split until each certified clearance is at least
         the share `tightness`, in (0, 1), of the least one measured of its kind: to the scene, or between
         links."""
-        self.contact, self.tightness = contact, tightness
-        self.exact = ExactCollision(robot, scene)
-        self._robot_arrays, self._scene_arrays = compile_robot(robot), compile_scene_for(robot, scene)
-        self._checks = _known_to_spheres(robot, self.exact.checks)
-        self._levers = _check_levers(robot, self.exact.checks)
+        self.robot, self.scene, self.contact, self.tightness = robot, scene, contact, tightness
+        self.arm, self.checks = _arm(robot), _checks(robot)
+        self.scene_arrays = compile_scene_for(robot, scene)
+        self.solids = solid_arrays(solids_of(scene))
 
     def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
         """Judge the motion along straight joint-space lines through the waypoints (at least one)."""
-        motion = _motion(q, self._levers)
-        todo = kernel.first_pieces(motion, FIRST_TRAVEL)
+        q = np.ascontiguousarray(q, dtype=np.float64)
+        motion = Motion(q, kernel.way_along(q, self.checks.levers))
+        todo = kernel.first_pieces(motion, self.checks, FIRST_TRAVEL)
         best, certified = np.full(2, CAP), np.full(2, CAP)
         hit: tuple[float, int] | None = None
         while len(todo.start):
             found, rows, columns = kernel.rounds(
-                self._robot_arrays,
-                self._scene_arrays,
+                self.arm,
+                self.scene_arrays,
+                self.solids,
                 motion,
-                self._checks,
+                self.checks,
                 todo,
                 best,
                 certified,
                 self.tightness,
+                self.contact,
             )
             if not len(rows):
                 break
-            todo, clearance, bound = found
-            kinds = self._checks.kind[columns]
-            middle = (todo.start + todo.stop) / 2
-            at = _interpolated(q, middle[rows])
-            cutoffs = np.minimum(bound[rows, columns] + best[kinds], CAP)
-            distances, _ = self.exact.nearest(at, columns, cutoffs, stop=self.contact)
-            asked = int(np.isfinite(distances).sum())
-            touched = distances[asked - 1] <= self.contact
-            asked -= int(touched)
-            clearance[rows[:asked], columns[:asked]] = distances[:asked]
-            np.minimum.at(best, kinds[:asked], distances[:asked])
-            if touched:
-                row = int(rows[asked])
-                hit = (float(middle[row]), int(columns[asked]))
-                # what follows the contact matters no more; what precedes it does, closer and closer
-                keep = row + int(bound[row].max() > FIRST_CONTACT_TRAVEL)
-                todo.stop[row] = middle[row]
-                todo = Pieces(*(part[:keep] for part in todo))
-                clearance, bound = clearance[:keep], bound[:keep]
-                clearance[row:] = -np.inf
-            found = kernel.Round(todo, clearance, bound)
-            todo = kernel.settle(self._checks, found, best, certified, self.tightness)
+            touched = self._ask(motion, found, rows, columns, best)
+            if touched is not None:
+                hit, found = touched
+            todo = kernel.settle(self.checks, found, best, certified, self.tightness)
         if hit is not None:
             return Sweep(self._contact(motion, *hit), 0.0, 0.0)
         return Sweep(None, *certified.tolist())
 
+    def _ask(
+        self, motion: Motion, found: Round, rows: ndarray, columns: ndarray, best: ndarray
+    ) -> tuple[tuple[float, int], Round] | None:
+        """Ask Coal what the round leaves to it. With a contact: its place and check, and what remains of the
+        round, since what follows the contact matters no more; what precedes it does, closer and closer."""
+        todo, clearance, lower = found.pieces, found.clearance, found.lower
+        kinds = self.checks.kind[columns]
+        travel = found.travel[rows, columns]
+        middle = (todo.start + todo.stop) / 2
+        at = kernel.configurations(motion, middle[rows])
+        cutoffs = np.clip(travel + best[kinds], 2 * self.contact, CAP)
+        distances, _ = self._exact.nearest(at, columns, cutoffs, stop=self.contact)
+        asked = int(np.isfinite(distances).sum())
+        touched = distances[asked - 1] <= self.contact
+        asked -= int(touched)
+        cells = rows[:asked], columns[:asked]
+        clearance[cells] = distances[:asked]
+        lower[cells] = np.maximum(lower[cells], distances[:asked] - travel[:asked])
+        np.minimum.at(best, kinds[:asked], distances[:asked])
+        if not touched:
+            return None
+        row = int(rows[asked])
+        keep = row + int(todo.stop[row] - todo.start[row] > 2 * FIRST_CONTACT_TRAVEL)
+        todo.stop[row] = middle[row]
+        clearance[row:] = lower[row:] = -np.inf
+        parts = (todo.start, todo.stop, todo.undecided)
+        rest = Round(Pieces(*(part[:keep] for part in parts)), *(part[:keep] for part in found[1:]))
+        return (float(middle[row]), int(columns[asked])), rest
+
+    @cached_property
+    def _exact(self) -> ExactCollision:
+        return ExactCollision(self.robot, self.scene)
+
     def _contact(self, motion: Motion, at: float, check: int) -> Contact:
         """The contact of a check at a place, with its depth until the check comes free of that obstacle."""
-        travelled = motion.travelled[:, check]
-        begin = float(_interpolated(travelled[:, None], np.array([at]))[0, 0])
-        steps = begin + EPISODE_TRAVEL * np.arange(EPISODE_SAMPLES)
-        steps = steps[steps <= travelled[-1]]
-        samples = np.maximum(np.interp(steps, travelled, np.arange(len(travelled))), at)
-        samples = np.concatenate([[at], samples])
-        checks, cutoffs = np.full(len(samples), check), np.full(len(samples), 2 * self.contact)
-        distances, names = self.exact.nearest(_interpolated(motion.q, samples), checks, cutoffs)
+        steps = at + EPISODE_TRAVEL * np.arange(EPISODE_SAMPLES)
+        steps = steps[steps <= max(motion.way[-1], at)]
+        checks, cutoffs = np.full(len(steps), check), np.full(len(steps), 2 * self.contact)
+        distances, names = self._exact.nearest(kernel.configurations(motion, steps), checks, cutoffs)
         other = names[0]
         left = [i for i, name in enumerate(names) if name != other or distances[i] > self.contact]
-        episode = distances[: left[0] if left else len(samples)]
-        return Contact(self.exact.checks[check], str(other), at, max(0.0, -float(episode.min(initial=0))))
-
-
-def _motion(q: Float[ndarray, "n dof"], levers: Float[ndarray, "dof checks"]) -> Motion:
-    q = np.ascontiguousarray(q, dtype=np.float64)
-    moves = np.abs(np.diff(q, axis=0, prepend=q[:1]))
-    return Motion(q, np.cumsum(moves, axis=0) @ levers)
-
-
-def _interpolated(rows: Float[ndarray, "n k"], at: Float[ndarray, "m"]) -> Float[ndarray, "m k"]:
-    low = at.astype(int)
-    high = np.minimum(low + 1, len(rows) - 1)
-    return rows[low] + (at - low)[:, None] * (rows[high] - rows[low])
+        episode = distances[: left[0] if left else len(steps)]
+        depth = max(0.0, -float(episode.min(initial=0)))
+        low, share = kernel.segment_at(motion.way, at)
+        if share == 0.0:  # the first of waypoints that are the same
+            low = int(np.searchsorted(motion.way, at))
+        return Contact(checks_of(self.robot)[check], str(other), low + share, depth)
 
 
 @once_per_robot
@@ -187,30 +196,38 @@ def _groups(robot: Robot) -> tuple[dict[str, int], dict[frozenset[str | None], i
     )
 
 
-def _known_to_spheres(robot: Robot, checks: tuple[Check, ...]) -> Checks:
+@once_per_robot
+def _arm(robot: Robot) -> Arm:
+    slides = np.array(robot.prismatic, np.bool_)
+    return Arm(compile_robot(robot), hulls_of(robot)[0], np.ascontiguousarray(robot.frame_offsets), slides)
+
+
+@once_per_robot
+def _checks(robot: Robot) -> Checks:
+    """What compiled code reads of the checks. Levers are seen from what the link is checked against."""
     groups, pairs = _groups(robot)
-    where = [
-        groups.get(check.link, -1) if check.other is None else pairs.get(frozenset(check), -1)
-        for check in checks
-    ]
-    kind = [SCENE if check.other is None else PAIR for check in checks]
-    return Checks(np.array(where, np.int64), np.array(kind, np.int64))
-
-
-def _check_levers(robot: Robot, checks: tuple[Check, ...]) -> Float[ndarray, "dof checks"]:
-    """Motion bound of each check's link, seen from what it is checked against, per unit of joint motion."""
-    covered = _covered(robot)
+    covered, parts = _covered(robot), hulls_of(robot)[1]
     links = [link for link in covered.link_names if link in covered.spheres]
-    radii = motion_radii(covered)
-    levers = np.zeros((robot.dof, len(checks)))
+    radii, checks = motion_radii(covered), checks_of(robot)
+    kind, where, of_parts, base = [], [], [], []
+    levers = np.zeros((len(checks), robot.dof))
     for k, (link, other) in enumerate(checks):
-        near, far, further = 0, robot.link_frame(link), link
-        if other is not None and robot.link_frame(other) > far:
-            near, far, further = far, robot.link_frame(other), other
-        elif other is not None:
-            near = robot.link_frame(other)
-        levers[near:far, k] = radii[links.index(further), near:far]
-    return levers
+        kind.append(SCENE if other is None else PAIR)
+        known = groups.get(link, -1) if other is None else pairs.get(frozenset((link, other)), -1)
+        where.append(known)
+        nearer, further = sorted((other or robot.base, link), key=robot.link_frame)
+        low, high = robot.link_frame(nearer), robot.link_frame(further)
+        levers[k, low:high] = radii[links.index(further), low:high]
+        base.append(low)
+        others = range(0) if other is None else parts[nearer]
+        of_parts.append((parts[further].start, parts[further].stop, others.start, others.stop))
+    return Checks(
+        np.array(kind, np.int64),
+        np.array(where, np.int64),
+        np.array(of_parts, np.int64).reshape(-1, 4),
+        np.array(base, np.int64),
+        levers,
+    )
 
 
 @once_per_robot

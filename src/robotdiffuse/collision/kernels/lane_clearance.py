@@ -97,7 +97,7 @@ def _to_points(at, s, scene, radius, out):
 
 
 @allocation_free(inline="always")
-def _to_scene(at, s, scene, radius, near, mark, out):
+def to_scene(at, s, scene, radius, near, mark, out):
     n = 0
     _to_spheres(at, s, scene.spheres, near, n, mark, out)
     n += len(scene.spheres)
@@ -216,7 +216,7 @@ def group_clearance(robot, scene, g, limit, work, best):
     solids = count_obstacles(scene) - 1
     obstacles = solids + (len(scene.points) > 0)
     radius = robot.bounds[g, 3]
-    _to_scene(work.centres, g, scene, radius, work.near, True, work.bounds)
+    to_scene(work.centres, g, scene, radius, work.near, True, work.bounds)
     for i in range(W):
         best[0, i] = limit
     if _mark_near(solids, obstacles, radius, limit, work.near, work.bounds, work.least) > 0:
@@ -225,7 +225,7 @@ def group_clearance(robot, scene, g, limit, work, best):
             # what the spheres before have found limits what is looked for
             for i in range(W):
                 work.least[0, i] = best[0, i] + robot.spheres[s, 3]
-            _to_scene(work.position, 0, scene, robot.spheres[s, 3], work.near, False, work.least)
+            to_scene(work.position, 0, scene, robot.spheres[s, 3], work.near, False, work.least)
             _write(work.least, robot.spheres[s, 3], best)
 
 

@@ -1,0 +1,369 @@
+"""Compiled lower bounds of the distances between convex meshes and shapes along short motions.
+
+A plane that separates two convex bodies proves them apart, whatever found it. The best plane in the middle of
+a motion is looked for by the algorithm of Gilbert, Johnson and Keerthi (GJK, 1988), from the one that was
+found last; what is proved is read off the plane alone: all vertices of the one body stay on their side of the
+other by so much while they move by t v + r (see `swept_spheres.py`), t in [-1, 1]. In float64.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+MOST_STEPS = 32
+"""Of GJK; mostly it takes three to eight."""
+CLOSE_ENOUGH = 0.02
+"""GJK ends when the distance is known up to this share ..."""
+CLOSER = 1e-7
+"""... or up to this [m]."""
+
+
+class Hulls(NamedTuple):
+    """Convex parts of a robot's links: the hull of vertices, rounded."""
+
+    vertices: np.ndarray
+    """[3, vertices] in the coordinates of the part's frame."""
+    first: np.ndarray
+    """[parts + 1] first vertex of each part."""
+    frame: np.ndarray
+    """[parts]"""
+    balls: np.ndarray
+    """[parts, 4] centre and radius of a ball around all of the part."""
+    rounding: np.ndarray
+    """[parts]"""
+
+
+class Solids(NamedTuple):
+    """Obstacles: the sum of a box, a disc around the box's z axis and a ball."""
+
+    rotation: np.ndarray
+    """[n, 3, 3] R_box_base"""
+    middle: np.ndarray
+    """[n, 3]"""
+    half: np.ndarray
+    """[n, 3] half edges."""
+    disc: np.ndarray
+    """[n] radius."""
+    rounding: np.ndarray
+    """[n] radius of the ball."""
+    bounds: np.ndarray
+    """[n] whether it only bounds a surface or a cloud of points, of which just that is known."""
+
+
+class Posture(NamedTuple):
+    """Scratch memory for one motion: the robot in its middle, and what GJK needs."""
+
+    frames: np.ndarray
+    """[dof + 1, 3, 4]"""
+    twists: np.ndarray
+    """[dof + 1, 6] as in `swept_spheres.py`."""
+    planes: np.ndarray
+    """[parts, solids + parts, 3] normals of the planes found last, towards the first; zero at first."""
+    simplex: np.ndarray
+    """[4, 3]"""
+    edges: np.ndarray
+    """[3, 3]"""
+    points: np.ndarray
+    """[3, 3] a normal, and the two bodies' vertices that reach furthest against each other."""
+
+
+@njit(cache=True)
+def make_posture(hulls, solids, dof):
+    """Scratch memory for one thread."""
+    frames = np.zeros((dof + 1, 3, 4))
+    for k in range(3):
+        frames[0, k, k] = 1.0
+    parts = len(hulls.frame)
+    planes = np.zeros((parts, len(solids.disc) + parts, 3))
+    return Posture(
+        frames, np.zeros((dof + 1, 6)), planes, np.empty((4, 3)), np.empty((3, 3)), np.empty((3, 3))
+    )
+
+
+@njit(cache=True)
+def pose(offsets, slides, q, dq, posture):
+    """The frames at q and their twists along dq; offsets[dof, 4, 4] as in `Robot.frame_offsets`."""
+    for j in range(len(q)):
+        parent, child, offset = posture.frames[j], posture.frames[j + 1], offsets[j]
+        before, twist = posture.twists[j], posture.twists[j + 1]
+        c, s, slide = (1.0, 0.0, q[j]) if slides[j] else (np.cos(q[j]), np.sin(q[j]), 0.0)
+        for r in range(3):
+            x = parent[r, 0] * offset[0, 0] + parent[r, 1] * offset[1, 0] + parent[r, 2] * offset[2, 0]
+            y = parent[r, 0] * offset[0, 1] + parent[r, 1] * offset[1, 1] + parent[r, 2] * offset[2, 1]
+            z = parent[r, 0] * offset[0, 2] + parent[r, 1] * offset[1, 2] + parent[r, 2] * offset[2, 2]
+            t = parent[r, 0] * offset[0, 3] + parent[r, 1] * offset[1, 3] + parent[r, 2] * offset[2, 3]
+            child[r, 0], child[r, 1], child[r, 2] = x * c + y * s, y * c - x * s, z
+            child[r, 3] = t + parent[r, 3] + z * slide
+        for r in range(3):
+            a, b = (r + 1) % 3, (r + 2) % 3
+            axis = child[r, 2] * dq[j]
+            moment = (child[a, 3] * child[b, 2] - child[b, 3] * child[a, 2]) * dq[j]
+            twist[r] = before[r] + (0.0 if slides[j] else axis)
+            twist[3 + r] = before[3 + r] + (axis if slides[j] else moment)
+
+
+@njit(cache=True)
+def _placed(T, p, r):
+    return T[r, 0] * p[0] + T[r, 1] * p[1] + T[r, 2] * p[2] + T[r, 3]
+
+
+@njit(cache=True)
+def part_speed(hulls, p, base, posture):
+    """No point of a part moves further than this from the middle to an end, seen from a frame [m]; but for
+    the remainder."""
+    frame, ball = hulls.frame[p], hulls.balls[p]
+    twist, other, T = posture.twists[frame], posture.twists[base], posture.frames[frame]
+    a, b, c = twist[0] - other[0], twist[1] - other[1], twist[2] - other[2]
+    x, y, z = _placed(T, ball, 0), _placed(T, ball, 1), _placed(T, ball, 2)
+    u = b * z - c * y + twist[3] - other[3]
+    v = c * x - a * z + twist[4] - other[4]
+    w = a * y - b * x + twist[5] - other[5]
+    return np.sqrt(u * u + v * v + w * w) + ball[3] * np.sqrt(a * a + b * b + c * c)
+
+
+@njit(cache=True)
+def ball_to_solid(hulls, p, solids, o, posture):
+    """A lower bound of the distance of a part to an obstacle in the middle, from ball and box."""
+    T, ball = posture.frames[hulls.frame[p]], hulls.balls[p]
+    outside, deepest = 0.0, -np.inf
+    for r in range(3):
+        d = 0.0
+        for k in range(3):
+            d += solids.rotation[o, r, k] * (_placed(T, ball, k) - solids.middle[o, k])
+        d = abs(d) - solids.half[o, r] - (solids.disc[o] if r < 2 else 0.0)
+        outside += max(d, 0.0) ** 2
+        deepest = max(deepest, d)
+    return np.sqrt(outside) + min(deepest, 0.0) - solids.rounding[o] - ball[3]
+
+
+@njit(cache=True)
+def ball_to_ball(hulls, p, q, posture):
+    """The same for two parts."""
+    S, T, total = posture.frames[hulls.frame[p]], posture.frames[hulls.frame[q]], 0.0
+    a, b = hulls.balls[p], hulls.balls[q]
+    for r in range(3):
+        total += (_placed(S, a, r) - _placed(T, b, r)) ** 2
+    return np.sqrt(total) - a[3] - b[3]
+
+
+@njit(cache=True, fastmath=True)
+def _least(vertices, first, last, x, y, z, offset, u, v, w, speed):
+    """Least of a - |b| over vertices, with a and b linear functions of the place."""
+    least = np.inf
+    for i in range(first, last):
+        a = vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z
+        b = vertices[0, i] * u + vertices[1, i] * v + vertices[2, i] * w + speed
+        least = min(least, a - abs(b))
+    return least + offset
+
+
+@njit(cache=True)
+def _furthest(vertices, first, last, x, y, z):
+    """The vertex that reaches furthest in a direction."""
+    best, at = -np.inf, first
+    for i in range(first, last):
+        a = vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z
+        if a > best:
+            best, at = a, i
+    return at
+
+
+@njit(cache=True)
+def _support_of_part(hulls, p, posture, sign, row):
+    """The vertex of a part that reaches furthest along sign * points[0], to points[row]."""
+    T, points = posture.frames[hulls.frame[p]], posture.points
+    x, y, z = sign * points[0, 0], sign * points[0, 1], sign * points[0, 2]
+    i = _furthest(
+        hulls.vertices,
+        hulls.first[p],
+        hulls.first[p + 1],
+        T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
+        T[0, 1] * x + T[1, 1] * y + T[2, 1] * z,
+        T[0, 2] * x + T[1, 2] * y + T[2, 2] * z,
+    )
+    for r in range(3):
+        points[row, r] = _placed(T, hulls.vertices[:, i], r)
+
+
+@njit(cache=True)
+def _support_of_solid(solids, o, posture, row):
+    """The place on an obstacle, but for its rounding, that reaches furthest along points[0]."""
+    R, points = solids.rotation[o], posture.points
+    x, y, z = points[0, 0], points[0, 1], points[0, 2]
+    a = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
+    b = R[1, 0] * x + R[1, 1] * y + R[1, 2] * z
+    c = R[2, 0] * x + R[2, 1] * y + R[2, 2] * z
+    disc = solids.disc[o] / max(np.sqrt(a * a + b * b), 1e-300)
+    a = np.copysign(solids.half[o, 0], a) + disc * a
+    b = np.copysign(solids.half[o, 1], b) + disc * b
+    c = np.copysign(solids.half[o, 2], c)
+    for r in range(3):
+        points[row, r] = R[0, r] * a + R[1, r] * b + R[2, r] * c + solids.middle[o, r]
+
+
+@njit(cache=True)
+def separation(hulls, p, solids, other, base, posture):
+    """By how much the plane with the unit normal points[0] parts two bodies: in the middle, and along the
+    motion but for the remainder, seen from frame `base`. `other` below 0 stands for part -1 - other."""
+    x, y, z = posture.points[0, 0], posture.points[0, 1], posture.points[0, 2]
+    frame = hulls.frame[p]
+    T, twist, seen = posture.frames[frame], posture.twists[frame], posture.twists[base]
+    a, b, c = twist[0] - seen[0], twist[1] - seen[1], twist[2] - seen[2]
+    # n . (w x p) = (n x w) . p
+    u, v, w = y * c - z * b, z * a - x * c, x * b - y * a
+    speed = u * T[0, 3] + v * T[1, 3] + w * T[2, 3]
+    speed += x * (twist[3] - seen[3]) + y * (twist[4] - seen[4]) + z * (twist[5] - seen[5])
+    offset = x * T[0, 3] + y * T[1, 3] + z * T[2, 3] - hulls.rounding[p]
+    lx, ly, lz = (
+        T[0, 0] * x + T[1, 0] * y + T[2, 0] * z,
+        T[0, 1] * x + T[1, 1] * y + T[2, 1] * z,
+        T[0, 2] * x + T[1, 2] * y + T[2, 2] * z,
+    )
+    lu, lv, lw = (
+        T[0, 0] * u + T[1, 0] * v + T[2, 0] * w,
+        T[0, 1] * u + T[1, 1] * v + T[2, 1] * w,
+        T[0, 2] * u + T[1, 2] * v + T[2, 2] * w,
+    )
+    first, last = hulls.first[p], hulls.first[p + 1]
+    along = _least(hulls.vertices, first, last, lx, ly, lz, offset, lu, lv, lw, speed)
+    middle = _least(hulls.vertices, first, last, lx, ly, lz, offset, 0.0, 0.0, 0.0, 0.0)
+    reach = 0.0
+    if other >= 0:
+        _support_of_solid(solids, other, posture, 2)
+        reach = solids.rounding[other]
+    else:
+        _support_of_part(hulls, -1 - other, posture, 1.0, 2)
+        reach = hulls.rounding[-1 - other]
+    at = posture.points[2]
+    reach += x * at[0] + y * at[1] + z * at[2]
+    # a normal of length 1 + e errs by e times the extent; that is what float64 leaves
+    return middle - reach - 1e-9, along - reach - 1e-9
+
+
+@njit(cache=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True)
+def _holds_origin(e, new):
+    """Whether the tetrahedron of `new` and `new` + e[0], e[1], e[2] holds the origin."""
+    inside = 1.0
+    for k in range(3):
+        a, b = e[(k + 1) % 3], e[(k + 2) % 3]
+        x, y, z = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+        volume = e[k, 0] * x + e[k, 1] * y + e[k, 2] * z
+        if abs(volume) < 1e-30:
+            return False
+        share = -(new[0] * x + new[1] * y + new[2] * z) / volume
+        inside -= share
+        if share <= 0:
+            return False
+    return inside > 0
+
+
+@njit(cache=True)
+def _nearest(simplex, count, edges, nearest):
+    """The point of a simplex nearest to the origin, which is known to need the last vertex. The simplex
+    becomes the smallest face that holds it; returns its number of vertices, 0 if the origin is inside."""
+    new = simplex[count - 1]
+    least, kept = _dot(new, new), 0
+    for r in range(3):
+        nearest[r] = new[r]
+        for k in range(count - 1):
+            edges[k, r] = simplex[k, r] - new[r]
+    if count == 4 and _holds_origin(edges, new):
+        return 0
+    for i in range(count - 1):
+        for j in range(i, count - 1):
+            e, f = edges[i], edges[j]
+            a, b, c = _dot(e, e), _dot(e, f), _dot(f, f)
+            d, g, x, y = -_dot(new, e), -_dot(new, f), 0.0, 0.0
+            if i == j:
+                x = d / max(a, 1e-300)
+                inside = 0 < x < 1
+            else:
+                area = max(a * c - b * b, 1e-300)
+                x, y = (d * c - g * b) / area, (g * a - d * b) / area
+                inside = x > 0 and y > 0 and x + y < 1
+            if inside:
+                total = 0.0
+                for r in range(3):
+                    total += (new[r] + x * e[r] + y * f[r]) ** 2
+                if total < least:
+                    least, kept = total, 1 << i | 1 << j
+                    for r in range(3):
+                        nearest[r] = new[r] + x * e[r] + y * f[r]
+    at = 0
+    for k in range(count):
+        if k == count - 1 or kept >> k & 1:
+            for r in range(3):
+                simplex[at, r] = simplex[k, r]
+            at += 1
+    return at
+
+
+@njit(cache=True)
+def find_plane(hulls, p, solids, other, posture):
+    """Turns the normal points[0], which is a guess, into that of the plane that parts two bodies best in the
+    middle of the motion; False if they touch, or nearly."""
+    points, simplex = posture.points, posture.simplex
+    rounding = hulls.rounding[p] + (solids.rounding[other] if other >= 0 else hulls.rounding[-1 - other])
+    best, gap, count = -np.inf, np.inf, 0
+    n0, n1, n2 = points[0, 0], points[0, 1], points[0, 2]
+    for _ in range(MOST_STEPS):
+        _support_of_part(hulls, p, posture, -1.0, 1)
+        if other >= 0:
+            _support_of_solid(solids, other, posture, 2)
+        else:
+            _support_of_part(hulls, -1 - other, posture, 1.0, 2)
+        for r in range(3):
+            simplex[count, r] = points[1, r] - points[2, r]
+        reached = _dot(simplex[count], points[0])
+        if reached > best:
+            best = reached
+            n0, n1, n2 = points[0, 0], points[0, 1], points[0, 2]
+        count = _nearest(simplex, count + 1, posture.edges, points[0])
+        before, gap = gap, np.sqrt(_dot(points[0], points[0]))
+        if count == 0 or gap - rounding < CLOSER:
+            return False
+        for r in range(3):
+            points[0, r] /= gap
+        if gap - best <= max(CLOSE_ENOUGH * (gap - rounding), CLOSER) or gap >= before:
+            break
+    points[0, 0], points[0, 1], points[0, 2] = n0, n1, n2
+    return best > rounding
+
+
+@njit(cache=True)
+def best_plane(hulls, p, solids, other, base, enough, plane, posture):
+    """A plane that parts two bodies: how far apart they are in the middle, and along the motion but for the
+    remainder, and whether GJK had to look for it, so that the first is their distance. That is done if along
+    `plane`, which was found last and is replaced, they are not parted by `enough`."""
+    n = posture.points[0]
+    known = False
+    for r in range(3):
+        n[r] = plane[r]
+        known |= plane[r] != 0.0
+    if known:
+        middle, along = separation(hulls, p, solids, other, base, posture)
+        if along >= enough:
+            return middle, along, False
+    else:
+        T = posture.frames[hulls.frame[p]]
+        for r in range(3):
+            n[r] = _placed(T, hulls.balls[p], r)
+            if other >= 0:
+                n[r] -= solids.middle[other, r]
+            else:
+                n[r] -= _placed(posture.frames[hulls.frame[-1 - other]], hulls.balls[-1 - other], r)
+        length = np.sqrt(_dot(n, n))
+        for r in range(3):
+            n[r] = n[r] / length if length > 0 else 1.0 / np.sqrt(3.0)
+    if not find_plane(hulls, p, solids, other, posture):
+        return -np.inf, -np.inf, True
+    for r in range(3):
+        plane[r] = n[r]
+    middle, along = separation(hulls, p, solids, other, base, posture)
+    return middle, along, True
