@@ -1,13 +1,13 @@
 """Collision of motions: the space that searches check them in, and the judge's certificate.
 
-The certificate says that a motion is free between its waypoints too, or where it first is not. A piece of the
-motion is free for a link if a lower bound of its clearance along the piece is positive; otherwise the piece is
-split. The bound comes from the clearance in the piece's middle, the velocity there towards what is near, and a
-bound on what the arm's curved way can add (`kernels/sweep.py`). Of two links, the further one is seen from the
-nearer one, so only the joints between them count. Clearances are those of the covering spheres, many
-configurations at once (`kernels/swept_spheres.py`); where the spheres are too coarse, of the convex meshes, by
-planes that part them (`kernels/hulls.py`). Coal says the distances to surfaces and clouds of points, and whether
-bodies touch.
+The certificate says that a motion is free between its waypoints too, or where it first is not. A piece of
+the motion is free for a link if a lower bound of its clearance along the piece is positive; otherwise the
+piece is split. The bound comes from the clearance in the piece's middle, the velocity there towards what is
+near, and a bound on what the arm's curved way can add (`kernels/sweep.py`). Of two links, the further one is
+seen from the nearer one, so only the joints between them count. Clearances are those of the covering spheres,
+many configurations at once (`kernels/swept_spheres.py`); where the spheres are too coarse, of the convex
+meshes, by planes that part them (`kernels/hulls.py`). Coal says the distances to surfaces and clouds of
+points, and whether bodies touch.
 """
 
 from dataclasses import replace
