@@ -209,6 +209,58 @@ def test_refusals() -> None:
         TimingSettings(corner_deviation=-0.1)
 
 
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(2, 8),
+    jerk=st.floats(5.0, 5000.0),
+    sample_time=st.sampled_from([0.001, 0.004, 0.01]),
+    stops=st.booleans(),
+)
+def test_a_limit_of_jerk_is_kept_with_the_others(
+    seed: int, count: int, jerk: float, sample_time: float, stops: bool
+) -> None:
+    robot = arm()
+    q = np.cumsum(np.random.default_rng(seed).normal(0, 0.3, (count, 7)), axis=0)
+    settings = TimingSettings(jerk=jerk, sample_time=sample_time)
+    answer = never if stops else always
+    t = time_parameterize(robot, path(robot, q), answer, answer, settings)
+    steps = np.diff(t.times)[:, None]
+    assert steps.min() > 0 and steps.max() <= 1.1 * sample_time + 1e-9
+    assert np.abs(np.diff(t.accelerations, axis=0) / steps).max() <= jerk * (1 + 1e-6)
+    assert (np.abs(t.velocities) <= robot.velocity * (1 + 1e-9)).all()
+    assert (np.abs(t.accelerations) <= robot.acceleration * (1 + 1e-9)).all()
+    assert np.array_equal(t.positions[0], q[0]) and np.array_equal(t.positions[-1], q[-1])
+    assert not t.velocities[[0, -1]].any() and np.abs(t.accelerations[[0, -1]]).max() < 1e-9
+    # rates are those of the positions: second differences agree to what the jerk does in two steps
+    middle = 0.5 * (t.velocities[1:] + t.velocities[:-1])
+    assert np.abs(np.diff(t.positions, axis=0) / steps - middle).max() < jerk * sample_time**2 + 1e-6
+    if stops:
+        assert distance_to_polyline(t.positions, q).max() < 1e-8
+
+
+def test_a_limit_of_jerk_costs_what_it_must() -> None:
+    """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs next to nothing."""
+    robot = arm((20.0,), (80.0,))
+    p = path(robot, [[0.0], [1.0]])
+    free, gentle, slight = (
+        time_parameterize(robot, p, always, always, TimingSettings(jerk=jerk)).duration
+        for jerk in (None, 50.0, 1e5)
+    )
+    least = (32 / 50.0) ** (1 / 3)
+    assert least <= gentle < 1.4 * least
+    assert slight == pytest.approx(free, abs=0.005)
+
+
+def test_fine_rows_keep_the_limits_to_the_letter() -> None:
+    """Accelerations were 0.025 % too great between the places in a curve that were looked at."""
+    robot = arm()
+    for seed in range(20):
+        q = np.cumsum(np.random.default_rng(seed).normal(0, 0.5, (6, 7)), axis=0)
+        t = time_parameterize(robot, path(robot, q), always, always, TimingSettings(sample_time=0.001))
+        assert (np.abs(t.velocities) <= robot.velocity).all()
+        assert (np.abs(t.accelerations) <= robot.acceleration).all()
+
+
 @given(seed=st.integers(0, 2**32 - 1), deviation=st.sampled_from([0.0, 0.02, 0.1]))
 def test_durations_are_those_of_toppra(seed: int, deviation: float) -> None:
     rng, robot = np.random.default_rng(seed), arm()

@@ -69,6 +69,9 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
             metavar="X",
             help=f"share of the robot's {what} limits that is used, above 0 and at most 1 (default: 1)",
         )
+    parser.add_argument(
+        "--jerk", type=positive, metavar="J", help="most jerk of any joint, in rad/s³ (default: no limit)"
+    )
     parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
     parser.add_argument(
         "--out",
@@ -113,6 +116,7 @@ def run_plan(arguments: argparse.Namespace) -> int:
         clearance=arguments.clearance,
         velocity_scaling=arguments.velocity_scaling,
         acceleration_scaling=arguments.acceleration_scaling,
+        jerk=arguments.jerk,
     )
     print_result(result)
     for file in outputs:

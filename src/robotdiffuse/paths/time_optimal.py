@@ -12,6 +12,8 @@ from numba import njit
 
 PARTS = 16
 """Places in a grid interval where rates are looked at; at 4, a reversal was 1.8 % too fast between them."""
+BETWEEN, ROUNDING = 1.0002, 1 + 1e-9
+"""Spared of limits on curves, since rates between those places were up to 0.025 % greater, and elsewhere."""
 TINY = 1e-7
 """Derivatives by s, which are of length one on lines, count as zero below this."""
 
@@ -130,15 +132,20 @@ def slowdown(line, grid, speeds, velocity, acceleration):
     for i in range(len(grid) - 1):
         width = grid[i + 1] - grid[i]
         pull = (speeds[i + 1] ** 2 - speeds[i] ** 2) / (2 * width)
-        for part in range(PARTS + 1):
+        # along a straight part, rates are greatest at its ends
+        place(waypoints, knots, directions, half_widths, grid[i] + 0.5 * width, 2, second)
+        curved = np.abs(second).max() > 0
+        spare = BETWEEN if curved else ROUNDING
+        for part in range(0, PARTS + 1, 1 if curved else PARTS):
             at = part / PARTS * width
             place(waypoints, knots, directions, half_widths, grid[i] + at, 1, first)
             place(waypoints, knots, directions, half_widths, grid[i] + at, 2, second)
             squared = max(speeds[i] ** 2 + 2 * pull * at, 0.0)
             speed = np.sqrt(squared)
             for j in range(dof):
-                worst = max(worst, abs(first[j]) * speed / velocity[j])
-                worst = max(worst, np.sqrt(abs(first[j] * pull + second[j] * squared) / acceleration[j]))
+                worst = max(worst, spare * abs(first[j]) * speed / velocity[j])
+                rate = abs(first[j] * pull + second[j] * squared)
+                worst = max(worst, spare * np.sqrt(rate / acceleration[j]))
     return worst
 
 

@@ -11,9 +11,10 @@ from numpy import ndarray
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.blending import BlendedPolyline, half_widths
+from robotdiffuse.paths.jerk import smoothed
 from robotdiffuse.paths.time_optimal import fastest, sampled, slowdown
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.settings import Bound, Count, NotNegative, OneOf, Settings
+from robotdiffuse.settings import Bound, Count, NotNegative, OneOf, Positive, Settings
 from robotdiffuse.types import Path, Trajectory
 
 COMPILED, TOPPRA = "compiled", "toppra"
@@ -21,6 +22,10 @@ SHRINKS = (0.25, 0.25, 0.0)
 """Factors on the deviation of a corner each time that its rounding is refused; 0: the motion stops there."""
 CORNER_PLACES = 17
 """Configurations of a rounded corner that are looked at."""
+FINE = 0.001
+"""Time between the rows that a limit of jerk is kept by [s]."""
+GENTLER = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
+"""Shares of the acceleration limits of which the fastest motion of limited jerk is taken."""
 SAME = 1e-6
 """Waypoints nearer to each other than this are one [rad]."""
 
@@ -33,6 +38,8 @@ class TimingSettings(Settings, name="timing"):
     """Share of the robot's velocity limits that is used."""
     acceleration_scale: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
     """Share of the robot's acceleration limits that is used."""
+    jerk: Positive | None = None
+    """Most jerk of any joint [rad/s³] or [m/s³]; None: accelerations may change at once."""
     corner_deviation: NotNegative = 0.1
     """How far a rounded corner may leave the path, if it stays valid there [rad, joint-space L2]."""
     corner_intervals: Count = 8
@@ -63,6 +70,8 @@ def time_parameterize(
 
     `keeps` says of configurations [n, dof] along a rounded corner whether they keep what the path does, a
     clearance say; corners that do not are rounded less from the start.
+
+    A limit of jerk takes time at both ends of the motion and at each stop, and may cut corners a little more.
 
     Times start at 0 and strictly increase; the first and last rows are the first and last waypoint exactly.
     A path of length zero becomes two equal rows at rest.
@@ -218,19 +227,45 @@ def _speeds_by_toppra(
     return np.full(len(grid), np.nan) if speeds is None else speeds
 
 
-def _piece(
-    robot: Robot, line: BlendedPolyline, settings: TimingSettings
-) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
-    """Times, positions, velocities and accelerations of a motion from rest to rest."""
+Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]
+"""Times, positions, velocities and accelerations."""
+
+
+def _piece(robot: Robot, line: BlendedPolyline, settings: TimingSettings) -> Rows:
+    """A motion from rest to rest."""
     grid, limits = _grid(line, settings), _limits(robot, settings)
-    if settings.solver == TOPPRA:
-        speeds = _speeds_by_toppra(line, grid, *limits)
+    if settings.jerk is None:
+        speeds = _speeds(line, grid, settings.solver, *limits)
+        return sampled(line.arrays, grid, speeds, settings.sample_time)
+    every = max(round(settings.sample_time / FINE), 1)
+    step, found = settings.sample_time / every, list[tuple[float, ndarray, int]]()
+    for share in GENTLER:
+        velocity, acceleration = limits[0], share * limits[1]
+        window = max(int(np.ceil(2 * acceleration.max() / settings.jerk / step)), 1)
+        speeds = _speeds(line, grid, settings.solver, velocity, acceleration)
+        lasts = float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
+        slower = np.ceil(lasts / step) * step / lasts  # whole steps
+        found.append((lasts * slower + window * step, speeds / slower, window))
+    _, speeds, window = min(found, key=lambda timed: timed[0])
+    rows = sampled(line.arrays, grid, speeds, step)[1:]
+    return smoothed(*rows, step, window, every)
+
+
+def _speeds(
+    line: BlendedPolyline,
+    grid: Float[ndarray, "m"],
+    solver: str,
+    velocity: Float[ndarray, "dof"],
+    acceleration: Float[ndarray, "dof"],
+) -> Float[ndarray, "m"]:
+    """ṡ at each value of s in the grid, such that the limits are kept in between too."""
+    if solver == TOPPRA:
+        speeds = _speeds_by_toppra(line, grid, velocity, acceleration)
     else:
-        speeds = fastest(line(grid, 1), line(grid, 2), grid, *limits)
+        speeds = fastest(line(grid, 1), line(grid, 2), grid, velocity, acceleration)
     if not (speeds[1:-1] > 0).all():
         raise RuntimeError("no timing was found; every path has one, so this is a numerical failure")
-    speeds = speeds / slowdown(line.arrays, grid, speeds, *limits)
-    return sampled(line.arrays, grid, speeds, settings.sample_time)
+    return speeds / slowdown(line.arrays, grid, speeds, velocity, acceleration)
 
 
 def _limits(robot: Robot, settings: TimingSettings) -> tuple[ndarray, ndarray]:

@@ -143,11 +143,12 @@ def plan(
     clearance: float | None = None,
     velocity_scaling: float = 1.0,
     acceleration_scaling: float = 1.0,
+    jerk: float | None = None,
 ) -> "PlanResult":
     """Plan with the default planner, which is loaded once; the arguments are those of
     `planners.base.Planner.plan`.
 
     The result holds a verified motion or a status that says why there is none.
     """
-    scaling = velocity_scaling, acceleration_scaling
-    return _default().plan(problem, time_limit, seed, until, clearance, *scaling)
+    limits = velocity_scaling, acceleration_scaling, jerk
+    return _default().plan(problem, time_limit, seed, until, clearance, *limits)

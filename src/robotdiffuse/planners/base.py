@@ -42,6 +42,7 @@ class Planner(ABC, Generic[Own]):
         clearance: float | None = None,
         velocity_scaling: float = 1.0,
         acceleration_scaling: float = 1.0,
+        jerk: float | None = None,
     ) -> PlanResult:
         """Plan a motion within `time_limit` [s] of wall time.
 
@@ -54,11 +55,12 @@ class Planner(ABC, Generic[Own]):
             and passages allow it [m]; where they do not, less, and a note says so. None: what the problem
             says, or 1 cm. The other planners have settings for it, or keep what their motions have.
         velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses.
+        jerk: most jerk of any joint of the timed motion [rad/s³]. None: no limit, the fastest motion.
 
         Raises InputError for arguments that are none of these, and where `prepare` does.
         """
         self.prepare(problem.robot)
-        request = Request(until, clearance, velocity_scaling, acceleration_scaling)
+        request = Request(until, clearance, velocity_scaling, acceleration_scaling, jerk)
         call = Call(self.name, problem, time_limit, seed, request)
         ends = usable_ends(call)
         return ends if isinstance(ends, PlanResult) else self.solve(call, ends)

@@ -14,7 +14,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.paths.timing import TimingSettings, time_parameterize
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
-from robotdiffuse.settings import Bound, NotNegative, OneOf, Settings
+from robotdiffuse.settings import Bound, NotNegative, OneOf, Positive, Settings
 from robotdiffuse.types import SHORT, UNTIL, Path, Status, Trajectory
 from robotdiffuse.verify import Report, Verifier, Violation, verifier
 
@@ -38,6 +38,7 @@ class Request(Settings):
     clearance: NotNegative | None = None
     velocity_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
     acceleration_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
+    jerk: Positive | None = None
 
 
 class Call:
@@ -63,7 +64,9 @@ class Call:
         self.clearance = next(value for value in wanted if value is not None)
         """Distance to obstacles that is to be kept where it can be [m]."""
         self._timing = TimingSettings(
-            velocity_scale=request.velocity_scaling, acceleration_scale=request.acceleration_scaling
+            velocity_scale=request.velocity_scaling,
+            acceleration_scale=request.acceleration_scaling,
+            jerk=request.jerk,
         )
         self._reserved = min(_finishing.get(problem.robot.name, 0.0), MOST_RESERVED * time_limit)
         self.rng = np.random.default_rng(seed)
