@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.box_arm import box_arm
-from robotdiffuse.collision import motion
+from robotdiffuse.collision import exact as exact_collision
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
@@ -207,7 +207,7 @@ def meshes_asked(*shapes: Shape) -> int:
             return super().nearest(q, *rest, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(motion, "ExactCollision", Counting)
+        patch.setattr(exact_collision, "ExactCollision", Counting)
         judge(SWING, *shapes)
     return sum(asked)
 

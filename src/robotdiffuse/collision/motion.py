@@ -12,7 +12,7 @@ points, and whether bodies touch.
 
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -20,7 +20,6 @@ from numpy import ndarray
 
 from robotdiffuse.collision.arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.checker import CollisionChecker
-from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.collision.hulls import Check, checks_of, hulls_of, solid_arrays, solids_of
 from robotdiffuse.collision.kernels import sweep as kernel
 from robotdiffuse.collision.kernels.motions import Space
@@ -28,6 +27,9 @@ from robotdiffuse.collision.kernels.sweep import CAP, PAIR, SCENE, Arm, Checks, 
 from robotdiffuse.robots.lever_arms import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from robotdiffuse.collision.exact import ExactCollision
 
 FINEST = 0.002
 """Least distance between two checks of a motion that is searched with [m]."""
@@ -166,7 +168,9 @@ class ContinuousCollision:
         return (float(middle[row]), int(columns[asked])), rest
 
     @cached_property
-    def _exact(self) -> ExactCollision:
+    def _exact(self) -> "ExactCollision":
+        from robotdiffuse.collision.exact import ExactCollision  # and Coal, which most motions do not need
+
         return ExactCollision(self.robot, self.scene)
 
     def _contact(self, motion: Motion, at: float, check: int) -> Contact:

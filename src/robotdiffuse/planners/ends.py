@@ -5,7 +5,6 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import ExactCollision, explain_collision
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.planners.call import Call
@@ -13,6 +12,7 @@ from robotdiffuse.problems.problem import JointGoal, PoseGoal
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.types import Status
 
 GOAL_COUNT = 10
@@ -152,6 +152,8 @@ def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
     clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
     worst = int(clearances.argmin())
     link, other = [*((link, None) for link in checker.links), *checker.pairs][worst]
+    from robotdiffuse.collision.exact import ExactCollision  # and Coal, which most calls do not need
+
     exact = ExactCollision(checker.robot, checker.scene)
     check = [frozenset(check) for check in exact.checks].index(frozenset((link, other)))
     [distance], [obstacle] = exact.nearest(q[None], np.array([check]), np.array([np.inf]))
@@ -165,7 +167,7 @@ def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
 def _usable_goals(call: Call, checker: CollisionChecker) -> Float[ndarray, "k dof"] | PlanResult:
     robot, scene, start = call.problem.robot, call.problem.scene, call.problem.start
     if not checker.free(start[None])[0]:
-        collision = explain_collision(robot, scene, start)
+        collision = _explained(robot, scene, start)
         if collision is not None:
             return call.fail(Status.INVALID_START, f"the start is in collision: {collision}")
     goal = call.problem.goal
@@ -180,7 +182,7 @@ def _free_goals(
     free = checker.free(goal.positions)
     if free.any():
         return goal.positions[free]
-    collisions = [explain_collision(call.problem.robot, call.problem.scene, q) for q in goal.positions]
+    collisions = [_explained(call.problem.robot, call.problem.scene, q) for q in goal.positions]
     kept = [q for q, collision in zip(goal.positions, collisions, strict=True) if collision is None]
     if kept:
         return np.stack(kept)
@@ -202,7 +204,7 @@ def _pose_goals(
             Status.UNREACHABLE_GOAL,
             f"no configuration within the joint limits brings {goal.frame} to the pose at ({xyz}) m",
         )
-    collisions = [explain_collision(robot, scene, q) for q in reached]
+    collisions = [_explained(robot, scene, q) for q in reached]
     kept = [q for q, collision in zip(reached, collisions, strict=True) if collision is None]
     if kept:
         return np.stack(kept)
@@ -211,3 +213,10 @@ def _pose_goals(
         f"all {len(reached)} configurations found for the pose of {goal.frame} at ({xyz}) m are in "
         f"collision, e.g. {collisions[0]}",
     )
+
+
+def _explained(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:
+    """See `explain_collision`, which imports Coal."""
+    from robotdiffuse.collision.exact import explain_collision
+
+    return explain_collision(robot, scene, q)
