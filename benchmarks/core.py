@@ -19,13 +19,17 @@ from tempfile import TemporaryDirectory
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+from numba import njit
 from report import header, print_table, progress
 
+from collision import POINTS, check_edges, checked_configurations, fastest
 from problems import PANDA, Case
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.collision.kernels.motions import motions_free
-from robotdiffuse.collision.motion import levers, search_space
+from robotdiffuse.collision.kernels.lanes import make_workspace, place_frames
+from robotdiffuse.collision.kernels.motions import Space
+from robotdiffuse.collision.kernels.simd import W, lanes_array
+from robotdiffuse.collision.motion import search_space
 from robotdiffuse.evaluation.methods import planned
 from robotdiffuse.evaluation.problem_sets import gather_cases
 from robotdiffuse.evaluation.records import Record
@@ -34,8 +38,9 @@ from robotdiffuse.paths.timing import TimingSettings, time_parameterize
 from robotdiffuse.planners import load_planner
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.scenes.sampling import sample_surface
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Cylinder
+from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud
 from robotdiffuse.types import Path as JointPath
 
 SEED = 20261122
@@ -43,6 +48,8 @@ LIMITS = (0.01, 0.05, 0.1, 1.0)
 """[s]"""
 REPEATS = 50
 """Of each path, back and forth, in the timing of the kernel."""
+RESOLUTION, POINT_RADIUS = 0.05, 0.01
+"""[m]"""
 TIGHT = (0.001, 0.01, 0.05, 0.1, 1.0)
 
 
@@ -125,31 +132,58 @@ def lengths(cases: Sequence[Case], known: dict) -> None:
     print_table("Length over best known at equal wall time", columns, rows, notes)
 
 
+@njit
+def place_along(space, starts, ends, counts):
+    """The kinematics of a check of these edges, in so many blocks each."""
+    work, block = make_workspace(space.robot, space.scene), lanes_array(starts.shape[1], 1)
+    for i in range(len(starts)):
+        for j in range(starts.shape[1]):
+            block[j, :] = np.float32(0.5) * (starts[i, j] + ends[i, j])
+        for _ in range(counts[i] // W):
+            place_frames(space.robot, block, work.frames, work.centres)
+    return work.centres[0, 0]
+
+
+def free_edges(path: np.ndarray, space: Space) -> tuple[np.ndarray, np.ndarray]:
+    """The edges of a path that are free there and back, in both directions, many times."""
+    starts, ends = np.concatenate([path[:-1], path[1:]]), np.concatenate([path[1:], path[:-1]])
+    free = check_edges(space, starts, ends)
+    free &= np.roll(free, len(path) - 1)
+    return np.tile(starts[free], (REPEATS, 1)), np.tile(ends[free], (REPEATS, 1))
+
+
 def kernel(cases: Sequence[Case], _lengths: dict) -> None:
     """Along the free edges of aorrtc's paths, at the resolution that searches use."""
-    planner, rows = load_planner("aorrtc"), []
+    planner, rows, rng = load_planner("aorrtc"), [], np.random.default_rng(SEED)
+    bare = search_space(CollisionChecker(PANDA, Scene()), RESOLUTION)
     for family, of in by_family(cases):
-        spent, count = 0.0, 0
+        if family == "all":
+            continue
+        spent, checked = np.zeros(4), np.zeros(2)
         for case in of[:20]:
-            result = planner.plan(case.problem, 1.0, until="first", clearance=0.0)
-            if result.path is None:
+            path = planner.plan(case.problem, 1.0, until="first", clearance=0.0).path
+            if path is None:
                 continue
-            space = search_space(CollisionChecker(PANDA, case.problem.scene), 0.05)
-            path = result.path.positions.astype(np.float32)
-            there_and_back = np.concatenate([path, path[-2::-1]])
-            travel = np.abs(np.diff(there_and_back, axis=0)) @ levers(PANDA)
-            blocks = np.maximum(np.ceil(travel / 0.05 / 16), 1)
-            # one call for many edges, so that what a call itself takes does not count
-            edges = np.concatenate([path[:1], np.tile(there_and_back[1:], (REPEATS, 1))])
-            if not motions_free(space, edges).all():
-                continue
-            with Clock() as clock:
-                motions_free(space, edges)
-            spent, count = spent + clock.cpu, count + REPEATS * 16 * int(blocks.sum())
-        rows.append((family, f"{1e9 * spent / max(count, 1):.0f}"))
-    print_table(
-        "Collision check of free edges, self-collision included", ["family", "ns a configuration"], rows
+            cloud = PointCloud(sample_surface(case.problem.scene, POINTS, rng), POINT_RADIUS)
+            for k, scene in enumerate((case.problem.scene, Scene([cloud]))):
+                space = search_space(CollisionChecker(PANDA, scene), RESOLUTION)
+                starts, ends = free_edges(path.positions.astype(np.float32), space)
+                if not len(starts):
+                    continue
+                counts = checked_configurations(space, starts, ends)
+                checked[k] += counts.sum()
+                spent[2 + k] += fastest(lambda a=starts, b=ends, s=space: check_edges(s, a, b))
+                if k == 0:
+                    spent[0] += fastest(lambda a=starts, b=ends, n=counts: place_along(bare, a, b, n))
+                    spent[1] += fastest(lambda a=starts, b=ends: check_edges(bare, a, b))
+        kinematics, itself, total = 1e9 * spent[:3] / max(checked[0], 1)
+        parts = (kinematics, itself - kinematics, total - itself, total, 1e9 * spent[3] / max(checked[1], 1))
+        rows.append((family, *(f"{ns:.0f}" for ns in parts)))
+    columns = ["family", "kinematics", "self", "scene", "total", f"total, cloud of {POINTS:,}"]
+    note = (
+        f"ns a configuration, the fastest of some passes; cloud: on the obstacles, {1e3 * POINT_RADIUS:g} mm"
     )
+    print_table("Collision check along edges that are free", columns, rows, (note,))
 
 
 def limits(cases: Sequence[Case], _lengths: dict) -> None:

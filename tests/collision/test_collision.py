@@ -17,7 +17,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.arrays import compile_scene, robot_groups
 from robotdiffuse.collision.exact import ExactCollision, forward_frames
 from robotdiffuse.collision.kernels.lane_clearance import block_clearances
-from robotdiffuse.collision.kernels.lanes import block_hits, free_many
+from robotdiffuse.collision.kernels.lanes import block_hits, free_many, make_workspace
 from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.collision.points import THINNING, build_grid, cover, thin
 from robotdiffuse.errors import InputError
@@ -201,6 +201,54 @@ def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
         np.testing.assert_allclose(found, right, atol=TOLERANCE)
         clear = np.abs(right).min(axis=1) > TOLERANCE
         np.testing.assert_array_equal(checker.free(q)[clear], np.logical_not(hit)[clear])
+
+
+@pytest.mark.parametrize("count", [15, 16, 17, 70])
+def test_any_number_of_obstacles(count: int) -> None:
+    """They are looked at by sixteen."""
+    robot, rng = with_spheres("panda"), np.random.default_rng(count)
+    kinds = ("sphere", "box", "cylinder", "capsule")
+    shapes = [random_shape(kinds[i % 4], rng) for i in range(count)]
+    scene = Scene([shape for shape in shapes if np.linalg.norm(shape.center) > 0.6])  # type: ignore[attr-defined]
+    q = rows(robot, 600)
+    least = np.minimum(link_distances(robot, scene, q).min(axis=1), pair_distances(robot, q).min(axis=1))
+    clear = np.abs(least) > TOLERANCE
+    free = CollisionChecker(robot, scene).free(q)
+    np.testing.assert_array_equal(free[clear], (least > 0)[clear])
+    assert 0 < free.sum() < len(q)
+
+
+@pytest.mark.parametrize("count", [16, 17, 50])
+def test_links_with_any_number_of_spheres(count: int) -> None:
+    """Those of many are parted, and their parts have bounding spheres of their own."""
+    arm, rng = with_spheres("ur5"), np.random.default_rng(count)
+    spheres = {
+        link: np.column_stack([rng.uniform(-0.06, 0.06, (count, 3)), rng.uniform(0.002, 0.01, count)])
+        for link in arm.spheres
+    }
+    robot, scene = replace(arm, spheres=spheres), solids()
+    q = rows(robot, 600, seed=2)
+    least = np.minimum(link_distances(robot, scene, q).min(axis=1), pair_distances(robot, q).min(axis=1))
+    clear = np.abs(least) > TOLERANCE
+    np.testing.assert_array_equal(CollisionChecker(robot, scene).free(q)[clear], (least > 0)[clear])
+    touching = pair_distances(robot, q).min(axis=1) < 0
+    assert 0 < touching.sum() < len(q)
+
+
+@pytest.mark.parametrize("stop_at_first", [False, True])
+def test_the_bits_of_a_block_are_its_configurations(stop_at_first: bool) -> None:
+    robot, scene = with_spheres("panda"), solids()
+    checker, q = CollisionChecker(robot, scene), rows(robot, 16, seed=4).astype(np.float32)
+    arrays = checker.robot_arrays, checker.scene_arrays
+    work = make_workspace(*arrays)
+    hits = block_hits(*arrays, np.ascontiguousarray(q.T), np.float32(0), stop_at_first, work)
+    found, right = hits >> np.arange(16) & 1 == 1, ~checker.free(q)
+    assert 0 < right.sum() < 16
+    if stop_at_first:
+        assert found.sum() == 1
+        assert right[found].all()
+    else:
+        np.testing.assert_array_equal(found, right)
 
 
 def test_configurations_beyond_the_limits() -> None:

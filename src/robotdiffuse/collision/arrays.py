@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy import ndarray
 
+from robotdiffuse.collision.kernels.simd import W, by_sixteen
 from robotdiffuse.collision.near_pairs import no_tables, tabulate
 from robotdiffuse.collision.points import EMPTY, PointGrid, build_grid, cover, thin
 from robotdiffuse.robots.lever_arms import motion_radii
@@ -18,6 +19,12 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Spher
 
 ROUNDING = 4e-7
 """Obstacles grow by this share of their coordinates: more than float32 rounds off."""
+
+BOX_SLACK = 1e-6
+"""Boxes around obstacles grow by this, absolutely and relatively: more than rounding does."""
+
+NO_BOX = np.repeat([[1e18, -1e18]], 3, axis=1)
+"""Lower and upper corner of a box that is far from everything [m]."""
 
 
 class RobotArrays(NamedTuple):
@@ -29,6 +36,13 @@ class RobotArrays(NamedTuple):
     """[n, 4] x y z radius in the frame of the group."""
     first: ndarray
     """[groups + 1] first sphere of each group."""
+    rows: ndarray
+    """[rows, 4 * 16] the spheres of each group by sixteen: x of all, y, z, radius; the
+    last one fills up."""
+    row_bounds: ndarray
+    """[rows, 4] a sphere around all spheres of the row."""
+    first_row: ndarray
+    """[groups + 1] first row of each group."""
     frame: ndarray
     """[groups] frame index, 0 for the fixed base."""
     bounds: ndarray
@@ -50,8 +64,16 @@ class SceneArrays(NamedTuple):
     """[n, 15] ..., radius, half height, 0."""
     capsules: ndarray
     """[n, 15] ..., radius, half height, 0."""
+    solids: ndarray
+    """[n, 17] all of these in one form: centre, rotation, half edges, a radius around, 1 if it is round about
+    its z axis between flat ends. The row of a cylinder has its radius for the first two half edges."""
+    around: ndarray
+    """[rows, 6 * 16] boxes around the solids by sixteen: low x of all, y, z, high x, y, z."""
     points: ndarray
     """[n, 4] centre, radius; sorted by cell."""
+    point_rows: ndarray
+    """[rows, 4 * 16] the points by sixteen: x of all, y, z, radius; the
+    last one fills up."""
     cell_first: ndarray
     """[cells + 1] first point of each cell."""
     grid: ndarray
@@ -79,6 +101,8 @@ def compile_robot(robot: Robot) -> RobotArrays:
         centres = local[:, :3] @ T[:3, :3].T + T[:3, 3]
         spheres.append(np.column_stack([centres, local[:, 3]]))
         bounds.append(_bounding_sphere(spheres[-1]))
+    clusters = [_clusters(of_group) for of_group in spheres]
+    rows = [row for of_group in clusters for row in of_group]
     index = {link: i for i, link in enumerate(groups)}
     T = robot.frame_offsets
     slides = np.array(robot.prismatic, np.float64)
@@ -88,6 +112,9 @@ def compile_robot(robot: Robot) -> RobotArrays:
         offsets=np.ascontiguousarray(offsets, np.float32),
         spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
+        rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [EMPTY, *rows]]),
+        row_bounds=np.array([_bounding_sphere(row) for row in rows], np.float32).reshape(-1, 4),
+        first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),
         bounds=np.array(bounds, np.float32).reshape(-1, 4),
         pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
@@ -109,6 +136,16 @@ def reach(robot: Robot) -> float:
     arrays = compile_robot(robot)
     extent = np.linalg.norm(arrays.bounds[:, :3], axis=1) + arrays.bounds[:, 3]
     return float(lengths.sum() + slides.sum() + extent.max(initial=0.0))
+
+
+def _clusters(spheres: ndarray) -> list[ndarray]:
+    """Spheres in parts of at most sixteen: halves along the direction in which they extend most."""
+    if len(spheres) <= W:
+        return [spheres]
+    centred = spheres[:, :3] - spheres[:, :3].mean(axis=0)
+    order = np.argsort(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], kind="stable")
+    half = len(spheres) // 2
+    return _clusters(spheres[order[:half]]) + _clusters(spheres[order[half:]])
 
 
 def _bounding_sphere(spheres: ndarray) -> ndarray:
@@ -150,13 +187,29 @@ def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> S
                 capsules.append(_oriented(shape, half, (2,), reach)[[*range(13), 14, 11]])
             case PointCloud() | Triangulated():
                 points.append(shape)
-    return SceneArrays(
+    by_type = (
         np.array(spheres, np.float32).reshape(-1, 4),
         np.array(boxes, np.float32).reshape(-1, 15),
         np.array(cylinders, np.float32).reshape(-1, 15),
         np.array(capsules, np.float32).reshape(-1, 15),
-        *_grid_around(tuple(points), reach, radius),
     )
+    return SceneArrays(*by_type, *_solids(*by_type), *_grid_around(tuple(points), reach, radius))
+
+
+def _solids(
+    spheres: ndarray, boxes: ndarray, cylinders: ndarray, capsules: ndarray
+) -> tuple[ndarray, ndarray]:
+    """Fields of SceneArrays."""
+    rows = np.zeros((len(spheres) + len(boxes) + len(cylinders) + len(capsules), 17), np.float32)
+    parts = np.split(rows, np.cumsum([len(spheres), len(boxes), len(cylinders)]))
+    parts[0][:, :3], parts[0][:, [3, 7, 11]], parts[0][:, 15] = spheres[:, :3], 1, spheres[:, 3]
+    parts[1][:, :15] = boxes
+    parts[2][:, :15], parts[2][:, 16] = cylinders[:, [*range(13), 12, 13]], 1
+    parts[3][:, :12], parts[3][:, [15, 14]] = capsules[:, :12], capsules[:, 12:14]
+    middle, rotation, half = rows[:, :3], np.abs(rows[:, 3:12].reshape(-1, 3, 3)), rows[:, 12:15]
+    extent = np.einsum("nij,ni->nj", rotation, half) + rows[:, 15:16]
+    extent += BOX_SLACK * (1 + np.abs(middle) + extent)
+    return rows, by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), NO_BOX)
 
 
 @lru_cache(maxsize=8)

@@ -7,6 +7,7 @@ from jaxtyping import Float, Float32, Int, Int32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.point_grid import KEEP, make_grid
+from robotdiffuse.collision.kernels.simd import by_sixteen
 
 MESH_SPACING = 0.02
 """Triangles of mesh obstacles are divided until no edge is longer [m]; each piece becomes a point."""
@@ -26,6 +27,7 @@ class PointGrid(NamedTuple):
     """Fields of SceneArrays."""
 
     points: Float32[ndarray, "n 4"]
+    point_rows: Float32[ndarray, "rows 64"]
     cell_first: Int32[ndarray, "cells"]
     grid: Float32[ndarray, "voxels"]
     nearest: Int32[ndarray, "voxels"]
@@ -106,6 +108,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     if not len(cloud):
         return PointGrid(
             EMPTY.astype(np.float32),
+            by_sixteen(EMPTY, EMPTY),
             np.zeros(2, np.int32),
             np.zeros(0, np.float32),
             np.zeros(0, np.int32),
@@ -137,7 +140,9 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     nearest_voxel, sizes = np.asarray(found).reshape(3, -1), tuple(shape.tolist())
     grid, nearest = make_grid(points, ends, run, nearest_voxel, low, voxel, sizes, band, np.float32(known))
     frame = [*low, voxel, 2 * voxel, radii.max(), radii.min(), band, *shape, *cells]
-    return PointGrid(points, first, grid, nearest, np.array(frame, np.float32))
+    return PointGrid(
+        points, by_sixteen(points, points[-1:]), first, grid, nearest, np.array(frame, np.float32)
+    )
 
 
 def _flat(index: Int[ndarray, "n 3"], shape: Int32[ndarray, "3"]) -> Int[ndarray, "n"]:

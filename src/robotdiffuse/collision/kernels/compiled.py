@@ -37,13 +37,16 @@ def compile_seconds() -> float:
     return _timer.seconds
 
 
-def allocation_free(fastmath: bool = False, inline: str = "never") -> Callable[[Callable], Any]:
+def allocation_free(
+    fastmath: bool = False, inline: str = "never", forceinline: bool = False
+) -> Callable[[Callable], Any]:
     """Compile without Numba's reference counting.
 
     Counting the references of the arrays that go into every call takes two thirds of the collision kernel's
     time. Such a function must not allocate, nor assign an array to a slice.
     """
-    options: dict[str, Any] = {"fastmath": fastmath, "inline": inline, "cache": True, "_nrt": False}
+    options: dict[str, Any] = {"fastmath": fastmath, "inline": inline, "forceinline": forceinline}
+    options |= {"cache": True, "_nrt": False}
     return njit(**options)
 
 

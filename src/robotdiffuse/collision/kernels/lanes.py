@@ -1,8 +1,9 @@
 """The compiled collision check: 16 configurations at once, yes or no.
 
-Everything is written so that LLVM turns the loops over lanes into SIMD instructions: flat float32 arrays with
-constant lane offsets, small functions with few stores, polynomial sine and cosine, integer hit counts in
-place of early exits inside a lane loop.
+From coarse to fine, with lanes over whatever there are many of. Frames and bounding spheres: over the 16
+configurations. Which obstacles a link can meet in any of them: over 16 obstacles, by boxes around them. In
+which configurations the bounding sphere does touch one of those: over the configurations. Whether the link
+does, in those configurations, one after the other: over its spheres.
 """
 
 from typing import NamedTuple
@@ -11,13 +12,32 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.point_grid import W, touch_points
+from robotdiffuse.collision.kernels.point_grid import far_from_points, near_points, touch_points
+from robotdiffuse.collision.kernels.simd import (
+    W,
+    first_lane,
+    gather,
+    greatest,
+    highest,
+    lanes_array,
+    lanes_with,
+    least,
+    load,
+    lowest,
+    magnitude,
+    root,
+    store,
+    whole,
+    with_sign,
+)
 
 _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
 _HALF = np.float32(0.5)
 HEAD, SIDE = 6, 130
 """Numbers before the cells, and cells along each side, of a table of `near_pairs.py`."""
+ALL = (1 << W) - 1
+"""The mask of all lanes."""
 _ZERO = np.float32(0.0)
 # sin(2 pi u) for |u| <= 1/4: Taylor coefficients, error below 6e-8
 _S1 = np.float32(6.283185307179586)
@@ -28,188 +48,75 @@ _S9 = np.float32(42.058693944897655)
 _S11 = np.float32(-15.094642576822984)
 
 
-@njit(fastmath=True, inline="always")
+@allocation_free(forceinline=True)
 def _sine_of_turn(u):
     v = u * u
     return u * (_S1 + v * (_S3 + v * (_S5 + v * (_S7 + v * (_S9 + v * _S11)))))
 
 
-@allocation_free(fastmath=True)
-def _turn(parent, child, offset, q):
-    """Frame behind a revolute joint: child = parent @ offset @ Rz(q), 16 lanes."""
-    a00, a01, a02 = offset[0], offset[1], offset[2]
-    a10, a11, a12 = offset[3], offset[4], offset[5]
-    a20, a21, a22 = offset[6], offset[7], offset[8]
-    px, py, pz = offset[9], offset[10], offset[11]
-    for i in range(W):
-        turns = q[i] * _INV_TAU
-        turns -= np.floor(turns + _HALF)
-        far = abs(turns)
-        c = _sine_of_turn(_QUARTER - far)
-        s = _sine_of_turn(_QUARTER - abs(far - _QUARTER))
-        s = -s if turns < _ZERO else s
-        for k in range(3):
-            r0, r1, r2 = parent[(3 * k) * W + i], parent[(3 * k + 1) * W + i], parent[(3 * k + 2) * W + i]
-            x = r0 * a00 + r1 * a10 + r2 * a20
-            y = r0 * a01 + r1 * a11 + r2 * a21
-            child[(3 * k) * W + i] = x * c + y * s
-            child[(3 * k + 1) * W + i] = y * c - x * s
-            child[(3 * k + 2) * W + i] = r0 * a02 + r1 * a12 + r2 * a22
-            child[(9 + k) * W + i] = r0 * px + r1 * py + r2 * pz + parent[(9 + k) * W + i]
+@allocation_free(forceinline=True)
+def _turn(frames, j, offset, q):
+    """Frame behind a revolute joint, in 16 lanes: frames[j + 1] = frames[j] @ offset @ Rz(q)."""
+    turns = load(q, j, 0) * _INV_TAU
+    turns = turns - whole(turns + _HALF)
+    far = magnitude(turns)
+    c = _sine_of_turn(_QUARTER - far)
+    s = with_sign(_sine_of_turn(_QUARTER - magnitude(far - _QUARTER)), turns)
+    for k in range(3):
+        r0, r1, r2 = load(frames, j, 3 * k), load(frames, j, 3 * k + 1), load(frames, j, 3 * k + 2)
+        x = r0 * offset[0] + r1 * offset[3] + r2 * offset[6]
+        y = r0 * offset[1] + r1 * offset[4] + r2 * offset[7]
+        z = r0 * offset[2] + r1 * offset[5] + r2 * offset[8]
+        store(frames, j + 1, 3 * k, x * c + y * s)
+        store(frames, j + 1, 3 * k + 1, y * c - x * s)
+        store(frames, j + 1, 3 * k + 2, z)
+        p = r0 * offset[9] + r1 * offset[10] + r2 * offset[11]
+        store(frames, j + 1, 9 + k, p + load(frames, j, 9 + k))
 
 
-@allocation_free(fastmath=True)
-def _slide(parent, child, offset, q):
-    """Frame behind a prismatic joint: child = parent @ offset @ Tz(q), 16 lanes."""
-    a00, a01, a02 = offset[0], offset[1], offset[2]
-    a10, a11, a12 = offset[3], offset[4], offset[5]
-    a20, a21, a22 = offset[6], offset[7], offset[8]
-    px, py, pz = offset[9], offset[10], offset[11]
-    for i in range(W):
-        for k in range(3):
-            r0, r1, r2 = parent[(3 * k) * W + i], parent[(3 * k + 1) * W + i], parent[(3 * k + 2) * W + i]
-            z = r0 * a02 + r1 * a12 + r2 * a22
-            child[(3 * k) * W + i] = r0 * a00 + r1 * a10 + r2 * a20
-            child[(3 * k + 1) * W + i] = r0 * a01 + r1 * a11 + r2 * a21
-            child[(3 * k + 2) * W + i] = z
-            child[(9 + k) * W + i] = r0 * px + r1 * py + r2 * pz + parent[(9 + k) * W + i] + z * q[i]
+@allocation_free(forceinline=True)
+def _slide(frames, j, offset, q):
+    """Frame behind a prismatic joint, in 16 lanes: frames[j + 1] = frames[j] @ offset @ Tz(q)."""
+    for k in range(3):
+        r0, r1, r2 = load(frames, j, 3 * k), load(frames, j, 3 * k + 1), load(frames, j, 3 * k + 2)
+        z = r0 * offset[2] + r1 * offset[5] + r2 * offset[8]
+        store(frames, j + 1, 3 * k, r0 * offset[0] + r1 * offset[3] + r2 * offset[6])
+        store(frames, j + 1, 3 * k + 1, r0 * offset[1] + r1 * offset[4] + r2 * offset[7])
+        store(frames, j + 1, 3 * k + 2, z)
+        p = r0 * offset[9] + r1 * offset[10] + r2 * offset[11]
+        store(frames, j + 1, 9 + k, p + load(frames, j, 9 + k) + z * load(q, j, 0))
 
 
-@allocation_free(fastmath=True)
+@allocation_free(forceinline=True)
+def _centres_of(frames, f, spheres, s):
+    """Positions of a sphere's centre in 16 lanes."""
+    x, y, z = spheres[s, 0], spheres[s, 1], spheres[s, 2]
+    return (
+        load(frames, f, 0) * x + load(frames, f, 1) * y + load(frames, f, 2) * z + load(frames, f, 9),
+        load(frames, f, 3) * x + load(frames, f, 4) * y + load(frames, f, 5) * z + load(frames, f, 10),
+        load(frames, f, 6) * x + load(frames, f, 7) * y + load(frames, f, 8) * z + load(frames, f, 11),
+    )
+
+
+@allocation_free(forceinline=True)
 def place(frames, f, spheres, s, positions, p):
     """Positions of a sphere's centre in 16 lanes, to row p."""
-    x, y, z = spheres[s, 0], spheres[s, 1], spheres[s, 2]
-    for i in range(W):
-        for k in range(3):
-            positions[p, k * W + i] = (
-                frames[f, (3 * k) * W + i] * x
-                + frames[f, (3 * k + 1) * W + i] * y
-                + frames[f, (3 * k + 2) * W + i] * z
-                + frames[f, (9 + k) * W + i]
-            )
+    x, y, z = _centres_of(frames, f, spheres, s)
+    store(positions, p, 0, x)
+    store(positions, p, 1, y)
+    store(positions, p, 2, z)
 
 
-@allocation_free(fastmath=True)
-def _touch_spheres(at, s, radius, obstacles, near, n, mark, hits):
-    """Adds 1 to the lanes whose sphere touches an obstacle; returns how many touches there are.
-
-    Tests the obstacles k with near[n + k]; with `mark` tests all and sets near[n + k] for those touched.
-    """
-    touches = 0
-    for k in range(len(obstacles)):
-        if not (mark or near[n + k]):
-            continue
-        x, y, z = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2]
-        reach = radius + obstacles[k, 3]
-        reach *= reach
-        total = 0
-        for i in range(W):
-            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
-            hit = np.int32(dx * dx + dy * dy + dz * dz < reach)
-            hits[i] += hit
-            total += hit
-        if mark:
-            near[n + k] = total > 0
-        touches += total
-    return touches
-
-
-@allocation_free(fastmath=True)
-def _touch_boxes(at, s, radius, obstacles, near, n, mark, hits):
-    touches = 0
-    reach = radius * radius
-    for k in range(len(obstacles)):
-        if not (mark or near[n + k]):
-            continue
-        x, y, z = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2]
-        a00, a01, a02 = obstacles[k, 3], obstacles[k, 4], obstacles[k, 5]
-        a10, a11, a12 = obstacles[k, 6], obstacles[k, 7], obstacles[k, 8]
-        a20, a21, a22 = obstacles[k, 9], obstacles[k, 10], obstacles[k, 11]
-        hx, hy, hz = obstacles[k, 12], obstacles[k, 13], obstacles[k, 14]
-        total = 0
-        for i in range(W):
-            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
-            u = max(abs(a00 * dx + a01 * dy + a02 * dz) - hx, _ZERO)
-            v = max(abs(a10 * dx + a11 * dy + a12 * dz) - hy, _ZERO)
-            w = max(abs(a20 * dx + a21 * dy + a22 * dz) - hz, _ZERO)
-            hit = np.int32(u * u + v * v + w * w < reach)
-            hits[i] += hit
-            total += hit
-        if mark:
-            near[n + k] = total > 0
-        touches += total
-    return touches
-
-
-@allocation_free(fastmath=True)
-def _touch_round(at, s, radius, obstacles, flat_ends, near, n, mark, hits):
-    """Cylinders (`flat_ends`) or capsules."""
-    touches = 0
-    for k in range(len(obstacles)):
-        if not (mark or near[n + k]):
-            continue
-        x, y, z = obstacles[k, 0], obstacles[k, 1], obstacles[k, 2]
-        a00, a01, a02 = obstacles[k, 3], obstacles[k, 4], obstacles[k, 5]
-        a10, a11, a12 = obstacles[k, 6], obstacles[k, 7], obstacles[k, 8]
-        a20, a21, a22 = obstacles[k, 9], obstacles[k, 10], obstacles[k, 11]
-        half = obstacles[k, 13]
-        wide = obstacles[k, 12] if flat_ends else _ZERO
-        reach = radius if flat_ends else radius + obstacles[k, 12]
-        reach *= reach
-        total = 0
-        for i in range(W):
-            dx, dy, dz = at[s, i] - x, at[s, W + i] - y, at[s, 2 * W + i] - z
-            u = a00 * dx + a01 * dy + a02 * dz
-            v = a10 * dx + a11 * dy + a12 * dz
-            w = max(abs(a20 * dx + a21 * dy + a22 * dz) - half, _ZERO)
-            r = max(np.sqrt(u * u + v * v) - wide, _ZERO)
-            hit = np.int32(r * r + w * w < reach)
-            hits[i] += hit
-            total += hit
-        if mark:
-            near[n + k] = total > 0
-        touches += total
-    return touches
-
-
-@allocation_free(fastmath=True)
-def _touch_each_other(a, s, b, t, reach, hits):
-    reach *= reach
-    total = 0
-    for i in range(W):
-        dx, dy, dz = a[s, i] - b[t, i], a[s, W + i] - b[t, W + i], a[s, 2 * W + i] - b[t, 2 * W + i]
-        hit = np.int32(dx * dx + dy * dy + dz * dz < reach)
-        hits[i] += hit
-        total += hit
-    return total
-
-
-@allocation_free(inline="always")
-def _touch_scene(at, s, radius, scene, near, mark, scratch, hits):
-    """Touches of sphere s with the obstacles marked as near (with `mark`: with all, marking them)."""
-    n = 0
-    total = _touch_spheres(at, s, radius, scene.spheres, near, n, mark, hits)
-    n += len(scene.spheres)
-    total += _touch_boxes(at, s, radius, scene.boxes, near, n, mark, hits)
-    n += len(scene.boxes)
-    total += _touch_round(at, s, radius, scene.cylinders, True, near, n, mark, hits)
-    n += len(scene.cylinders)
-    total += _touch_round(at, s, radius, scene.capsules, False, near, n, mark, hits)
-    n += len(scene.capsules)
-    if len(scene.points) and (mark or near[n]):
-        touches = touch_points(at, s, radius, scene, mark, scratch, hits)
-        if mark:
-            near[n] = touches > 0
-        total += touches
-    return total
-
-
-@allocation_free()
-def _all_lanes_hit(hits):
-    total = 0
-    for i in range(W):
-        total += np.int32(hits[i] > 0)
-    return total == W
+@allocation_free(forceinline=True)
+def place_frames(robot, q, frames, centres):
+    """Frames of 16 configurations, and the centres of the bounding spheres of all groups."""
+    for j in range(len(robot.offsets)):
+        if robot.offsets[j, 12] > _ZERO:
+            _slide(frames, j, robot.offsets[j], q)
+        else:
+            _turn(frames, j, robot.offsets[j], q)
+    for g in range(len(robot.frame)):
+        place(frames, robot.frame[g], robot.bounds, g, centres, g)
 
 
 class Workspace(NamedTuple):
@@ -217,141 +124,223 @@ class Workspace(NamedTuple):
 
     frames: np.ndarray
     """[dof + 1, 12 * W]"""
-    positions: np.ndarray
-    """[spheres, 3 * W]"""
     centres: np.ndarray
     """[groups, 3 * W] centres of the bounding spheres."""
-    placed: np.ndarray
-    """[groups] whether the group's positions are those of this block."""
-    near: np.ndarray
-    """[obstacles] whether the obstacle touches the group's bounding sphere."""
-    scratch: np.ndarray
-    """[W] hits of bounding spheres, not read; what the grid of points says."""
-    hits: np.ndarray
-    """[W] hits of each lane."""
+    row: np.ndarray
+    """[1, 3 * W] positions of a row of spheres."""
 
 
 @njit(cache=True)
 def make_workspace(robot, scene):
     """Scratch memory for one thread."""
-    frames = np.zeros((len(robot.offsets) + 1, 12 * W), np.float32)
+    frames = lanes_array(len(robot.offsets) + 1, 12)
     for k in (0, 4, 8):
         frames[0, k * W : (k + 1) * W] = 1.0
-    obstacles = len(scene.spheres) + len(scene.boxes) + len(scene.cylinders) + len(scene.capsules) + 1
-    return Workspace(
-        frames,
-        np.zeros((len(robot.spheres), 3 * W), np.float32),
-        np.zeros((len(robot.frame), 3 * W), np.float32),
-        np.zeros(len(robot.frame), np.bool_),
-        np.zeros(obstacles, np.bool_),
-        np.zeros(W, np.int32),
-        np.zeros(W, np.int32),
+    return Workspace(frames, lanes_array(len(robot.frame), 3), lanes_array(1, 3))
+
+
+@allocation_free(forceinline=True)
+def _touching(x, y, z, radius, solids, k):
+    """The lanes whose sphere touches an obstacle."""
+    dx, dy, dz = x - solids[k, 0], y - solids[k, 1], z - solids[k, 2]
+    u = dx * solids[k, 3] + dy * solids[k, 4] + dz * solids[k, 5]
+    v = dx * solids[k, 6] + dy * solids[k, 7] + dz * solids[k, 8]
+    w = dx * solids[k, 9] + dy * solids[k, 10] + dz * solids[k, 11]
+    w = greatest(magnitude(w) - solids[k, 14], _ZERO)
+    reach = radius + solids[k, 15]
+    if solids[k, 16] > _ZERO:
+        r = greatest(root(u * u + v * v) - solids[k, 12], _ZERO)
+        return r * r + w * w < reach * reach
+    u = greatest(magnitude(u) - solids[k, 12], _ZERO)
+    v = greatest(magnitude(v) - solids[k, 13], _ZERO)
+    return u * u + v * v + w * w < reach * reach
+
+
+@allocation_free(forceinline=True)
+def _coordinate(frames, f, i, k, x, y, z):
+    """Number k of the position of a point, or of points in lanes, of frame f in lane i."""
+    return (
+        x * frames[f, 3 * k * W + i]
+        + y * frames[f, (3 * k + 1) * W + i]
+        + z * frames[f, (3 * k + 2) * W + i]
+        + frames[f, (9 + k) * W + i]
     )
 
 
-@allocation_free(inline="always")
-def _place_group(robot, g, work):
-    if not work.placed[g]:
-        for s in range(robot.first[g], robot.first[g + 1]):
-            place(work.frames, robot.frame[g], robot.spheres, s, work.positions, s)
-        work.placed[g] = True
+@allocation_free(forceinline=True)
+def _place_row(robot, row, frames, f, i):
+    """Positions of a row of spheres in lane i of the configurations."""
+    x, y, z = load(robot.rows, row, 0), load(robot.rows, row, 1), load(robot.rows, row, 2)
+    return (
+        _coordinate(frames, f, i, 0, x, y, z),
+        _coordinate(frames, f, i, 1, x, y, z),
+        _coordinate(frames, f, i, 2, x, y, z),
+    )
 
 
-@allocation_free(inline="always")
-def place_frames(robot, q, frames, centres):
-    """Frames of 16 configurations, and the centres of the bounding spheres of all groups."""
-    for j in range(len(robot.offsets)):
-        if robot.offsets[j, 12] > _ZERO:
-            _slide(frames[j], frames[j + 1], robot.offsets[j], q[j])
-        else:
-            _turn(frames[j], frames[j + 1], robot.offsets[j], q[j])
-    for g in range(len(robot.frame)):
-        place(frames, robot.frame[g], robot.bounds, g, centres, g)
+@allocation_free(forceinline=True)
+def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
+    """Those of the lanes `near` in which a group touches an obstacle."""
+    hits, f = 0, robot.frame[g]
+    first, last = robot.first_row[g], robot.first_row[g + 1]
+    for row in range(first, last):
+        open_lanes = near & ~hits
+        if last - first > 1:
+            x, y, z = _centres_of(frames, f, robot.row_bounds, row)
+            open_lanes &= _touching(x, y, z, robot.row_bounds[row, 3] + padding, solids, k)
+        while open_lanes:
+            i = first_lane(open_lanes)
+            open_lanes &= open_lanes - 1
+            x, y, z = _place_row(robot, row, frames, f, i)
+            if _touching(x, y, z, load(robot.rows, row, 3) + padding, solids, k) != 0:
+                hits |= 1 << i
+                if stop_at_first:
+                    return hits
+    return hits
 
 
-@allocation_free(inline="always")
+@allocation_free(forceinline=True)
+def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
+    """Those of the lanes `near` in which a group touches a point."""
+    hits, f = 0, robot.frame[g]
+    first, last = robot.first_row[g], robot.first_row[g + 1]
+    for row in range(first, last):
+        open_lanes = near & ~hits
+        if last - first > 1:
+            x, y, z = _centres_of(frames, f, robot.row_bounds, row)
+            open_lanes &= near_points(x, y, z, robot.row_bounds[row, 3] + padding, scene)
+        while open_lanes:
+            i = first_lane(open_lanes)
+            open_lanes &= open_lanes - 1
+            x, y, z = _place_row(robot, row, frames, f, i)
+            if touch_points(x, y, z, load(robot.rows, row, 3) + padding, scene):
+                hits |= 1 << i
+                if stop_at_first:
+                    return hits
+    return hits
+
+
+@allocation_free(forceinline=True)
+def _touching_balls(x, y, z, radius, u, v, w, other):
+    """The lanes in which two spheres touch each other."""
+    dx, dy, dz, reach = x - u, y - v, z - w, radius + other
+    return dx * dx + dy * dy + dz * dz < reach * reach
+
+
+@allocation_free(forceinline=True)
+def _touching_each_other(robot, a, b, near, stop_at_first, work):
+    """Those of the lanes `near` in which two groups touch each other."""
+    hits, frames, bounds = 0, work.frames, robot.row_bounds
+    for row in range(robot.first_row[a], robot.first_row[a + 1]):
+        x, y, z = _centres_of(frames, robot.frame[a], bounds, row)
+        u, v, w = load(work.centres, b, 0), load(work.centres, b, 1), load(work.centres, b, 2)
+        near_row = near & ~hits & _touching_balls(x, y, z, bounds[row, 3], u, v, w, robot.bounds[b, 3])
+        if near_row == 0:
+            continue
+        for other in range(robot.first_row[b], robot.first_row[b + 1]):
+            u, v, w = _centres_of(frames, robot.frame[b], bounds, other)
+            open_lanes = near_row & ~hits
+            open_lanes &= _touching_balls(x, y, z, bounds[row, 3], u, v, w, bounds[other, 3])
+            while open_lanes:
+                i = first_lane(open_lanes)
+                open_lanes &= open_lanes - 1
+                if _rows_touch(robot, row, robot.frame[a], other, robot.frame[b], i, work):
+                    hits |= 1 << i
+                    if stop_at_first:
+                        return hits
+    return hits
+
+
+@allocation_free(forceinline=True)
+def _rows_touch(robot, row, f, other, g, i, work):
+    """Whether a row of spheres of frame f touches another of frame g in lane i."""
+    x, y, z = _place_row(robot, row, work.frames, f, i)
+    u, v, w = _place_row(robot, other, work.frames, g, i)
+    radius, placed = load(robot.rows, row, 3), work.row
+    store(placed, 0, 0, u)
+    store(placed, 0, 1, v)
+    store(placed, 0, 2, w)
+    for t in range(W):
+        radii = radius + robot.rows[other, 3 * W + t]
+        if _touching_balls(x, y, z, radii, placed[0, t], placed[0, W + t], placed[0, 2 * W + t], _ZERO):
+            return True
+    return False
+
+
+@allocation_free(forceinline=True)
 def _hits_scene(robot, scene, padding, stop_at_first, work):
-    any_hit = False
+    hits = 0
+    frames, around, solids = work.frames, scene.around, scene.solids
     for g in range(len(robot.frame)):
         if robot.frame[g] == 0:
             continue
+        x, y, z = load(work.centres, g, 0), load(work.centres, g, 1), load(work.centres, g, 2)
+        x0, x1, y0, y1, z0, z1 = lowest(x), highest(x), lowest(y), highest(y), lowest(z), highest(z)
         reach = robot.bounds[g, 3] + padding
-        if _touch_scene(work.centres, g, reach, scene, work.near, True, work.scratch, work.scratch) == 0:
-            continue
-        _place_group(robot, g, work)
-        for s in range(robot.first[g], robot.first[g + 1]):
-            reach = robot.spheres[s, 3] + padding
-            if _touch_scene(work.positions, s, reach, scene, work.near, False, work.scratch, work.hits) > 0:
-                any_hit = True
-                if stop_at_first:
-                    return True
-        if any_hit and _all_lanes_hit(work.hits):
-            return True
-    return any_hit
+        for row in range(len(around)):
+            dx = greatest(greatest(load(around, row, 0) - x1, x0 - load(around, row, 3)), _ZERO)
+            dy = greatest(greatest(load(around, row, 1) - y1, y0 - load(around, row, 4)), _ZERO)
+            dz = greatest(greatest(load(around, row, 2) - z1, z0 - load(around, row, 5)), _ZERO)
+            close = dx * dx + dy * dy + dz * dz < reach * reach
+            while close:
+                k = row * W + first_lane(close)
+                close &= close - 1
+                near = _touching(x, y, z, reach, solids, k) & ~hits
+                if near:
+                    hits |= _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first)
+                    if stop_at_first and hits:
+                        return hits
+        if len(scene.points) and not far_from_points(scene, x0, x1, y0, y1, z0, z1, reach):
+            near = near_points(x, y, z, reach, scene) & ~hits
+            if near:
+                hits |= _touching_points(robot, g, frames, near, padding, scene, stop_at_first)
+                if stop_at_first and hits:
+                    return hits
+        if hits == ALL:
+            return hits
+    return hits
 
 
-@allocation_free()
-def _open_pairs(robot, table, q):
-    """Bits of the table's pairs that may touch in any of 16 lanes; see `near_pairs.py`."""
+@allocation_free(forceinline=True)
+def _open_lanes(robot, table, bit, q):
+    """The lanes in which a pair may touch by its table; see `near_pairs.py`."""
     row = robot.near[table]
-    first, second = q[np.int32(row[0])], q[np.int32(row[3])]
-    low1, per1, low2, per2 = row[1], row[2], row[4], row[5]
-    last = np.float32(SIDE - 1)
-    found = np.int32(0)
-    for i in range(W):
-        k = np.int32(min(max((first[i] - low1) * per1, _ZERO), last)) * np.int32(SIDE)
-        k += np.int32(min(max((second[i] - low2) * per2, _ZERO), last))
-        found |= np.int32(row[HEAD + k])
-    return found
+    first, second = load(q, np.int32(row[0]), 0), load(q, np.int32(row[3]), 0)
+    i = least(greatest((first - row[1]) * row[2], _ZERO), np.float32(SIDE - 1))
+    j = least(greatest((second - row[4]) * row[5], _ZERO), np.float32(SIDE - 1))
+    cells = gather(row, whole(i) * np.float32(SIDE) + whole(j) + np.float32(HEAD))
+    return lanes_with(cells, bit)
 
 
-@allocation_free(inline="always")
-def _hits_itself(robot, q, stop_at_first, work):
-    any_hit = False
-    known, opened = -1, np.int32(0)
-    positions, centres, scratch, hits = work.positions, work.centres, work.scratch, work.hits
-    spheres, bounds, first = robot.spheres, robot.bounds, robot.first
+@allocation_free(forceinline=True)
+def _hits_itself(robot, q, hits, stop_at_first, work):
+    """`hits` and the lanes in which a checked pair of links touches."""
+    centres, bounds = work.centres, robot.bounds
     for p in range(len(robot.pairs)):
-        table = robot.pairs[p, 2]
+        a, b, table, bit = robot.pairs[p, 0], robot.pairs[p, 1], robot.pairs[p, 2], robot.pairs[p, 3]
+        x, y, z = load(centres, a, 0), load(centres, a, 1), load(centres, a, 2)
+        u, v, w = load(centres, b, 0), load(centres, b, 1), load(centres, b, 2)
+        near = _touching_balls(x, y, z, bounds[a, 3], u, v, w, bounds[b, 3]) & ~hits
         if table >= 0:
-            if table != known:
-                known, opened = table, _open_pairs(robot, table, q)
-            if not opened & robot.pairs[p, 3]:
-                continue
-        a, b = robot.pairs[p, 0], robot.pairs[p, 1]
-        if _touch_each_other(centres, a, centres, b, bounds[a, 3] + bounds[b, 3], scratch) == 0:
-            continue
-        _place_group(robot, a, work)
-        _place_group(robot, b, work)
-        for s in range(first[a], first[a + 1]):
-            radius = spheres[s, 3]
-            if _touch_each_other(positions, s, centres, b, radius + bounds[b, 3], scratch) == 0:
-                continue
-            for t in range(first[b], first[b + 1]):
-                if _touch_each_other(positions, s, positions, t, radius + spheres[t, 3], hits) > 0:
-                    any_hit = True
-                    if stop_at_first:
-                        return True
-        if any_hit and _all_lanes_hit(hits):
-            return True
-    return any_hit
+            near &= _open_lanes(robot, table, bit, q)
+        if near:
+            hits |= _touching_each_other(robot, a, b, near, stop_at_first, work)
+            if stop_at_first and hits:
+                return hits
+    return hits
 
 
 @allocation_free()
 def block_hits(robot, scene, q, padding, stop_at_first, work):
-    """Collisions of 16 configurations, q[dof, 16]; `work.hits` counts them by lane.
+    """The configurations of q[dof, 16] that collide: bit i tells of column i.
 
-    `padding` [m] is added to the radii towards the scene. With `stop_at_first` it returns at the first
-    link or pair that collides in any lane, otherwise when all lanes are decided. Returns whether any lane
-    collides.
+    `padding` [m] is added to the radii towards the scene. With `stop_at_first` one that collides is enough.
     """
-    work.hits[:] = 0
-    work.placed[:] = False
     place_frames(robot, q, work.frames, work.centres)
-    any_hit = _hits_scene(robot, scene, padding, stop_at_first, work)
-    if any_hit and (stop_at_first or _all_lanes_hit(work.hits)):
-        return True
-    return _hits_itself(robot, q, stop_at_first, work) or any_hit
+    hits = _hits_scene(robot, scene, padding, stop_at_first, work)
+    if hits == ALL or (stop_at_first and hits):
+        return hits
+    return _hits_itself(robot, q, hits, stop_at_first, work)
 
 
 @njit(cache=True, nogil=True)
@@ -360,14 +349,13 @@ def free_many(robot, scene, q, padding):
     n, dof = q.shape
     out = np.empty(n, np.bool_)
     work = make_workspace(robot, scene)
-    hits = work.hits
     block = np.empty((dof, W), np.float32)
     for start in range(0, n, W):
         for i in range(W):
             row = min(start + i, n - 1)
             for j in range(dof):
                 block[j, i] = q[row, j]
-        block_hits(robot, scene, block, padding, False, work)
+        hits = block_hits(robot, scene, block, padding, False, work)
         for i in range(min(W, n - start)):
-            out[start + i] = hits[i] == 0
+            out[start + i] = not hits >> i & 1
     return out

@@ -6,7 +6,8 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.lanes import W, block_hits, make_workspace
+from robotdiffuse.collision.kernels.lanes import block_hits, make_workspace
+from robotdiffuse.collision.kernels.simd import W, ramp, store
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 RELAXATION_SLOPE = np.float32(0.1)
@@ -102,10 +103,9 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
     blocks = max(int(np.ceil(travel / space.resolution / np.float32(W))), 1)
     step = (t - s) / np.float32(blocks * W)
     for k in range(blocks):
+        shares = (ramp() * np.float32(blocks) + np.float32(blocks - k)) * step
         for j in range(dof):
-            origin, delta = a[j] + s * (b[j] - a[j]), b[j] - a[j]
-            for i in range(W):
-                block[j, i] = origin + np.float32(i * blocks + (blocks - k)) * step * delta
+            store(block, j, 0, shares * (b[j] - a[j]) + (a[j] + s * (b[j] - a[j])))
         if block_hits(space.robot, space.scene, block, padding, True, work):
             return False
     return True

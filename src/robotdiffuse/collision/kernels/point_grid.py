@@ -11,9 +11,18 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.simd import (
+    W,
+    first_lane,
+    gather,
+    greatest,
+    lane,
+    least,
+    load,
+    root,
+    whole,
+)
 
-W = 16
-"""Lanes: configurations per block."""
 KEEP = np.float32(0.3)
 """Points are known this far beyond the robot's reach; clearances to points count as at most this [m]."""
 _ZERO = np.float32(0.0)
@@ -147,64 +156,121 @@ def _closer(distances, nearest, at, n, base, z, voxel, p, band):
         nearest[at + k] = p if closer else nearest[at + k]
 
 
-@allocation_free(fastmath=True)
-def grid_states(at, s, radius, grid, frame, state):
-    """What the grid says of a sphere in 16 lanes: 0 free, 2 touches a point, 1 unknown. Returns their sum."""
-    nx, ny, nz = np.int32(frame[8]), np.int32(frame[9]), np.int32(frame[10])
-    band = frame[7]
-    lx, ly, lz, voxel = frame[0], frame[1], frame[2], frame[3]
+@allocation_free(forceinline=True)
+def _ask_grid(x, y, z, radius, scene):
+    """What the grid says of spheres in 16 lanes: those that may touch a point, and those that surely do."""
+    frame = scene.grid_frame
+    band, voxel = frame[7], frame[3]
     inverse = _ONE / voxel
-    free = radius + frame[5] + _SLACK
-    hit = radius + frame[6] - _SLACK
-    mx, my, mz = np.float32(nx) - _HALF, np.float32(ny) - _HALF, np.float32(nz) - _HALF
-    total = 0
-    for i in range(W):
-        fx, fy, fz = (
-            (at[s, i] - lx) * inverse,
-            (at[s, W + i] - ly) * inverse,
-            (at[s, 2 * W + i] - lz) * inverse,
-        )
-        cx, cy, cz = min(max(fx, _ZERO), mx), min(max(fy, _ZERO), my), min(max(fz, _ZERO), mz)
-        ix, iy, iz = np.int32(cx), np.int32(cy), np.int32(cz)
-        g = grid[(ix * ny + iy) * nz + iz]
-        ex, ey, ez = cx - np.float32(ix) - _HALF, cy - np.float32(iy) - _HALF, cz - np.float32(iz) - _HALF
-        e = voxel * np.sqrt(ex * ex + ey * ey + ez * ez)
-        ox, oy, oz = fx - cx, fy - cy, fz - cz
-        out = voxel * voxel * (ox * ox + oy * oy + oz * oz)
-        inner = max(g - e, _ZERO)
-        near = np.int32(inner * inner + out < free * free)
-        inside = np.int32(g + e + np.sqrt(out) < hit) * np.int32(g < band)
-        state[i] = near + near * inside
-        total += near + near * inside
-    return total
+    fx, fy, fz = (x - frame[0]) * inverse, (y - frame[1]) * inverse, (z - frame[2]) * inverse
+    cx = least(greatest(fx, _ZERO), frame[8] - _HALF)
+    cy = least(greatest(fy, _ZERO), frame[9] - _HALF)
+    cz = least(greatest(fz, _ZERO), frame[10] - _HALF)
+    ix, iy, iz = whole(cx), whole(cy), whole(cz)
+    g = gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz)
+    ex, ey, ez = cx - ix - _HALF, cy - iy - _HALF, cz - iz - _HALF
+    e = root(ex * ex + ey * ey + ez * ez) * voxel
+    ox, oy, oz = fx - cx, fy - cy, fz - cz
+    out = (ox * ox + oy * oy + oz * oz) * (voxel * voxel)
+    inner = greatest(g - e, _ZERO)
+    free = radius + (frame[5] + _SLACK)
+    near = inner * inner + out < free * free
+    inside = (g + e + root(out) < radius + (frame[6] - _SLACK)) & (g < band)
+    return near, near & inside
 
 
 @allocation_free()
-def touch_points(at, s, radius, scene, mark, state, hits):
-    """Adds 1 to the lanes whose sphere touches a point; returns how many there are, with `mark` at least."""
-    near = grid_states(at, s, radius, scene.grid, scene.grid_frame, state)
-    if mark or near == 0:
-        return near
-    total = 0
-    for i in range(W):
-        if state[i] == 2 or (
-            state[i] == 1 and _touches(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], radius)
-        ):
-            hits[i] += 1
-            total += 1
-    return total
+def far_from_points(scene, x0, x1, y0, y1, z0, z1, radius):
+    """Whether no sphere with its centre in a box touches a point, from the middle of the box."""
+    lower, _, _ = _look_up(scene, _HALF * (x0 + x1), _HALF * (y0 + y1), _HALF * (z0 + z1))
+    dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
+    return lower > radius + _HALF * np.sqrt(dx * dx + dy * dy + dz * dz) + _SLACK
+
+
+@allocation_free()
+def near_points(x, y, z, radius, scene):
+    """The lanes whose sphere may touch a point."""
+    return _ask_grid(x, y, z, radius, scene)[0]
+
+
+@allocation_free()
+def _near_by_eight(x, y, z, radius, scene):
+    """The lanes whose sphere may touch a point, as far as the eight voxels around its centre can tell: of
+    their bounds, that of the voxel straight away from the nearest point hardly loses anything."""
+    frame = scene.grid_frame
+    inverse = _ONE / frame[3]
+    fx = least(greatest((x - frame[0]) * inverse, _ZERO), frame[8] - _HALF)
+    fy = least(greatest((y - frame[1]) * inverse, _ZERO), frame[9] - _HALF)
+    fz = least(greatest((z - frame[2]) * inverse, _ZERO), frame[10] - _HALF)
+    lx = least(whole(greatest(fx - _HALF, _ZERO)), frame[8] - np.float32(2.0))
+    ly = least(whole(greatest(fy - _HALF, _ZERO)), frame[9] - np.float32(2.0))
+    lz = least(whole(greatest(fz - _HALF, _ZERO)), frame[10] - np.float32(2.0))
+    bound = fx * _ZERO
+    for corner in range(8):
+        ix, iy, iz = (
+            lx + np.float32(corner >> 2),
+            ly + np.float32((corner >> 1) & 1),
+            lz + np.float32(corner & 1),
+        )
+        ex, ey, ez = fx - ix - _HALF, fy - iy - _HALF, fz - iz - _HALF
+        e = root(ex * ex + ey * ey + ez * ez) * frame[3]
+        bound = greatest(bound, gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz) - e)
+    return bound < radius + (frame[5] + _SLACK)
+
+
+@allocation_free()
+def touch_points(x, y, z, radius, scene):
+    """Whether a sphere in any of 16 lanes touches a point."""
+    near, inside = _ask_grid(x, y, z, radius, scene)
+    if inside:
+        return True
+    if near:
+        near &= _near_by_eight(x, y, z, radius, scene)
+    while near:
+        i = first_lane(near)
+        near &= near - 1
+        if _touches(scene, lane(x, i), lane(y, i), lane(z, i), lane(radius, i)):
+            return True
+    return False
 
 
 @allocation_free()
 def _touches(scene, x, y, z, radius):
+    """Whether a sphere touches a point: the one that the grid knows, or another in the cells around."""
+    frame, rows = scene.grid_frame, scene.point_rows
     _, _, p = _look_up(scene, x, y, z)
     if p >= 0:
         point = scene.points[p]
         dx, dy, dz, r = point[0] - x, point[1] - y, point[2] - z, radius + point[3]
         if dx * dx + dy * dy + dz * dz < r * r:
             return True
-    best, _ = _search(scene, x, y, z, radius, True)
-    return best < radius
+    cell, reach = frame[4], radius + frame[5] + _SLACK
+    if reach <= _ZERO:
+        return False
+    mx, my, mz = int(frame[11]), int(frame[12]), int(frame[13])
+    rx, ry, rz = x - frame[0], y - frame[1], z - frame[2]
+    i0, i1 = max(int((rx - reach) / cell), 0), min(int((rx + reach) / cell), mx - 1)
+    j0, j1 = max(int((ry - reach) / cell), 0), min(int((ry + reach) / cell), my - 1)
+    for i in range(i0, i1 + 1):
+        gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), _ZERO)
+        for j in range(j0, j1 + 1):
+            gy = max(max(np.float32(j) * cell - ry, ry - np.float32(j + 1) * cell), _ZERO)
+            rest = reach * reach - gx * gx - gy * gy
+            if rest <= _ZERO:
+                continue
+            half = np.sqrt(rest) + _SLACK
+            k0, k1 = max(int((rz - half) / cell), 0), min(int((rz + half) / cell), mz - 1)
+            if k0 > k1:
+                continue
+            column = (i * my + j) * mz
+            # sixteen points at once, and those beside them that are further away
+            first, last = scene.cell_first[column + k0], scene.cell_first[column + k1 + 1]
+            for row in range(first // W, (last + W - 1) // W):
+                dx, dy, dz = load(rows, row, 0) - x, load(rows, row, 1) - y, load(rows, row, 2) - z
+                r = load(rows, row, 3) + radius
+                if dx * dx + dy * dy + dz * dz < r * r:
+                    return True
+    return False
 
 
 @allocation_free()
@@ -226,15 +292,15 @@ def _look_up(scene, x, y, z):
 
 
 @allocation_free(fastmath=True)
-def _search(scene, x, y, z, limit, any_hit):
-    """Distance to the surface of the nearest point (with `any_hit`: of any) below `limit`, else `limit`."""
+def _search(scene, x, y, z, limit):
+    """Distance to the surface of the nearest point below `limit`, else `limit`."""
     points, first, frame = scene.points, scene.cell_first, scene.grid_frame
     cell = frame[4]
     mx, my, mz = int(frame[11]), int(frame[12]), int(frame[13])
     reach = limit + frame[5] + _SLACK
-    best, where = limit, -1
+    best = limit
     if reach <= _ZERO:
-        return best, where
+        return best
     rx, ry, rz = x - frame[0], y - frame[1], z - frame[2]
     i0, i1 = max(int((rx - reach) / cell), 0), min(int((rx + reach) / cell), mx - 1)
     j0, j1 = max(int((ry - reach) / cell), 0), min(int((ry + reach) / cell), my - 1)
@@ -255,13 +321,11 @@ def _search(scene, x, y, z, limit, any_hit):
                 r = best + points[p, 3]
                 square = dx * dx + dy * dy + dz * dz
                 if r > _ZERO and square < r * r:
-                    best, where = np.sqrt(square) - points[p, 3], p
-                    if any_hit:
-                        return best, where
+                    best = np.sqrt(square) - points[p, 3]
             reach = best + frame[5] + _SLACK
             if reach <= _ZERO:
-                return best, where
-    return best, where
+                return best
+    return best
 
 
 @allocation_free()
@@ -278,8 +342,7 @@ def points_distance(scene, x, y, z, limit):
     point = scene.points[p]
     dx, dy, dz = point[0] - x, point[1] - y, point[2] - z
     best = min(np.sqrt(dx * dx + dy * dy + dz * dz) - point[3], limit)
-    found, _ = _search(scene, x, y, z, best, False)
-    return min(found, best)
+    return _search(scene, x, y, z, best)
 
 
 @allocation_free()

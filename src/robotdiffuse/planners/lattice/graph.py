@@ -113,9 +113,9 @@ def check_nodes(space, lattice, table, count, scratch):
         _configuration(lattice, scratch.other, scratch.a)
         for j in range(len(scratch.a)):
             scratch.block[j, i] = scratch.a[j]
-    block_hits(space.robot, space.scene, scratch.block, space.padding, False, scratch.work)
+    hits = block_hits(space.robot, space.scene, scratch.block, space.padding, False, scratch.work)
     for i in range(count):
-        table.state[scratch.pending[i]] = FREE if scratch.work.hits[i] == 0 else BLOCKED
+        table.state[scratch.pending[i]] = BLOCKED if hits >> i & 1 else FREE
 
 
 @allocation_free(inline="always")

@@ -1,0 +1,258 @@
+"""Sixteen float32 numbers as one value in compiled code: the type `Lanes`, LLVM's <16 x float>.
+
+Loops over lanes need not be recognised by LLVM then: whatever is written on lanes becomes SIMD instructions,
+one each with AVX-512, two with AVX2, four with SSE or NEON, without any setting. `+ - *` work on lanes and
+on a lane and a float32, which stands in all lanes; `a < b` is an int64 whose bit i tells of lane i.
+Arithmetic may be contracted to fused multiplications and knows no NaN.
+"""
+
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import njit
+from numba.core import cgutils, types
+from numba.core.datamodel.models import PrimitiveModel
+from numba.core.datamodel.registry import register_default
+from numba.core.imputils import lower_builtin, lower_cast
+from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic
+from numpy import ndarray
+
+W = 16
+"""Lanes: configurations per block, or spheres, or obstacles."""
+_FLAGS = ("nnan", "nsz", "contract")
+_FLOAT, _BITS = ir.FloatType(), ir.IntType(64)
+_VECTOR = ir.VectorType(_FLOAT, W)
+_INTEGERS = ir.VectorType(ir.IntType(32), W)
+_EVERYWHERE = ir.Constant(_INTEGERS, [0] * W)
+_ALIGN = 4
+
+
+class LanesType(types.Type):
+    """Numba's type of 16 float32 numbers."""
+
+    def __init__(self) -> None:
+        super().__init__(name="Lanes")
+
+
+LANES = LanesType()
+
+
+@register_default(LanesType)
+class _LanesModel(PrimitiveModel):
+    def __init__(self, dmm: Any, fe_type: types.Type) -> None:
+        super().__init__(dmm, fe_type, _VECTOR)
+
+
+def _splat(builder: Any, scalar: Any) -> Any:
+    single = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), scalar, ir.Constant(_BITS, 0))
+    return builder.shuffle_vector(single, ir.Constant(_VECTOR, ir.Undefined), _EVERYWHERE)
+
+
+@lower_cast(types.float32, LanesType)
+def _float_to_lanes(_context: Any, builder: Any, _from: Any, _to: Any, value: Any) -> Any:
+    return _splat(builder, value)
+
+
+def _call(builder: Any, name: str, arguments: list[Any], result: ir.Type = _VECTOR) -> Any:
+    """An LLVM intrinsic for vectors of 16 float32 numbers."""
+    kind = ir.FunctionType(result, [argument.type for argument in arguments])
+    function = cgutils.get_or_insert_function(builder.module, kind, f"llvm.{name}.v{W}f32")
+    return builder.call(function, arguments, fastmath=_FLAGS)
+
+
+def _mask(builder: Any, bits: Any) -> Any:
+    return builder.zext(builder.bitcast(bits, ir.IntType(W)), _BITS)
+
+
+def _operation(generated: Callable) -> Any:
+    """What is called on lanes: from the types of the arguments its signature and code generator."""
+    return intrinsic(generated)
+
+
+def _define_operator(function: Callable, result: types.Type, build: Callable[[Any, Any, Any], Any]) -> None:
+    """`build` takes the builder and two vectors."""
+
+    class Template(AbstractTemplate):
+        key = function
+
+        def generic(self, args: tuple, kws: dict) -> Any:
+            if len(args) == 2 and LANES in args and all(arg in (LANES, types.float32) for arg in args):
+                return signature(result, LANES, LANES)
+            return None
+
+    infer_global(function, types.Function(Template))
+
+    @lower_builtin(function, LANES, LANES)
+    def lowered(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
+        return build(builder, *args)
+
+
+_define_operator(operator.add, LANES, lambda builder, a, b: builder.fadd(a, b, flags=_FLAGS))
+_define_operator(operator.sub, LANES, lambda builder, a, b: builder.fsub(a, b, flags=_FLAGS))
+_define_operator(operator.mul, LANES, lambda builder, a, b: builder.fmul(a, b, flags=_FLAGS))
+_define_operator(
+    operator.lt,
+    types.int64,
+    lambda builder, a, b: _mask(builder, builder.fcmp_ordered("<", a, b, flags=_FLAGS)),
+)
+
+
+def _elementwise(name: str, count: int) -> Any:
+    """An intrinsic of LLVM on so many lanes or float32 numbers."""
+    known = (LANES, types.float32)
+
+    def generated(context: Any, *args: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, values: Any) -> Any:
+            given = [context.cast(builder, v, t, LANES) for v, t in zip(values, args, strict=True)]
+            return _call(builder, name, given)
+
+        return (LANES(*args), codegen) if all(arg in known for arg in args) else None
+
+    if count == 1:
+        return _operation(lambda context, a: generated(context, a))
+    return _operation(lambda context, a, b: generated(context, a, b))
+
+
+least = _elementwise("minnum", 2)
+greatest = _elementwise("maxnum", 2)
+magnitude = _elementwise("fabs", 1)
+with_sign = _elementwise("copysign", 2)
+root = _elementwise("sqrt", 1)
+whole = _elementwise("floor", 1)
+
+
+def _reduction(name: str) -> Any:
+    def generated(_context: Any, a: Any) -> Any:
+        def codegen(_context: Any, builder: Any, _sig: Any, values: Any) -> Any:
+            return _call(builder, f"vector.reduce.{name}", list(values), _FLOAT)
+
+        return (types.float32(a), codegen) if a == LANES else None
+
+    return _operation(generated)
+
+
+lowest = _reduction("fmin")
+highest = _reduction("fmax")
+
+
+def _address(context: Any, builder: Any, array_type: Any, array: Any, row: Any, part: Any) -> Any:
+    """Of the sixteen numbers from 16 * part on in a row of a contiguous array."""
+    struct = context.make_array(array_type)(context, builder, array)
+    columns = cgutils.unpack_tuple(builder, struct.shape, 2)[1]
+    size = columns.type
+    start = builder.add(
+        builder.mul(builder.sext(row, size) if row.type != size else row, columns),
+        builder.mul(builder.sext(part, size) if part.type != size else part, ir.Constant(size, W)),
+    )
+    return builder.gep(struct.data, [start])
+
+
+def _holds_floats(array: Any, dimensions: int) -> bool:
+    return isinstance(array, types.Array) and (array.dtype, array.ndim, array.layout) == (
+        types.float32,
+        dimensions,
+        "C",
+    )
+
+
+@_operation
+def ramp(_context: Any) -> Any:
+    """The number of each lane."""
+    return LANES(), lambda *_: ir.Constant(_VECTOR, [float(i) for i in range(W)])
+
+
+@_operation
+def load(_context: Any, array: Any, row: Any, part: Any) -> Any:
+    """Lanes from array[row, 16 * part :] of a C-contiguous float32 array."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        where = _address(context, builder, sig.args[0], *args)
+        return builder.load(builder.bitcast(where, _VECTOR.as_pointer()), align=_ALIGN, typ=_VECTOR)
+
+    return (LANES(array, row, part), codegen) if _holds_floats(array, 2) else None
+
+
+@_operation
+def store(_context: Any, array: Any, row: Any, part: Any, value: Any) -> Any:
+    """Lanes to array[row, 16 * part :] of a C-contiguous float32 array."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        where = _address(context, builder, sig.args[0], *args[:3])
+        builder.store(args[3], builder.bitcast(where, _VECTOR.as_pointer()), align=_ALIGN)
+        return context.get_dummy_value()
+
+    return (
+        (types.void(array, row, part, value), codegen) if _holds_floats(array, 2) and value == LANES else None
+    )
+
+
+@_operation
+def gather(_context: Any, array: Any, index: Any) -> Any:
+    """Lanes from the places of a contiguous float32 array that the index, whole numbers, tells."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        places: Any = builder.gep(data, [builder.fptosi(args[1], _INTEGERS)], source_etype=_FLOAT)
+        places.type = ir.VectorType(ir.PointerType(), W)  # which llvmlite does not know of vectors of indices
+        everywhere = ir.Constant(ir.VectorType(ir.IntType(1), W), [1] * W)
+        given = [places, ir.Constant(ir.IntType(32), _ALIGN), everywhere, ir.Constant(_VECTOR, ir.Undefined)]
+        kind = ir.FunctionType(_VECTOR, [value.type for value in given])
+        name = f"llvm.masked.gather.v{W}f32.v{W}p0"
+        return builder.call(cgutils.get_or_insert_function(builder.module, kind, name), given)
+
+    return (LANES(array, index), codegen) if _holds_floats(array, 1) and index == LANES else None
+
+
+@_operation
+def lane(_context: Any, a: Any, i: Any) -> Any:
+    """The number in lane i."""
+
+    def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
+        return builder.extract_element(*args)
+
+    return (types.float32(a, i), codegen) if a == LANES else None
+
+
+@_operation
+def lanes_with(_context: Any, a: Any, bit: Any) -> Any:
+    """The lanes whose whole number has a bit of `bit`."""
+
+    def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
+        numbers = builder.fptosi(args[0], _INTEGERS)
+        single = builder.insert_element(ir.Constant(_INTEGERS, ir.Undefined), args[1], ir.Constant(_BITS, 0))
+        wanted = builder.shuffle_vector(single, ir.Constant(_INTEGERS, ir.Undefined), _EVERYWHERE)
+        there = builder.and_(numbers, wanted)
+        return _mask(builder, builder.icmp_unsigned("!=", there, ir.Constant(_INTEGERS, [0] * W)))
+
+    return (types.int64(a, bit), codegen) if a == LANES and bit == types.int32 else None
+
+
+@_operation
+def first_lane(_context: Any, mask: Any) -> Any:
+    """The number of the lowest bit that is set."""
+
+    def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
+        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
+
+    return (types.int64(mask), codegen) if mask == types.int64 else None
+
+
+@njit(cache=True)
+def lanes_array(rows, parts):
+    """Zeros [rows, parts * 16] that begin at a cache line, so that no load or store of lanes touches two."""
+    size = rows * parts * W
+    memory = np.zeros(size + W, np.float32)
+    start = -(memory.ctypes.data // 4) % W
+    return memory[start : start + size].reshape((rows, parts * W))
+
+
+def by_sixteen(rows: ndarray, fill: ndarray) -> ndarray:
+    """Rows of [n, k] numbers by sixteen, [ceil(n / 16), k * 16]: sixteen of the first numbers, of the second
+    and so on. The last sixteen are filled up with `fill`, one row."""
+    n, k = rows.shape
+    filled = np.concatenate([rows, np.repeat(fill, -n % W, axis=0)]).astype(np.float32)
+    return np.ascontiguousarray(filled.reshape(-1, W, k).swapaxes(1, 2)).reshape(-1, k * W)
