@@ -50,6 +50,8 @@ REPEATS = 50
 """Of each path, back and forth, in the timing of the kernel."""
 RESOLUTION, POINT_RADIUS = 0.05, 0.01
 """[m]"""
+JERK = 100.0
+"""[rad/s³]"""
 TIGHT = (0.001, 0.01, 0.05, 0.1, 1.0)
 
 
@@ -208,6 +210,7 @@ def limits(cases: Sequence[Case], _lengths: dict) -> None:
 
 def timing(cases: Sequence[Case], _lengths: dict) -> None:
     planner, ratios, worst, times = load_planner("aorrtc"), [], [0.0, 0.0], [[], []]
+    longer, jerk = [], 0.0
     rng = np.random.default_rng(SEED)
     paths: list[JointPath] = []
     for case in progress(cases, "paths"):
@@ -226,11 +229,18 @@ def timing(cases: Sequence[Case], _lengths: dict) -> None:
         fine = time_parameterize(PANDA, path, always, always, TimingSettings(sample_time=0.001))
         worst[0] = max(worst[0], float((np.abs(fine.velocities) / PANDA.velocity).max()))
         worst[1] = max(worst[1], float((np.abs(fine.accelerations) / PANDA.acceleration).max()))
+        limited = TimingSettings(sample_time=0.001, jerk=JERK)
+        gentle = time_parameterize(PANDA, path, always, always, limited)
+        rates = np.diff(gentle.accelerations, axis=0) / np.diff(gentle.times)[:, None]
+        jerk = max(jerk, float(np.abs(rates).max()) / JERK)
+        longer.append(gentle.duration / fine.duration)
     rows = [
         ("duration over toppra's, least to most", f"{min(ratios):.5f} to {max(ratios):.5f}"),
         ("CPU time, ms, median: compiled, toppra", f"{np.median(times[0]):.2f}, {np.median(times[1]):.2f}"),
         ("greatest share of a velocity limit at 1 ms", f"{worst[0]:.6f}"),
         ("greatest share of an acceleration limit at 1 ms", f"{worst[1]:.6f}"),
+        (f"greatest share of a jerk limit of {JERK:g} rad/s³ at 1 ms", f"{jerk:.6f}"),
+        ("duration with it over that without, median, most", f"{np.median(longer):.3f}, {max(longer):.3f}"),
     ]
     print_table(f"Timing of {len(ratios)} paths", ["", ""], rows)
 

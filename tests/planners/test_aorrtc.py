@@ -136,6 +136,16 @@ def test_scaled_motions_are_slower() -> None:
     assert half.trajectory.duration == pytest.approx(2 * full.trajectory.duration, rel=0.01)
 
 
+def test_a_limit_of_jerk_is_kept_by_a_certified_motion() -> None:
+    free, gentle = (
+        AORRTC().plan(AROUND, 20.0, until="first", jerk=jerk).trajectory for jerk in (None, 100.0)
+    )
+    assert free is not None and gentle is not None
+    rates = np.diff(gentle.accelerations, axis=0) / np.diff(gentle.times)[:, None]
+    assert np.abs(rates).max() <= 100.0 * (1 + 1e-6)
+    assert free.duration < gentle.duration < 2 * free.duration
+
+
 def test_no_gain_asked_for_is_no_end() -> None:
     """With `gain` 0 the search stopped at once where there was no path at half the work."""
     result = AORRTC(AORRTCSettings(gain=0.0, patience=0)).plan(AROUND, 0.5)
@@ -149,6 +159,7 @@ def test_no_gain_asked_for_is_no_end() -> None:
         ({"clearance": float("nan")}, "clearance is nan"),
         ({"velocity_scaling": 0.0}, r"velocity_scaling is 0\.0; it must be above 0 and at most 1"),
         ({"acceleration_scaling": 1.5}, r"acceleration_scaling is 1\.5"),
+        ({"jerk": 0.0}, r"jerk is 0\.0; it must be"),
     ],
 )
 def test_arguments_are_checked(arguments: dict, message: str) -> None:
