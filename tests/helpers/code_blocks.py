@@ -29,6 +29,7 @@ from robotdiffuse.cli import build_parser, main
 from robotdiffuse.problems.files import load_problem
 from robotdiffuse.robots.add import add_robot
 from robotdiffuse.robots.allowed_collisions import SamplingSettings
+from robotdiffuse.robots.preparation import PreparationSettings
 from robotdiffuse.robots.sphere_fitting import SphereSettings
 
 ROOT = Path(__file__).parents[2]
@@ -102,9 +103,8 @@ def rop_data(folder: Path) -> None:
 def bench_arm(folder: Path) -> None:
     """The robot of arm.urdf, with few spheres and few samples: `robot add` itself takes a minute."""
     coarse = SphereSettings(first_half=0.06, second_half=0.06, candidates=200, rounds=3, starts=1)
-    add_robot(
-        "arm.urdf", base="base", limits="joint_limits.yaml", spheres=coarse, sampling=SamplingSettings(500)
-    )
+    settings = PreparationSettings(spheres=coarse, sampling=SamplingSettings(500), rounds=0, samples=500)
+    add_robot("arm.urdf", base="base", limits="joint_limits.yaml", settings=settings)
 
 
 def shelf(folder: Path) -> None:

@@ -16,6 +16,7 @@ from robotdiffuse.robots.add import add_robot
 from robotdiffuse.robots.allowed_collisions import SamplingSettings
 from robotdiffuse.robots.bundle import read_bundle, read_source, write_bundle
 from robotdiffuse.robots.limits import read_limits, with_limits
+from robotdiffuse.robots.preparation import PreparationSettings
 from robotdiffuse.robots.robot import TURNS, Robot
 from robotdiffuse.robots.sphere_fitting import covered
 from robotdiffuse.robots.urdf import content_hash, read_urdf
@@ -98,7 +99,6 @@ def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
         text = ARM.replace(BOX, f'<mesh filename="{name}" scale="2 2 1"/>')
         robot = read_urdf(urdf(package / "urdf", text))
         assert np.linalg.norm(robot.meshes["upper"][0].vertices[:, :2], axis=1).max() == pytest.approx(0.06)
-        assert any("ring.stl" in note for note in robot.notes)
 
 
 MESH = '<mesh filename="package://a/b.stl"/>'
@@ -259,11 +259,11 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     file, steps = urdf(tmp_path, balls), []
     report = add_robot(
         file,
-        sampling=SamplingSettings(samples=200),
+        settings=PreparationSettings(sampling=SamplingSettings(samples=200), samples=200, rounds=0),
         progress=lambda what, step, count: steps.append((step, count)),
     )
     assert report.folder == tmp_path / "robots" / "tiny"
-    assert steps[0] == (0, 4) and steps[-1] == (4, 4)
+    assert steps[0] == (0, 7) and steps[-1] == (7, 7)
     for link in report.links:
         assert link.covered and link.stick_out <= 0.0151
         assert covered(report.robot.meshes[link.link], report.robot.spheres[link.link])

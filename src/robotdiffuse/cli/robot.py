@@ -118,7 +118,7 @@ def run_add(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from robotdiffuse.evaluation.tables import Column, Table, show
+    from robotdiffuse.cli.preparation import print_preparation
     from robotdiffuse.robots.add import add_robot
 
     console = Console(stderr=True)
@@ -147,9 +147,7 @@ def run_add(arguments: argparse.Namespace) -> int:
             packages=dict(arguments.package),
             progress=progress,
         )
-    columns = ("link", "spheres", Column("sticking out", "mm", ".1f", scale=1e3), "covered")
-    rows = [(of.link, of.spheres, of.stick_out, "yes" if of.covered else "no") for of in report.links]
-    show(Table.of("", columns, rows))
+    print_preparation(report)
     _print_pairs(report)
     print_robot(report.robot)
     print(f"wrote {report.folder}")

@@ -1,46 +1,27 @@
 """Making a robot from a URDF: spheres, allowed collisions and limits, written as a robot folder."""
 
 import os
+import resource
+import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.robots.allowed_collisions import (
-    BY_SRDF,
-    CHECKED,
-    NAMED,
-    PairReport,
-    SamplingSettings,
-    allowed_pairs,
-    find_allowed_collisions,
-)
+from robotdiffuse.robots.allowed_collisions import BY_SRDF, CHECKED, NAMED, PairReport
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
-from robotdiffuse.robots.interfaces import face_allowances, stick_out_of_arm
 from robotdiffuse.robots.limits import read_limits, with_limits
+from robotdiffuse.robots.preparation import LinkReport, PreparationSettings, Progress, prepare
+from robotdiffuse.robots.refusals import Refusals
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
 from robotdiffuse.robots.srdf import Srdf, read_srdf, srdf_beside
-from robotdiffuse.robots.urdf import content_hash, read_urdf, robot_name
+from robotdiffuse.robots.urdf import collision_surfaces, content_hash, read_urdf, robot_name
 
-Progress = Callable[[str, int, int], None]
-"""Called with what is being done, the number of the step and the number of steps."""
-
-
-@dataclass(frozen=True)
-class LinkReport:
-    """The spheres of one link."""
-
-    link: str
-    spheres: int
-    stick_out: float
-    """How far a sphere reaches out of the arm, at most [m]: of the meshes of the link and, where it meets its
-    neighbours, of theirs, at any value of the joints between them."""
-    covered: bool
-    """Whether the spheres provably cover the surface of the meshes."""
+LITTLE, REFUSED = 0.2, 0.08
+"""Shares of free configurations, and of those that spheres refuse, from which on there is a warning."""
+KILO = 1 if sys.platform == "darwin" else 1024
+"""Bytes per unit of what the system says of a process's memory."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +45,11 @@ class AddReport:
     folder: Path
     links: tuple[LinkReport, ...]
     pairs: tuple[PairReport, ...]
+    refusals: Refusals
     seconds: float
+    """Processor time."""
+    memory: int
+    """The most that this process has used so far [bytes]."""
     srdf: Path | None = None
     """The SRDF that was given, or found beside the URDF."""
     differences: tuple[PairDifference, ...] = ()
@@ -73,6 +58,25 @@ class AddReport:
     @property
     def sphere_count(self) -> int:
         return sum(link.spheres for link in self.links)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What will keep this robot from moving, if anything."""
+        found, of = [], self.refusals
+        worst = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in of.pairs[:3])
+        if of.free < LITTLE:
+            often = sorted(of.pairs, key=lambda pair: -pair.colliding)[:3]
+            names = "; ".join(f"{' against '.join(pair.links)} {pair.colliding:.1%}" for pair in often)
+            found.append(
+                f"only {of.free:.1%} of the configurations are free of self-collision by the URDF's meshes "
+                f"({names}); a pair that may touch can be allowed"
+            )
+        if of.by_spheres > REFUSED:
+            found.append(
+                f"covering spheres refuse {of.by_spheres:.1%} of the free configurations, more than "
+                f"{REFUSED:.0%} ({worst}); plans there will not be found"
+            )
+        return (*found, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
 def user_robots() -> Path:
@@ -93,16 +97,15 @@ def add_robot(
     limits: str | Path | None = None,
     out: str | Path | None = None,
     licence: str = "see the URDF",
-    spheres: SphereSettings | None = None,
-    sampling: SamplingSettings | None = None,
+    settings: PreparationSettings | None = None,
     seed: int = 0,
-    progress: Progress | None = None,
+    progress: Progress = lambda what, step, steps: None,
     group: str | None = None,
     srdf: str | Path | None = None,
     allow: Sequence[tuple[str, str]] = (),
     packages: dict[str, str | Path] | None = None,
 ) -> AddReport:
-    """Read a URDF (see read_urdf), fit spheres, find allowed collisions, write the robot folder.
+    """Read a URDF (see read_urdf), prepare it (see preparation.py), write the robot folder.
 
     `name` defaults to the URDF's; `out`, the folder, to `user_robots() / name`; `limits` is a file in the
     form of MoveIt's joint_limits.yaml. The same input and seed give the same robot. Raises InputError for
@@ -112,8 +115,7 @@ def add_robot(
     that need no check are found by sampling and compared with the SRDF's; a given `srdf` allows its pairs
     too, one that was found does not. `allow` are further pairs.
     """
-    begin = time.perf_counter()
-    report = progress or (lambda what, step, steps: None)
+    begin = time.process_time()
     semantics, found = _semantics(urdf, srdf, packages)
     robot = read_urdf(urdf, base, tip, locked, group, semantics, packages)
     for link in {link for pair in allow for link in pair} - {*robot.link_names}:
@@ -129,35 +131,26 @@ def add_robot(
             f"{urdf}: no link has collision geometry, nor a visual one that could stand for it; nothing "
             f"could be checked: give its links <collision> elements"
         )
-    settings = spheres or SphereSettings()
-    steps = len(robot.meshes) + 1
-    fitted, links = {}, []
-    for step, (link, meshes) in enumerate(robot.meshes.items()):
-        report(f"spheres of {link}", step, steps)
-        tolerance = settings.tolerance(robot, link)
-        hidden = face_allowances(robot, link, tolerance)
-        fit = fit_spheres(meshes, tolerance, np.random.default_rng(seed), hidden, settings)
-        fitted[link] = np.round(fit, 6)  # as the file holds them: these are judged
-        own, arm = float(stick_out(meshes, fitted[link]).max()), stick_out_of_arm(robot, link, fitted[link])
-        links.append(LinkReport(link, len(fit), min(own, arm), covered(meshes, fitted[link])))
-    report("pairs of links", steps - 1, steps)
-    robot = replace(robot, spheres=fitted)
-    pairs = find_allowed_collisions(robot, sampling or SamplingSettings(), np.random.default_rng(seed))
     known = {} if semantics is None else semantics.allowed
+    allowed = {pair: BY_SRDF for pair in known} if srdf is not None else {}
+    allowed |= {frozenset(pair): NAMED for pair in allow}
+    surfaces = collision_surfaces(urdf, robot.meshes, packages)
+    made = prepare(robot, surfaces, settings or PreparationSettings(), seed, progress, allowed)
     differences = tuple(
         PairDifference(pair.links, pair.reason, pair.colliding, known.get(frozenset(pair.links), CHECKED))
-        for pair in pairs
+        for pair in made.sampled
         if semantics is not None and (pair.reason == CHECKED) == (frozenset(pair.links) in known)
     )
-    pairs = _also_allowed(pairs, {frozenset(pair) for pair in allow}, NAMED)
-    pairs = _also_allowed(pairs, set(known) if srdf is not None else set(), BY_SRDF)
-    robot = replace(robot, allowed_collisions=allowed_pairs(pairs))
     folder = user_robots() / name if out is None else Path(out)
     source = {"urdf": Path(urdf).name, "sha256": content_hash(urdf, packages), "licence": licence}
-    write_bundle(robot, folder, source)
-    report("done", steps, steps)
-    seconds = time.perf_counter() - begin
-    return AddReport(read_bundle(folder), folder, tuple(links), pairs, seconds, found, differences)
+    note = (
+        f"{made.refusals.free:.1%} of the configurations are free of self-collision; convex parts refuse "
+        f"{made.refusals.by_parts:.1%} of these, spheres {made.refusals.by_spheres:.1%}"
+    )
+    write_bundle(replace(made.robot, notes=(*robot.notes, note)), folder, source)
+    seconds, memory = time.process_time() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KILO
+    shown = (made.links, made.pairs, made.refusals, seconds, memory, found, differences)
+    return AddReport(read_bundle(folder), folder, *shown)
 
 
 def _semantics(
@@ -168,12 +161,3 @@ def _semantics(
         return read_srdf(srdf), Path(srdf)
     found = srdf_beside(urdf, robot_name(urdf, packages))
     return (None, None) if found is None else (read_srdf(found), found)
-
-
-def _also_allowed(
-    pairs: tuple[PairReport, ...], allowed: set[frozenset[str]], reason: str
-) -> tuple[PairReport, ...]:
-    return tuple(
-        replace(pair, reason=reason) if pair.reason == CHECKED and frozenset(pair.links) in allowed else pair
-        for pair in pairs
-    )

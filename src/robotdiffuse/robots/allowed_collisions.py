@@ -11,8 +11,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots.interfaces import coal_hull
-from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
+from robotdiffuse.robots.sphere_kernels import deepest_touches
 from robotdiffuse.transforms import rotation_about
 
 ADJACENT, ALWAYS, NEVER, DEFAULT, CHECKED = "adjacent", "always", "never", "default", "checked"
@@ -64,7 +64,7 @@ def find_allowed_collisions(
     that never collided are driven together by random descent from their closest samples; those that can be
     made to collide are checked.
     """
-    links = _Links(robot)
+    links = Links(robot)
     default = np.clip(np.zeros((1, len(links.joints))), links.lower, links.upper)
     q = links.random(settings.samples, rng)
     poses = links.poses(q)
@@ -95,9 +95,7 @@ def allowed_pairs(reports: tuple[PairReport, ...]) -> frozenset[frozenset[str]]:
     return frozenset(frozenset(report.links) for report in reports if report.reason != CHECKED)
 
 
-def _descend(
-    links: "_Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator
-) -> bool:
+def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator) -> bool:
     """Whether random descent on the distance between the meshes finds a collision of the links."""
     for start in starts:
         q, step = start, 0.1 * (links.upper - links.lower)
@@ -150,7 +148,7 @@ def _adjacent(robot: Robot) -> set[frozenset[str]]:
     return pairs
 
 
-class _Links:
+class Links:
     """Poses of all links for many values of all movable joints, and tests of pairs of links."""
 
     def __init__(self, robot: Robot) -> None:
@@ -158,7 +156,7 @@ class _Links:
         self.joints = [j for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None]
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
-        self.hulls = {link: [coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
+        self.hulls = {link: [_coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
         self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
 
@@ -185,19 +183,12 @@ class _Links:
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
         """Signed distance between the covering spheres of two links [m]: at most that of their meshes."""
-        T_a_base = np.linalg.inv(poses[a])
-        T_a_b = T_a_base @ poses[b]
-        first, second = self.robot.spheres[a], self.robot.spheres[b]
-        near = np.full(len(T_a_b), np.inf)
-        for sphere in second:
-            center = T_a_b[:, :3, :3] @ sphere[:3] + T_a_b[:, :3, 3]
-            gaps = np.linalg.norm(center[:, None] - first[None, :, :3], axis=2) - first[:, 3] - sphere[3]
-            near = np.minimum(near, gaps.min(1))
-        return near
+        T_a_b = np.linalg.inv(poses[a]) @ poses[b]
+        return -deepest_touches(T_a_b, self.robot.spheres[a], self.robot.spheres[b])[0]
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""
-        T_a, T_b = _coal_pose(poses[a][i]), _coal_pose(poses[b][i])
+        T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
         for first in self.hulls[a]:
             for second in self.hulls[b]:
                 self.result.clear()
@@ -207,7 +198,7 @@ class _Links:
 
     def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
         """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
-        T_a, T_b = _coal_pose(poses[a][i]), _coal_pose(poses[b][i])
+        T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
         least = np.inf
         for first in self.hulls[a]:
             for second in self.hulls[b]:
@@ -228,5 +219,14 @@ def _motions(axis: Float[ndarray, "3"], prismatic: bool, q: Float[ndarray, "n"])
     return T
 
 
-def _coal_pose(T: Float[ndarray, "4 4"]) -> "coal.Transform3s":
+def coal_pose(T: Float[ndarray, "4 4"]) -> "coal.Transform3s":
     return coal.Transform3s(np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]))
+
+
+def _coal_hull(mesh: ConvexMesh) -> "coal.Convex":
+    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    for vertex in mesh.vertices:
+        points.append(vertex)
+    for face in mesh.faces:
+        triangles.append(coal.Triangle(*map(int, face)))
+    return coal.Convex(points, triangles)

@@ -4,25 +4,31 @@ The surface is cut into small triangles. A sphere is convex, so it covers a tria
 its three corners: a set of spheres in which every small triangle lies within one sphere provably covers the
 surface, not just samples of it.
 
-A sphere with centre p and radius r sticks out of a convex mesh by exactly r - depth(p), where depth is the
-distance from p to the nearest face plane. For the cells given to one sphere, the centre that makes it stick
-out least is the minimum of max |corner - p| - depth(p), a convex function of p. Like Lloyd's algorithm, the
-fit alternates between giving each cell to the sphere that holds it with the least stick-out and moving each
-sphere to its best centre. It starts from a greedy set cover and drops spheres as long as the tolerance holds.
+How large a sphere may be about a place is told by a grid (see sphere_room.py). For the cells given to one
+sphere, its best centre p is the minimum of max |corner - p| - room(p). Like Lloyd's algorithm, the fit
+alternates between giving each cell to the sphere that holds it with most room to spare and moving each sphere
+to its best centre. It starts from a greedy set cover and drops spheres as long as all have room.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.robots.convex_parts import split
 from robotdiffuse.robots.robot import ConvexMesh, Robot
-from robotdiffuse.robots.sphere_kernels import DIRECTIONS, assign, depths_at, relax
+from robotdiffuse.robots.sphere_kernels import DIRECTIONS, assign, gaps, held_by_one, plane_depths, relax
+from robotdiffuse.robots.sphere_room import Bounds, Room, Solid, stacked_planes
 
 MARGIN = 1e-5
 """Added to the radii [m]: covers rounding in files and in single-precision kernels."""
+SLACK = 0.1
+"""Of the spacing of the grid, what room a sphere may lack."""
+APART = 0.02
+"""Spheres that are added at once begin at least so far from each other [m]."""
 
 
 @dataclass(frozen=True)
@@ -33,18 +39,22 @@ class SphereSettings:
     """How far a sphere may stick out of a link that half of the joints (rounded up) or fewer move [m]."""
     second_half: float = 0.009
     """The same for the links beyond, which work closer to obstacles [m]."""
+    fixed: float = 0.03
+    """The same for links that no planned joint moves, which nothing but the arm itself can meet [m]."""
     relative: float = 1.0
     """Never more than this times the radius of the largest sphere inside the link."""
     finest: float = 0.004
     """Nor less than this [m]."""
-    candidates: int = 1000
+    candidates: int = 400
     """Places inside the mesh that the greedy cover chooses from."""
-    rounds: int = 15
+    rounds: int = 8
     """Rounds of the alternation for each number of spheres."""
-    tries: int = 5
+    tries: int = 3
     """Spheres of which each is dropped for a try, before their number is final."""
-    starts: int = 2
+    starts: int = 1
     """Fits from different starts, of which the one with the fewest spheres is kept."""
+    most: int = 200
+    """Spheres of a link, about; where they do not suffice, they stick out further."""
 
     def __post_init__(self) -> None:
         if not 0 < self.finest <= min(self.first_half, self.second_half):
@@ -53,46 +63,38 @@ class SphereSettings:
                 f"({self.first_half}) and second_half ({self.second_half})"
             )
 
-    def tolerance(self, robot: Robot, link: str) -> float:
-        """How far the spheres of a link may stick out [m]."""
-        meshes = robot.meshes[link]
-        first = robot.link_frame(link) <= (robot.dof + 1) // 2
-        wanted = self.first_half if first else self.second_half
-        size = np.ptp(np.concatenate([mesh.vertices for mesh in meshes]), axis=0).min()
-        inradius = _Body(meshes).depth(_grid(meshes, size / 16)).max()
+    def tolerance(self, robot: Robot, link: str, inradius: float) -> float:
+        """How far the spheres of a link may stick out [m] whose largest inner sphere has this radius [m]."""
+        frame = robot.link_frame(link)
+        wanted = self.first_half if frame <= (robot.dof + 1) // 2 else self.second_half
+        if frame == 0:
+            wanted = max(wanted, self.fixed)
         return float(max(min(wanted, self.relative * inradius), self.finest))
 
 
 def fit_spheres(
-    meshes: tuple[ConvexMesh, ...],
-    tolerance: float,
+    solid: Solid,
+    bounds: Bounds,
     rng: np.random.Generator,
-    allowances: tuple[Float[ndarray, "f"], ...] | None = None,
     settings: SphereSettings = SphereSettings(),
 ) -> Float[ndarray, "n 4"]:
-    """Spheres [x y z radius, m] that cover the union of convex meshes and stick out by `tolerance` [m].
-
-    Over the faces of each mesh they may stick out by `allowances` [m] more, where the next link hides it.
-    """
-    body, true_body = _Body(meshes, allowances), _Body(meshes)
-    grid = _grid(meshes, tolerance / 2)
+    """Spheres [x y z radius, m] that cover convex meshes, inside and surface, and keep within bounds."""
+    room = solid.room(bounds)
+    inside = solid.inside
     # sticking out of a flat face by e, a sphere covers a disc of radius sqrt(2 r e); cells are much smaller
-    disc = float(np.sqrt(2 * tolerance * true_body.depth(grid).max()))
-    coarse, medium, fine = (_Cells.of(meshes, disc / cut) for cut in (4, 8, 16))
+    coarse, fine = _Cells.of(solid, bounds, 5), _Cells.of(solid, bounds, 8)
     covers = []
     for _ in range(settings.starts):
-        places = _inside_points(true_body, meshes, settings.candidates, rng)
-        centers = _first_cover(body, coarse, places, tolerance, settings.rounds)
-        for cells in (coarse, medium):
-            centers = _thin_out(body, cells, centers, tolerance, settings)
+        places = rng.permutation(inside)[: settings.candidates] + rng.uniform(-0.5, 0.5, 3) * solid.spacing
+        centers = _thin_out(room, coarse, _first_cover(room, coarse, places, settings), settings)
         covers.append(centers)
-    centers, _ = _relax(body, fine, min(covers, key=len), settings.rounds, 0.0)
-    return _without_holes(true_body, grid, _with_radii(body, fine, centers), tolerance)
+    centers = _with_enough(room, fine, min(covers, key=len), settings)
+    return _without_holes(solid, inside, _with_radii(room, fine, centers))
 
 
-def stick_out(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n"]:
-    """How far each sphere reaches out of the meshes [m] (an upper bound where meshes overlap)."""
-    return spheres[:, 3] - _Body(meshes).depth(spheres[:, :3])
+def stick_out(solid: Solid, spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n"]:
+    """How far each sphere reaches out of the meshes [m]."""
+    return spheres[:, 3] - solid.as_room().at(spheres[:, :3])
 
 
 def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], finest: float = 2e-6) -> bool:
@@ -102,14 +104,13 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], fine
     no sphere, or they are smaller than `finest` [m].
     """
     triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
-    single = [_Body((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
+    single = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
     while len(triangles):
         corners = triangles.reshape(-1, 3)
-        gaps = _distances(corners, spheres[:, :3]) - spheres[:, 3]
-        is_open = (gaps.reshape(len(triangles), 3, -1).max(1) > 0).all(1)
-        bare = gaps.min(1) > 0
-        for body in single:
-            hidden = body.depth(corners) > 1e-9
+        held, bare = held_by_one(triangles, spheres)
+        is_open = ~held
+        for planes in single:
+            hidden = plane_depths(corners, *planes) > 1e-9
             is_open &= ~hidden.reshape(-1, 3).all(1)
             bare &= ~hidden
         if bare.any():
@@ -124,49 +125,6 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], fine
     return True
 
 
-class _Body:
-    """A union of convex meshes as face planes, each moved outwards by its allowance."""
-
-    def __init__(
-        self, meshes: tuple[ConvexMesh, ...], allowances: tuple[Float[ndarray, "f"], ...] | None = None
-    ) -> None:
-        allowances = allowances or tuple(np.zeros(len(mesh.faces)) for mesh in meshes)
-        planes = [_planes(mesh, extra) for mesh, extra in zip(meshes, allowances, strict=True)]
-        self.normals = np.concatenate([normals for normals, _ in planes])
-        self.offsets = np.concatenate([offsets for _, offsets in planes])
-        self.starts = np.cumsum([0, *(len(offsets) for _, offsets in planes)])
-        """First plane of each mesh, and the number of planes."""
-
-    @property
-    def arrays(self) -> tuple[ndarray, ndarray, ndarray]:
-        return self.normals, self.offsets, self.starts
-
-    def depth(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        """Distance from each point inside to the nearest face plane [m]; negative outside."""
-        return depths_at(points, *self.arrays)
-
-
-def _planes(
-    mesh: ConvexMesh, allowance: Float[ndarray, "f"]
-) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p"]]:
-    """Normals and offsets of the distinct planes of a mesh."""
-    normals = face_normals(mesh)
-    good = np.linalg.norm(normals, axis=1) > 0.5
-    normals, index = np.unique(np.round(normals[good], 9), axis=0, return_inverse=True)
-    least = np.full(len(normals), np.inf)
-    np.minimum.at(least, index.ravel(), allowance[good])
-    # the farthest vertex, not the face's own: rounding must not put a plane inside the mesh
-    return normals, (mesh.vertices @ normals.T).max(0) + least
-
-
-def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:
-    """Outward unit normals; zero for a face without area."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    normals = np.cross(b - a, c - a)
-    size = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.where(size > 1e-14, normals / np.maximum(size, 1e-14), 0.0)
-
-
 @dataclass(frozen=True, eq=False)
 class _Cells:
     """Small triangles of the surface of the union of meshes."""
@@ -178,27 +136,36 @@ class _Cells:
     """Vertices of the meshes; all other points lie between neighbours on a face or an edge."""
 
     @staticmethod
-    def of(meshes: tuple[ConvexMesh, ...], size: float) -> "_Cells":
-        """Triangles with edges of at most this size [m], without those inside another mesh."""
-        soup, vertices, cut = [], [], []
-        for k, mesh in enumerate(meshes):
-            triangles = _split(mesh.vertices[mesh.faces], size)
+    def of(solid: Solid, bounds: Bounds, cut: int) -> "_Cells":
+        """Triangles, without those inside another mesh, whose edges are a fraction of the largest disc that a
+        sphere within bounds can cover."""
+        soup, vertices, left_out = [], [], False
+        planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
+        for k, mesh in enumerate(solid.meshes):
+            triangles = mesh.vertices[mesh.faces]
+            size = _disc(bounds.tolerance, solid.depth) / cut
+            triangles = split(triangles, size)
             hidden = np.zeros(len(triangles), dtype=bool)
-            for other in meshes[:k] + meshes[k + 1 :]:
-                inside = _Body((other,)).depth(triangles.reshape(-1, 3)) > 1e-9
+            for other in planes[:k] + planes[k + 1 :]:
+                inside = plane_depths(triangles.reshape(-1, 3), *other) > 1e-9
                 hidden |= inside.reshape(-1, 3).all(1)
-            soup.append(triangles[~hidden])
+            triangles = triangles[~hidden]
+            if bounds.varies:
+                tolerances = bounds.tolerances(triangles.mean(1))
+                triangles = split(triangles, _disc(tolerances, solid.depth) / cut)
+            soup.append(triangles)
             vertices.append(mesh.vertices)
-            cut.append(hidden.any())
+            left_out |= bool(hidden.any() or bounds.varies)
         corners = np.concatenate(soup).reshape(-1, 3)
-        keys = np.round(np.concatenate([*vertices, corners]), 9) + 0.0
-        _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        points = np.concatenate([*vertices, corners])[first]
-        count = len(keys) - len(corners)
+        points = np.concatenate([*vertices, corners])
+        lattice = np.round((points - points.min(0)) * (2**20 / np.ptp(points, axis=0).max())).astype(np.int64)
+        _, first, index = np.unique(lattice @ (1, 2**21, 2**42), return_index=True, return_inverse=True)
+        count = len(points) - len(corners)
+        points = points[first]
         sharp = np.zeros(len(points), dtype=bool)
         sharp[index.ravel()[:count]] = True
         # where triangles were left out, any point may be a corner of what is left
-        sharp |= any(cut)
+        sharp |= left_out
         return _Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
 
     def farthest(self, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "c n"]:
@@ -208,114 +175,110 @@ class _Cells:
         return np.maximum(np.maximum(distance[a], distance[b]), distance[c])
 
     def assigned(
-        self, body: _Body, centers: Float[ndarray, "n 3"]
+        self, room: Room, centers: Float[ndarray, "n 3"]
     ) -> tuple[Int[ndarray, "c"], Float[ndarray, "c"], Float[ndarray, "c"]]:
-        """For each cell the sphere that holds it with the least stick-out, that, and the next least [m]."""
+        """For each cell the sphere that holds it with most room to spare, what it lacks, and the next one."""
         owner = np.empty(len(self.corners), np.int64)
         least, second = np.empty(len(owner)), np.empty(len(owner))
-        assign(self.points, self.corners, centers, body.depth(centers), owner, least, second)
+        assign(self.points, self.corners, centers, room.at(centers), owner, least, second)
         return owner, least, second
 
 
 def _relax(
-    body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
+    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
 ) -> tuple[Float[ndarray, "n 3"], float]:
-    """Better centres, and how far the worst sphere sticks out [m]; ends early at `enough`."""
-    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *body.arrays, DIRECTIONS)
+    """Better centres, and how much room the worst sphere lacks [m]; ends early at `enough`."""
+    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *room.arrays, DIRECTIONS)
 
 
 def _first_cover(
-    body: _Body, cells: _Cells, places: Float[ndarray, "n 3"], tolerance: float, rounds: int
+    room: Room, cells: _Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "k 3"]:
-    """Centres from a greedy set cover, with more until none sticks out by more than the tolerance."""
-    needed = cells.farthest(places) - body.depth(places)
-    open_cells = needed <= np.maximum(tolerance, needed.min(1, keepdims=True))
+    """Centres from a greedy set cover."""
+    needed = cells.farthest(places) - room.at(places)
+    open_cells = needed <= np.maximum(0.0, needed.min(1, keepdims=True))
     chosen: list[int] = []
     while len(open_cells):
         chosen.append(int(open_cells.sum(0).argmax()))
         open_cells = open_cells[~open_cells[:, chosen[-1]]]
-    centers, worst = _relax(body, cells, places[chosen], rounds, tolerance)
-    while worst > tolerance:
-        extra = cells.points[cells.corners[cells.assigned(body, centers)[1].argmax()]].mean(0)
-        centers, worst = _relax(body, cells, np.concatenate([centers, extra[None]]), rounds, tolerance)
+    return _with_enough(room, cells, places[chosen], settings)
+
+
+def _with_enough(
+    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
+) -> Float[ndarray, "m 3"]:
+    """Centres moved, with more until all spheres have the room that they need."""
+    enough = room.spacing * SLACK
+    centers, worst = _relax(room, cells, centers, settings.rounds, enough)
+    while worst > enough and len(centers) < settings.most:
+        lacking = cells.assigned(room, centers)[1]
+        extra = _apart(cells.points[cells.corners].mean(1), lacking, len(centers) // 20 + 1)
+        centers, worst = _relax(room, cells, np.concatenate([centers, extra]), settings.rounds, enough)
     return centers
 
 
+def _apart(points: Float[ndarray, "c 3"], lacking: Float[ndarray, "c"], count: int) -> Float[ndarray, "k 3"]:
+    """The points that lack most, none close to another."""
+    order = np.argsort(-lacking)[: max(1, int((lacking > 0).sum()))]
+    points, chosen = points[order], []
+    while len(points) and len(chosen) < count:
+        chosen.append(points[0])
+        points = points[np.linalg.norm(points - points[0], axis=1) > APART]
+    return np.array(chosen)
+
+
 def _thin_out(
-    body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"], tolerance: float, settings: SphereSettings
+    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "m 3"]:
-    """Drop spheres, those first whose cells the others take over best, as long as the tolerance holds."""
-    failures = 0
+    """Drop spheres, those first whose cells the others take over best, as long as there is room."""
+    failures, enough = 0, room.spacing * SLACK
     while failures < min(settings.tries, len(centers) - 1):
-        owner, _, second = cells.assigned(body, centers)
+        owner, _, second = cells.assigned(room, centers)
         loss = np.zeros(len(centers))
         np.maximum.at(loss, owner, second)
         fewer = np.delete(centers, np.argsort(loss)[failures], axis=0)
-        fewer, worst = _relax(body, cells, fewer, settings.rounds, tolerance)
-        if worst > tolerance:
+        fewer, worst = _relax(room, cells, fewer, settings.rounds, enough)
+        if worst > enough:
             failures += 1
         else:
             centers, failures = fewer, 0
     return centers
 
 
-def _with_radii(body: _Body, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "n 4"]:
+def _with_radii(room: Room, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "m 4"]:
     """Least radii with which each sphere holds its own cells; spheres without any are dropped."""
-    radius = cells.farthest(centers)
-    own = np.eye(len(centers), dtype=bool)[(radius - body.depth(centers)).argmin(1)]
-    radii = np.where(own, radius, 0.0).max(0) + MARGIN
-    return np.concatenate([centers, radii[:, None]], axis=1)[own.any(0)]
+    owner = cells.assigned(room, centers)[0]
+    radii = np.zeros(len(centers))
+    far = np.linalg.norm(cells.points[cells.corners] - centers[owner][:, None], axis=2).max(1)
+    np.maximum.at(radii, owner, far + MARGIN)
+    return np.concatenate([centers, radii[:, None]], axis=1)[radii > 0]
 
 
 def _without_holes(
-    body: _Body, grid: Float[ndarray, "g 3"], spheres: Float[ndarray, "n 4"], hole: float
+    solid: Solid, inside: Float[ndarray, "g 3"], spheres: Float[ndarray, "n 4"]
 ) -> Float[ndarray, "m 4"]:
-    """Fill holes inside the meshes, where a small obstacle could hide, from the emptiest grid point on."""
-    inside = body.depth(grid)
-    grid, inside = grid[inside > 0], inside[inside > 0]
-    while len(grid):
-        gap = (_distances(grid, spheres[:, :3]) - spheres[:, 3]).min(1)
-        worst = int(gap.argmax())
-        if gap[worst] < hole:
-            break
-        spheres = np.concatenate([spheres, np.append(grid[worst], inside[worst])[None]])
-    return spheres
+    """Fill holes inside the meshes, where a small obstacle could hide, from the deepest place on."""
+    depth = solid.as_room().at(inside)
+    gap = gaps(inside, spheres)
+    # nothing between the grid's points is further from them than half of a cube's diagonal
+    half = np.sqrt(0.75) * solid.spacing
+    is_open = gap > np.where(depth > 2 * half, -half, 0.0)
+    inside, depth, extra = inside[is_open], depth[is_open], []
+    while len(inside):
+        deepest = int(depth.argmax())
+        extra.append(np.append(inside[deepest], max(depth[deepest], half)))
+        is_open = np.linalg.norm(inside - inside[deepest], axis=1) > extra[-1][3] - half
+        is_open[deepest] = False
+        inside, depth = inside[is_open], depth[is_open]
+    return np.concatenate([spheres, np.reshape(extra, (-1, 4))])
 
 
-def _split(triangles: Float[ndarray, "n 3 3"], size: float) -> Float[ndarray, "m 3 3"]:
-    """Halve triangles at their longest edge until no edge is longer than `size` [m]."""
-    done = []
-    while len(triangles):
-        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
-        longest = edges.argmax(1)
-        small = edges.max(1) <= size
-        done.append(triangles[small])
-        triangles, longest = triangles[~small], longest[~small]
-        turn = (longest[:, None] + np.arange(3)) % 3
-        a, b, c = np.moveaxis(np.take_along_axis(triangles, turn[:, :, None], axis=1), 1, 0)
-        middle = (a + b) / 2
-        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return np.concatenate(done)
+def _disc(tolerance: Any, depth: float) -> Any:
+    """Radius of what a sphere covers of a face [m] that sticks out by a tolerance, from a depth."""
+    return np.sqrt(2 * tolerance * depth + tolerance**2)
 
 
 def _distances(a: ndarray, b: ndarray) -> ndarray:
     """Distances [n, m] of points [n, 3] and [m, 3]."""
     squares = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
     return np.sqrt(np.maximum(squares, 0.0))
-
-
-def _grid(meshes: tuple[ConvexMesh, ...], spacing: float) -> Float[ndarray, "n 3"]:
-    corners = np.concatenate([mesh.vertices for mesh in meshes])
-    axes = [
-        np.arange(lo, hi, spacing) + spacing / 2
-        for lo, hi in zip(corners.min(0), corners.max(0), strict=True)
-    ]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-
-
-def _inside_points(
-    body: _Body, meshes: tuple[ConvexMesh, ...], count: int, rng: np.random.Generator
-) -> Float[ndarray, "n 3"]:
-    corners = np.concatenate([mesh.vertices for mesh in meshes])
-    points = rng.uniform(corners.min(0), corners.max(0), (20 * count, 3))
-    return points[body.depth(points) > 0][:count]

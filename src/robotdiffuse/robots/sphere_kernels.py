@@ -1,4 +1,5 @@
-"""Compiled inner loops of the sphere fit. A surface is cells (triangles of points), a mesh is face planes."""
+"""Compiled inner loops of the sphere fit. A surface is cells (triangles of points); the room for a sphere
+about each place is a grid."""
 
 import math
 
@@ -9,6 +10,8 @@ FIRST_STEP, LAST_STEP, SHRINK = 0.004, 0.0005, 0.8
 """Step of the search for centres [m]: in the first round, at least, and from round to round."""
 FINEST_STEP = 2e-4
 """[m]; smaller steps than this end the search for one centre."""
+OUTSIDE = -1.0
+"""Room outside the grid [m]."""
 GAIN = 1e-7
 """Steps that gain less than this are not taken [m]."""
 
@@ -18,24 +21,48 @@ DIRECTIONS = np.array(
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
 
 
-@njit(cache=True, fastmath=True)
-def depth_at(x, y, z, normals, offsets, starts):
-    """Distance to the nearest face plane of the part in which the point is deepest; negative outside."""
-    best = -1e9
-    for part in range(len(starts) - 1):
-        least = 1e9
-        for f in range(starts[part], starts[part + 1]):
-            least = min(least, offsets[f] - normals[f, 0] * x - normals[f, 1] * y - normals[f, 2] * z)
-        best = max(best, least)
-    return best
-
-
-@njit(cache=True, fastmath=True)
-def depths_at(centers, normals, offsets, starts):
-    depths = np.empty(len(centers))
-    for i in range(len(centers)):
-        depths[i] = depth_at(centers[i, 0], centers[i, 1], centers[i, 2], normals, offsets, starts)
+@njit(cache=True)
+def plane_depths(points, normals, offsets, starts):
+    """Distance to the nearest face plane of the part in which each point is deepest; negative outside."""
+    depths = np.empty(len(points))
+    for i in range(len(points)):
+        x, y, z = points[i]
+        best = -1e9
+        for part in range(len(starts) - 1):
+            least = 1e9
+            for f in range(starts[part], starts[part + 1]):
+                least = min(least, offsets[f] - normals[f, 0] * x - normals[f, 1] * y - normals[f, 2] * z)
+                if least <= best:
+                    break
+            best = max(best, least)
+        depths[i] = best
     return depths
+
+
+@njit(cache=True, fastmath=True)
+def room_at(x, y, z, grid, origin, spacing):
+    """Value of a grid between its points; outside the grid a low one, the lower the further."""
+    u, v, w = (x - origin[0]) / spacing, (y - origin[1]) / spacing, (z - origin[2]) / spacing
+    beyond = 0.0
+    for value, count in ((u, grid.shape[0]), (v, grid.shape[1]), (w, grid.shape[2])):
+        beyond = max(beyond, -value, value - (count - 1.001))
+    if beyond > 0.0:
+        return OUTSIDE - beyond * spacing
+    i, j, k = int(u), int(v), int(w)
+    u, v, w = u - i, v - j, w - k
+    low = (grid[i, j, k] * (1 - w) + grid[i, j, k + 1] * w) * (1 - v)
+    low += (grid[i, j + 1, k] * (1 - w) + grid[i, j + 1, k + 1] * w) * v
+    high = (grid[i + 1, j, k] * (1 - w) + grid[i + 1, j, k + 1] * w) * (1 - v)
+    high += (grid[i + 1, j + 1, k] * (1 - w) + grid[i + 1, j + 1, k + 1] * w) * v
+    return low * (1 - u) + high * u
+
+
+@njit(cache=True, fastmath=True)
+def rooms_at(centers, grid, origin, spacing):
+    rooms = np.empty(len(centers))
+    for i in range(len(centers)):
+        rooms[i] = room_at(centers[i, 0], centers[i, 1], centers[i, 2], grid, origin, spacing)
+    return rooms
 
 
 @njit(cache=True, fastmath=True)
@@ -65,27 +92,87 @@ def assign(points, corners, centers, depths, owner, least, second):
         owner[c], least[c], second[c] = mine, best, runner
 
 
+@njit(cache=True)
+def deepest_touches(T_a_b, first, second):
+    """For each pose [n, 4, 4] of one set of spheres in the frame of another how deep any two overlap [m]
+    (negative if none do), and the middle of where they do, in the frame of the first set."""
+    depth, middle = np.full(len(T_a_b), -np.inf), np.zeros((len(T_a_b), 3))
+    for n in range(len(T_a_b)):
+        T = T_a_b[n]
+        for j in range(len(second)):
+            x = T[0, 0] * second[j, 0] + T[0, 1] * second[j, 1] + T[0, 2] * second[j, 2] + T[0, 3]
+            y = T[1, 0] * second[j, 0] + T[1, 1] * second[j, 1] + T[1, 2] * second[j, 2] + T[1, 3]
+            z = T[2, 0] * second[j, 0] + T[2, 1] * second[j, 1] + T[2, 2] * second[j, 2] + T[2, 3]
+            for i in range(len(first)):
+                dx, dy, dz = first[i, 0] - x, first[i, 1] - y, first[i, 2] - z
+                reach = first[i, 3] + second[j, 3] - depth[n]
+                if reach <= 0.0 or dx * dx + dy * dy + dz * dz >= reach * reach:
+                    continue
+                far = math.sqrt(dx * dx + dy * dy + dz * dz)
+                depth[n] = first[i, 3] + second[j, 3] - far
+                # from b's centre towards a's, to the middle of the two surfaces
+                along = (far + second[j, 3] - first[i, 3]) / 2 / max(far, 1e-9)
+                middle[n, 0], middle[n, 1], middle[n, 2] = x + along * dx, y + along * dy, z + along * dz
+    return depth, middle
+
+
 @njit(cache=True, fastmath=True)
-def stick_out_at(x, y, z, own, count, normals, offsets, starts):
+def gaps(points, spheres):
+    """Signed distance of points from a union of spheres [m]; inside only a bound."""
+    out = np.empty(len(points))
+    for n in range(len(points)):
+        least = 1e9
+        for i in range(len(spheres)):
+            reach = least + spheres[i, 3]
+            square = squared_distance(points, n, spheres, i)
+            if reach > 0.0 and square < reach * reach:
+                least = math.sqrt(square) - spheres[i, 3]
+        out[n] = least
+    return out
+
+
+@njit(cache=True)
+def held_by_one(triangles, spheres):
+    """Whether one sphere holds all of each triangle; and whether no sphere holds each corner."""
+    held, bare = np.zeros(len(triangles), np.bool_), np.ones(3 * len(triangles), np.bool_)
+    for t in range(len(triangles)):
+        for i in range(len(spheres)):
+            inside, square = 0, spheres[i, 3] * spheres[i, 3]
+            for k in range(3):
+                x, y = triangles[t, k, 0] - spheres[i, 0], triangles[t, k, 1] - spheres[i, 1]
+                z = triangles[t, k, 2] - spheres[i, 2]
+                if x * x + y * y + z * z <= square:
+                    inside += 1
+                    bare[3 * t + k] = False
+            if inside == 3:
+                held[t] = True
+                break
+        if held[t]:
+            bare[3 * t : 3 * t + 3] = False
+    return held, bare
+
+
+@njit(cache=True, fastmath=True)
+def stick_out_at(x, y, z, own, count, grid, origin, spacing):
     """How far a sphere at a centre sticks out if it holds the own points."""
     far = 0.0
     for k in range(count):
         dx, dy, dz = own[k, 0] - x, own[k, 1] - y, own[k, 2] - z
         far = max(far, dx * dx + dy * dy + dz * dz)
-    return math.sqrt(far) - depth_at(x, y, z, normals, offsets, starts)
+    return math.sqrt(far) - room_at(x, y, z, grid, origin, spacing)
 
 
 @njit(cache=True, fastmath=True)
-def move_center(center, own, count, step, normals, offsets, starts, directions):
+def move_center(center, own, count, step, grid, origin, spacing, directions):
     """Pattern search for the centre of least stick-out; changes `center`."""
-    least = stick_out_at(center[0], center[1], center[2], own, count, normals, offsets, starts)
+    least = stick_out_at(center[0], center[1], center[2], own, count, grid, origin, spacing)
     while step > FINEST_STEP:
         best, way = least - GAIN, -1
         for k in range(len(directions)):
             x = center[0] + step * directions[k, 0]
             y = center[1] + step * directions[k, 1]
             z = center[2] + step * directions[k, 2]
-            value = stick_out_at(x, y, z, own, count, normals, offsets, starts)
+            value = stick_out_at(x, y, z, own, count, grid, origin, spacing)
             if value < best:
                 best, way = value, k
         if way < 0:
@@ -96,7 +183,7 @@ def move_center(center, own, count, step, normals, offsets, starts, directions):
 
 
 @njit(cache=True, fastmath=True)
-def relax(points, corners, sharp, centers, rounds, enough, normals, offsets, starts, directions):
+def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing, directions):
     """Alternate between giving cells to spheres and moving the spheres.
 
     Returns the best centres met and how far they stick out; ends early at `enough`.
@@ -112,7 +199,7 @@ def relax(points, corners, sharp, centers, rounds, enough, normals, offsets, sta
     best, best_value = centers.copy(), 1e9
     step = FIRST_STEP
     for r in range(rounds + 1):
-        assign(points, corners, centers, depths_at(centers, normals, offsets, starts), owner, least, second)
+        assign(points, corners, centers, rooms_at(centers, grid, origin, spacing), owner, least, second)
         value = least.max()
         if value < best_value:
             best, best_value = centers.copy(), value
@@ -147,6 +234,6 @@ def relax(points, corners, sharp, centers, rounds, enough, normals, offsets, sta
                         own[found] = points[p]
                         found += 1
             if found > 0:
-                move_center(centers[i], own, found, step, normals, offsets, starts, directions)
+                move_center(centers[i], own, found, step, grid, origin, spacing, directions)
         step = max(SHRINK * step, LAST_STEP)
     return best, best_value

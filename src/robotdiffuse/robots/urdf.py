@@ -2,6 +2,7 @@
 
 import hashlib
 import xml.etree.ElementTree as ET
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -9,9 +10,9 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.spatial import ConvexHull, QhullError
 
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.robots.convex_parts import Surface, convex_hull
 from robotdiffuse.robots.groups import passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.packages import Packages, urdf_text
 from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
@@ -25,8 +26,6 @@ ACCELERATION_PER_VELOCITY = 4.0
 """URDF has no acceleration limit: full speed after a quarter of a second [1/s]."""
 JERK_PER_ACCELERATION = 10.0
 """Nor one for jerk: full acceleration after a tenth of a second [1/s]."""
-HULL_NOTE = 1.05
-"""Hulls larger than their mesh by more than this factor are noted."""
 
 
 def read_urdf(
@@ -91,18 +90,16 @@ def read_urdf(
     return robot
 
 
-def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
-    """Convex hull with outward faces; a flat set of points is given a hair of thickness."""
-    try:
-        hull = ConvexHull(points)
-    except QhullError:
-        hull = ConvexHull(points, qhull_options="QJ")
-    used, index = np.unique(hull.simplices, return_inverse=True)
-    vertices, faces = points[used], index.reshape(hull.simplices.shape)
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    inwards = np.einsum("fd,fd->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
-    faces[inwards] = faces[inwards][:, ::-1]
-    return ConvexMesh(vertices, faces)
+def collision_surfaces(
+    path: str | Path, links: Iterable[str], packages: dict[str, str | Path] | None = None
+) -> dict[str, tuple[Surface, ...]]:
+    """The collision meshes of links as the URDF has them, in the links' frames, for those that have any.
+
+    Raises InputError as read_urdf does.
+    """
+    tree = _Tree(Path(path), packages or {})
+    surfaces = {link: tree.surfaces(link) for link in links}
+    return {link: parts for link, parts in surfaces.items() if parts}
 
 
 def robot_name(path: str | Path, packages: dict[str, str | Path] | None = None) -> str:
@@ -297,7 +294,9 @@ class _Tree:
     def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
         """Hulls of the links' collision elements by link, in its frame; of their visual ones if no link of
         the file has any of the others."""
-        parts = {link: self._meshes(link) for link in links}
+        parts = {
+            link: tuple(convex_hull(surface.vertices) for surface in self.surfaces(link)) for link in links
+        }
         if self.kind == "visual" and any(parts.values()):
             self.notes.append("no link has collision geometry; the visual geometry is taken")
         elif any(parts.values()):
@@ -308,19 +307,20 @@ class _Tree:
                 self.notes.append(f"links without collision geometry are not checked: {', '.join(shown)}")
         return parts
 
-    def _meshes(self, link: str) -> tuple[ConvexMesh, ...]:
+    def surfaces(self, link: str) -> tuple[Surface, ...]:
+        """The link's collision elements, in its frame."""
         parts = []
         for element in self.links[link].findall(self.kind):
             geometry = element.find("geometry")
             shape = next(iter(geometry), None) if geometry is not None else None
             if shape is None:
                 raise InputError(f"{self.path}: link {link}: a <{self.kind}> has no geometry")
-            points = self._points(shape, link)
+            surface = self._surface(shape, link)
             T = self._origin(element, f"link {link}: {self.kind}")
-            parts.append(convex_hull(points @ T[:3, :3].T + T[:3, 3]))
+            parts.append(Surface(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces))
         return tuple(parts)
 
-    def _points(self, shape: ET.Element, link: str) -> Float[ndarray, "n 3"]:
+    def _surface(self, shape: ET.Element, link: str) -> Surface:
         def positive(name: str, count: int) -> Float[ndarray, "n"]:
             what = f"link {link}: {shape.tag} {name}"
             values = self._numbers(shape.get(name, ""), count, what)
@@ -328,27 +328,30 @@ class _Tree:
                 raise InputError(f"{self.path}: {what} is {shape.get(name)!r}; it must be positive")
             return values
 
+        if shape.tag == "mesh":
+            return self._mesh(shape, link)
         if shape.tag == "box":
-            return np.array(trimesh.creation.box(positive("size", 3)).vertices)
-        if shape.tag == "sphere":
-            return _ball() * positive("radius", 1)
-        if shape.tag == "capsule":
+            points = np.array(trimesh.creation.box(positive("size", 3)).vertices)
+        elif shape.tag == "sphere":
+            points = _ball() * positive("radius", 1)
+        elif shape.tag == "capsule":
             ball, half = _ball() * positive("radius", 1), float(positive("length", 1)[0]) / 2
-            return np.concatenate([ball + np.array([0, 0, z]) for z in (-half, half)])
-        if shape.tag == "cylinder":
+            points = np.concatenate([ball + np.array([0, 0, z]) for z in (-half, half)])
+        elif shape.tag == "cylinder":
             angle = np.arange(32) * np.pi / 16
             ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
             ring = ring * positive("radius", 1) / np.cos(np.pi / 32)
             half = float(positive("length", 1)[0]) / 2
-            return np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
-        if shape.tag == "mesh":
-            return self._mesh_points(shape, link)
-        raise InputError(
-            f"{self.path}: link {link}: {self.kind} shape <{shape.tag}> is not known; known: box, capsule, "
-            f"cylinder, mesh, sphere"
-        )
+            points = np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
+        else:
+            raise InputError(
+                f"{self.path}: link {link}: {self.kind} shape <{shape.tag}> is not known; known: box, "
+                f"capsule, cylinder, mesh, sphere"
+            )
+        hull = convex_hull(points)
+        return Surface(hull.vertices, hull.faces)
 
-    def _mesh_points(self, shape: ET.Element, link: str) -> Float[ndarray, "n 3"]:
+    def _mesh(self, shape: ET.Element, link: str) -> Surface:
         file = self.packages.file(shape.get("filename", ""))
         try:
             mesh = trimesh.load(file, force="mesh")
@@ -356,12 +359,8 @@ class _Tree:
             raise InputError(f"{self.path}: link {link}: cannot read {file}: {error}") from None
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.vertices) < 4:
             raise InputError(f"{self.path}: link {link}: {file} holds no triangle mesh")
-        hull = convex_hull(np.array(mesh.vertices, dtype=np.float64))
-        volume = trimesh.Trimesh(hull.vertices, hull.faces, process=False).volume
-        if not mesh.is_watertight or volume > HULL_NOTE * mesh.volume:
-            self.notes.append(f"link {link}: {file.name} is not convex; its convex hull is taken")
         scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"link {link}: mesh scale")
-        return hull.vertices * scale
+        return Surface(np.array(mesh.vertices, np.float64) * scale, np.array(mesh.faces, np.int64))
 
 
 def _ball() -> Float[ndarray, "n 3"]:

@@ -1,0 +1,346 @@
+"""Convex parts that together hold a collision mesh: what Coal can measure exactly.
+
+A mesh is cut by planes until no part's hull sticks out of it too far, then parts are joined again as long as
+their common hull does not. A hull of all that a plane leaves on one side of a closed surface holds the solid
+on that side, so the parts cover mesh and solid by construction, whatever the mesh looks like. How far a hull
+sticks out is measured on a voxel grid: what cannot be reached from outside without crossing the surface is
+solid, so that holes smaller than a voxel, inner walls and triangles that overlap do no harm.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+from numpy import ndarray
+from scipy import ndimage
+from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.robot import ConvexMesh
+
+CUTS = np.arange(1, 10) / 10
+"""Where a part may be cut, along each axis, as shares of its length."""
+STEP = 1e-4
+"""How far from such a surface a part is cut [m]."""
+TIE = 0.999
+"""Of cuts that leave as little volume, but for such a factor, the first is taken."""
+WALLS = 6
+"""Surfaces across an axis at which a part may be cut too, at most."""
+CHOICE_POINTS = 1200
+"""Points of the surface from which the best cut is chosen, about."""
+MOST_NORMALS = 1000
+"""Faces of a hull whose planes are all looked at when it is simplified."""
+GROWTH = 1e-7
+"""Simplified hulls are larger by this [m]: more than rounding takes away."""
+
+
+@dataclass(frozen=True)
+class PartSettings:
+    """How closely convex parts follow a mesh."""
+
+    concavity: float = 0.007
+    """How far the hull of a part may stick out of the mesh [m]."""
+    most: int = 16
+    """Parts of a link, at most."""
+    voxels: int = 400_000
+    """Of the grid on which that is measured, about."""
+    finest: float = 0.0015
+    """Edge of a voxel, at least [m]."""
+    faces: int = 400
+    """Hulls with more triangles are simplified, outwards."""
+    rounding: float = 5e-4
+    """How far a simplified hull may stick out of the hull [m], as long as 120 planes suffice."""
+
+    def __post_init__(self) -> None:
+        if not self.finest > 0 or not self.concavity > 0 or self.most < 1:
+            raise InputError(
+                f"convex parts: concavity is {self.concavity}, finest {self.finest}, most {self.most}; "
+                "all must be positive"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A triangle mesh in the frame of its link [m]; it need not be closed."""
+
+    vertices: Float[ndarray, "v 3"]
+    faces: Int[ndarray, "f 3"]
+
+
+def convex_parts(
+    surfaces: tuple[Surface, ...], settings: PartSettings | None = None
+) -> tuple[ConvexMesh, ...]:
+    """Convex meshes whose union holds the surfaces of a link and what they enclose."""
+    settings = settings or PartSettings()
+    soups = [surface.vertices[surface.faces] for surface in surfaces]
+    space = _Space.around(soups, settings)
+    parts = [_Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
+    most = max(settings.most, 2 * len(parts))
+    while len(parts) < most:
+        worst = max(range(len(parts)), key=lambda i: parts[i].concavity)
+        if parts[worst].concavity <= settings.concavity:
+            break
+        parts[worst : worst + 1] = parts[worst].halves(space, settings)
+    return tuple(_without_contained(_joined([part.hull for part in parts], space, settings)))
+
+
+def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
+    """Convex hull with outward faces; a flat set of points is given a hair of thickness."""
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        hull = ConvexHull(points, qhull_options="QJ")
+    used, index = np.unique(hull.simplices, return_inverse=True)
+    vertices, faces = points[used], index.reshape(hull.simplices.shape)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    inwards = np.einsum("fd,fd->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return ConvexMesh(vertices, faces)
+
+
+def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:
+    """Outward unit normals; zero for a face without area."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(size > 1e-14, normals / np.maximum(size, 1e-14), 0.0)
+
+
+def planes_of(mesh: ConvexMesh) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p"]]:
+    """Normals and offsets of the distinct planes of a convex mesh."""
+    normals = face_normals(mesh)
+    normals = np.unique(np.round(normals[np.linalg.norm(normals, axis=1) > 0.5], 9), axis=0)
+    # the farthest vertex, not the face's own: rounding must not put a plane inside the mesh
+    return normals, (mesh.vertices @ normals.T).max(0)
+
+
+def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: int = 120) -> ConvexMesh:
+    """A convex mesh that holds a hull, of some of the hull's own planes; the same one if it has few faces.
+
+    Planes are added where the corners that the others leave stick out most.
+    """
+    settings = settings or PartSettings()
+    if len(hull.faces) <= settings.faces:
+        return hull
+    normals = face_normals(hull)
+    if len(normals) > MOST_NORMALS:  # those that are much alike count once
+        _, first = np.unique(np.round(normals * 12).astype(int) @ [1, 100, 10_000], return_index=True)
+        normals = normals[first]
+    normals = np.concatenate([np.eye(3), -np.eye(3), normals[np.linalg.norm(normals, axis=1) > 0.5]])
+    offsets = (hull.vertices @ normals.T).max(0) + GROWTH
+    chosen, middle = list(range(6)), hull.vertices.mean(0)
+    try:
+        while True:
+            halfspaces = np.column_stack([normals[chosen], -offsets[chosen]])
+            corners = HalfspaceIntersection(halfspaces, middle).intersections
+            beyond = corners @ normals.T - offsets
+            worst = beyond.max(1)
+            if worst.max() <= settings.rounding or len(chosen) >= most:
+                return convex_hull(corners)
+            for corner in np.argsort(-worst)[: min(8, most - len(chosen))]:
+                plane = int(beyond[corner].argmax())
+                if worst[corner] > settings.rounding and plane not in chosen:
+                    chosen.append(plane)
+    except QhullError:  # almost flat
+        return hull
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    triangles: Float[ndarray, "n 3 3"]
+    points: Float[ndarray, "m 3"]
+    """All over the triangles, for the choice of cuts."""
+    hull: ConvexMesh
+    concavity: float
+
+    @staticmethod
+    def of(triangles: ndarray, points: ndarray, space: "_Space", settings: PartSettings) -> "_Part":
+        hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
+        return _Part(triangles, points, hull, space.concavity(hull))
+
+    def halves(self, space: "_Space", settings: PartSettings) -> list["_Part"]:
+        """The two sides of the plane that leaves hulls of least volume; itself if it is too small to cut."""
+        low, size = self.hull.vertices.min(0), np.ptp(self.hull.vertices, axis=0)
+        points, apart = _thinned(self.points, space.pitch)
+        best, least = None, np.inf
+        for axis in sorted(np.flatnonzero(size > 6 * space.pitch), key=lambda axis: -size[axis]):
+            for at in (*_walls(points[:, axis], space.pitch), *(low[axis] + CUTS * size[axis])):
+                height = points[:, axis] - at
+                volume = 0.0
+                for side in (points[height <= 0], points[height > 0]):
+                    edge = side[np.abs(side[:, axis] - at) <= apart]
+                    edge[:, axis] = at  # where the surface meets the plane, about
+                    volume += _volume(np.concatenate([side, edge]))
+                if volume < TIE * least:
+                    best, least = (int(axis), float(at)), volume
+        halves = _sides(self.triangles, *best) if best else ()
+        if best is None or not all(map(len, halves)):
+            return [replace(self, concavity=0.0)]
+        low_points = self.points[:, best[0]] <= best[1]
+        points = (self.points[low_points], self.points[~low_points])
+        return [_Part.of(side, near, space, settings) for side, near in zip(halves, points, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Space:
+    """What is around a surface: for each voxel the distance to the solid, zero in it [m]."""
+
+    origin: Float[ndarray, "3"]
+    pitch: float
+    distance: Float[ndarray, "nx ny nz"]
+
+    @staticmethod
+    def around(soups: list[Float[ndarray, "n 3 3"]], settings: PartSettings) -> "_Space":
+        corners = np.concatenate(soups).reshape(-1, 3)
+        low, high = corners.min(0), corners.max(0)
+        size = np.maximum(high - low, settings.finest)
+        pitch = max(float(np.prod(size) / settings.voxels) ** (1 / 3), size.max() / 300, settings.finest)
+        origin = low - 2.5 * pitch
+        shape = np.ceil((high - origin) / pitch).astype(int) + 3
+        occupied = np.zeros(shape, dtype=bool)
+        for soup in soups:
+            samples = split(soup, pitch / 2).reshape(-1, 3)
+            occupied[tuple(np.floor((samples - origin) / pitch).astype(int).T)] = True
+        found: Any = ndimage.label(~occupied)
+        free = found[0] == found[0][0, 0, 0]
+        return _Space(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
+
+    def concavity(self, hull: ConvexMesh) -> float:
+        """How far a hull sticks out of the solid [m], about."""
+        low = np.floor((hull.vertices.min(0) - self.origin) / self.pitch).astype(int)
+        high = np.ceil((hull.vertices.max(0) - self.origin) / self.pitch).astype(int) + 1
+        return _farthest_inside(self.distance, self.origin, self.pitch, low, high, *planes_of(hull))
+
+
+@njit(cache=True)
+def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
+    """Largest distance of a voxel whose centre is within the planes."""
+    best = 0.0
+    for i in range(max(low[0], 0), min(high[0], distance.shape[0])):
+        x = origin[0] + (i + 0.5) * pitch
+        for j in range(max(low[1], 0), min(high[1], distance.shape[1])):
+            y = origin[1] + (j + 0.5) * pitch
+            for k in range(max(low[2], 0), min(high[2], distance.shape[2])):
+                if distance[i, j, k] <= best:
+                    continue
+                z = origin[2] + (k + 0.5) * pitch
+                inside = True
+                for f in range(len(offsets)):
+                    if normals[f, 0] * x + normals[f, 1] * y + normals[f, 2] * z > offsets[f]:
+                        inside = False
+                        break
+                if inside:
+                    best = distance[i, j, k]
+    return best
+
+
+def _walls(heights: Float[ndarray, "n"], pitch: float) -> list[float]:
+    """Just before and behind where a surface runs across an axis: parts often meet there."""
+    counts, edges = np.histogram(heights, max(int(np.ptp(heights) / pitch), 1))
+    most = np.argsort(-counts)[:WALLS]
+    middles = [
+        float(np.median(heights[(heights >= edges[k]) & (heights <= edges[k + 1])]))
+        for k in most
+        if counts[k] > 2 * np.median(counts)
+    ]
+    return [middle + step for middle in middles for step in (-STEP, STEP)]
+
+
+def _spread(triangles: Float[ndarray, "n 3 3"], pitch: float) -> Float[ndarray, "m 3"]:
+    """Points all over a surface."""
+    return _one_per_cube(split(triangles, 2 * pitch).reshape(-1, 3), pitch)
+
+
+def _thinned(points: Float[ndarray, "n 3"], size: float) -> tuple[Float[ndarray, "m 3"], float]:
+    """Fewer points, one of each cube, and the edge of the cubes [m]."""
+    while len(points) > CHOICE_POINTS:
+        size *= 1.3
+        points = _one_per_cube(points, size)
+    return points, size
+
+
+def _one_per_cube(points: Float[ndarray, "n 3"], size: float) -> Float[ndarray, "m 3"]:
+    cubes = np.floor((points - points.min(0)) / size).astype(np.int64)
+    _, first = np.unique(np.ravel_multi_index(tuple(cubes.T), cubes.max(0) + 1), return_index=True)
+    return points[first]
+
+
+def _volume(points: Float[ndarray, "n 3"]) -> float:
+    try:
+        return ConvexHull(points).volume
+    except (QhullError, ValueError):  # flat, or fewer than four points
+        return 0.0
+
+
+def _sides(
+    triangles: Float[ndarray, "n 3 3"], axis: int, at: float
+) -> tuple[Float[ndarray, "a 3 3"], Float[ndarray, "b 3 3"]]:
+    """What of triangles lies on the two sides of an axis-aligned plane."""
+    height = triangles[:, :, axis] - at
+    below, above = (height <= 0).all(1), (height >= 0).all(1)
+    crossing, height = triangles[~below & ~above], height[~below & ~above]
+    # the corner that is alone on its side comes first
+    negative = height < 0
+    alone = np.where(negative.sum(1) == 1, negative.argmax(1), (~negative).argmax(1))
+    turn = (alone[:, None] + np.arange(3)) % 3
+    rows = np.arange(len(crossing))[:, None]
+    (a, b, c), (x, y, z) = np.moveaxis(crossing[rows, turn], 1, 0), height[rows, turn].T[:, :, None]
+    ab, ac = a + (b - a) * (x / (x - y)), a + (c - a) * (x / (x - z))
+    single = np.stack([a, ab, ac], axis=1)
+    double = np.concatenate([np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)])
+    low = x[:, 0] < 0
+    return (
+        np.concatenate([triangles[below], single[low], double[np.tile(~low, 2)]]),
+        np.concatenate([triangles[above & ~below], single[~low], double[np.tile(low, 2)]]),
+    )
+
+
+def _joined(hulls: list[ConvexMesh], space: _Space, settings: PartSettings) -> list[ConvexMesh]:
+    """Hulls joined, those first whose common hull sticks out least, as long as it does not too far."""
+    hulls = list(hulls)
+    known: dict[tuple[int, int], tuple[float, ConvexMesh]] = {}
+    while len(hulls) > 1:
+        for i, a in enumerate(hulls):
+            for b in hulls[i + 1 :]:
+                if (id(a), id(b)) not in known:
+                    both = convex_hull(np.concatenate([a.vertices, b.vertices]))
+                    both = simplified(both, settings)
+                    known[id(a), id(b)] = (space.concavity(both), both)
+        pairs = [
+            (known[id(a), id(b)][0], i, j) for i, a in enumerate(hulls) for j, b in enumerate(hulls) if i < j
+        ]
+        least, i, j = min(pairs)
+        if least > settings.concavity:
+            break
+        both = known[id(hulls[i]), id(hulls[j])][1]
+        hulls = [hull for k, hull in enumerate(hulls) if k not in (i, j)] + [both]
+    return hulls
+
+
+def _without_contained(hulls: list[ConvexMesh]) -> list[ConvexMesh]:
+    """Hulls without those that lie in one other."""
+    kept = sorted(hulls, key=lambda hull: float(np.prod(np.ptp(hull.vertices, axis=0))))
+    for hull in tuple(kept):
+        others = [planes_of(other) for other in kept if other is not hull]
+        if any((hull.vertices @ normals.T <= offsets).all() for normals, offsets in others):
+            kept.remove(hull)
+    return kept
+
+
+def split(triangles: Float[ndarray, "n 3 3"], size: "float | Float[ndarray, 'n']") -> Float[ndarray, "m 3 3"]:
+    """Halve triangles at their longest edge until no edge is longer than `size` [m]."""
+    done = []
+    size = np.broadcast_to(size, len(triangles))
+    while len(triangles):
+        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
+        longest = edges.argmax(1)
+        small = edges.max(1) <= size
+        done.append(triangles[small])
+        triangles, longest, size = triangles[~small], longest[~small], np.tile(size[~small], 2)
+        turn = (longest[:, None] + np.arange(3)) % 3
+        a, b, c = np.moveaxis(np.take_along_axis(triangles, turn[:, :, None], axis=1), 1, 0)
+        middle = (a + b) / 2
+        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+    return np.concatenate(done)

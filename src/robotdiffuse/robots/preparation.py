@@ -1,0 +1,216 @@
+"""From a robot's collision meshes to what planning needs: convex parts, covering spheres, allowed pairs.
+
+It measures itself: configurations in which the true meshes are free, but parts or spheres are not, are what
+the planner will never see. Where a pair of links refuses too many of them, parts and spheres are made again,
+finer in the places where the two touch in vain.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.allowed_collisions import (
+    CHECKED,
+    Links,
+    PairReport,
+    SamplingSettings,
+    allowed_pairs,
+    find_allowed_collisions,
+)
+from robotdiffuse.robots.convex_parts import PartSettings, Surface, convex_parts
+from robotdiffuse.robots.interfaces import hidden_by_neighbours
+from robotdiffuse.robots.refusals import PairRefusals, Refusals, measure_refusals
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
+from robotdiffuse.robots.sphere_room import FLOOR, Bounds, Solid
+
+Progress = Callable[[str, int, int], None]
+"""Called with what is being done, the number of the step and the number of steps."""
+FINER = 0.5
+"""From round to round, how far convex parts may stick out where they refuse much, as a share."""
+LEFT = 0.6
+"""What pairs that stay as they are may refuse together, as a share of what all may."""
+FASTER = 0.6
+"""From round to round, a factor of that share."""
+GAP_SHARE = 1.2
+"""Of the gap between two links that spheres bridge in vain, what those of each may stick out into it."""
+
+
+@dataclass(frozen=True)
+class PreparationSettings:
+    """How a robot is prepared."""
+
+    parts: PartSettings = field(default_factory=PartSettings)
+    spheres: SphereSettings = field(default_factory=SphereSettings)
+    sampling: SamplingSettings = field(default_factory=SamplingSettings)
+    refused: float = 0.06
+    """Share of the free configurations that spheres may refuse before they are made finer."""
+    samples: int = 4000
+    """Configurations on which that is measured."""
+    rounds: int = 3
+    """Times that links are made finer, at most."""
+    finest: float = 0.003
+    """Spheres need not stick out by less anywhere [m]."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.refused < 1 or self.samples < 100 or self.rounds < 0:
+            raise InputError(
+                f"preparation: refused is {self.refused} (must be between 0 and 1), samples {self.samples} "
+                f"(at least 100), rounds {self.rounds} (at least 0)"
+            )
+
+
+@dataclass(frozen=True)
+class LinkReport:
+    """Parts and spheres of one link."""
+
+    link: str
+    parts: int
+    spheres: int
+    stick_out: float
+    """How far a sphere reaches out of the parts, at most [m]; also to where a neighbour is at any angle."""
+    covered: bool
+    """Whether the spheres provably cover the surface of the parts."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """What `prepare` made."""
+
+    robot: Robot
+    links: tuple[LinkReport, ...]
+    pairs: tuple[PairReport, ...]
+    sampled: tuple[PairReport, ...]
+    """The pairs by sampling alone."""
+    refusals: Refusals
+
+
+@dataclass(eq=False)
+class _Link:
+    """One link while it is made."""
+
+    name: str
+    surfaces: tuple[Surface, ...]
+    parts: PartSettings
+    bounds: Bounds = field(default_factory=lambda: Bounds(0.0))
+    solid: Solid | None = None
+    spheres: ndarray | None = None
+
+    def decompose(self, robot: Robot) -> Robot:
+        """The robot with this link's convex parts."""
+        meshes = convex_parts(self.surfaces, self.parts)
+        self.solid = None
+        return replace(robot, meshes=robot.meshes | {self.name: meshes})
+
+    def fit(self, robot: Robot, settings: SphereSettings, seed: int) -> Robot:
+        """The robot with this link's spheres; `tight` places that were found stay."""
+        if self.solid is None:
+            meshes = robot.meshes[self.name]
+            self.solid = Solid.of(meshes, settings.tolerance(robot, self.name, np.inf))
+            tolerance = settings.tolerance(robot, self.name, self.solid.depth)
+            hidden = hidden_by_neighbours(robot, self.name)
+            self.bounds = Bounds(tolerance, hidden, self.bounds.tight, _floor(robot, self.name))
+        fit = fit_spheres(self.solid, self.bounds, np.random.default_rng(seed), settings)
+        self.spheres = np.round(fit, 6)  # as the file holds them: these are judged
+        return replace(robot, spheres=robot.spheres | {self.name: self.spheres})
+
+    def report(self) -> LinkReport:
+        assert self.solid is not None and self.spheres is not None
+        out = float(stick_out(self.solid, self.spheres).max())
+        whole = covered(self.solid.meshes, self.spheres)
+        return LinkReport(self.name, len(self.solid.meshes), len(self.spheres), out, whole)
+
+
+def prepare(
+    robot: Robot,
+    surfaces: Mapping[str, tuple[Surface, ...]],
+    settings: PreparationSettings,
+    seed: int = 0,
+    progress: Progress = lambda what, step, steps: None,
+    allowed: Mapping[frozenset[str], str] | None = None,
+) -> Prepared:
+    """The robot with parts, spheres and allowed pairs for the collision meshes of its links.
+
+    `surfaces` are the meshes by link, in the links' frames; `allowed` pairs, with reasons, that need no check
+    whatever sampling says. The same input and seed give the same robot.
+    """
+    links = {name: _Link(name, meshes, settings.parts) for name, meshes in surfaces.items()}
+    steps = 2 * len(links) + 1 + settings.rounds
+    for step, link in enumerate(links.values()):
+        progress(f"convex parts of {link.name}", step, steps)
+        robot = link.decompose(robot)
+    for step, link in enumerate(links.values(), len(links)):
+        progress(f"spheres of {link.name}", step, steps)
+        robot = link.fit(robot, settings.spheres, seed)
+    progress("pairs of links", 2 * len(links), steps)
+    sampled = find_allowed_collisions(robot, settings.sampling, np.random.default_rng(seed))
+    named = allowed or {}
+    pairs = tuple(
+        replace(pair, reason=named[frozenset(pair.links)])
+        if pair.reason == CHECKED and frozenset(pair.links) in named
+        else pair
+        for pair in sampled
+    )
+    robot = replace(robot, allowed_collisions=allowed_pairs(pairs))
+    for k in range(settings.rounds + 1):
+        progress("configurations refused", 2 * len(links) + 1 + k, steps)
+        refusals = measure_refusals(robot, surfaces, settings.samples, np.random.default_rng(seed))
+        if refusals.by_spheres <= settings.refused or k == settings.rounds:
+            break
+        robot = _refined(robot, links, refusals, k, settings, seed)
+    progress("done", steps, steps)
+    return Prepared(robot, tuple(link.report() for link in links.values()), pairs, sampled, refusals)
+
+
+def _refined(
+    robot: Robot,
+    links: dict[str, _Link],
+    refusals: Refusals,
+    k: int,
+    settings: PreparationSettings,
+    seed: int,
+) -> Robot:
+    """The robot with finer parts and spheres where pairs of links refuse much."""
+    worst = _worst(refusals, settings.refused)
+    coarse = {name for pair in worst if pair.by_parts > settings.refused / 5 for name in pair.links}
+    for name in sorted(coarse):
+        link = links[name]
+        link.parts = replace(link.parts, concavity=link.parts.concavity * FINER, most=2 * link.parts.most)
+        robot = link.decompose(robot)
+    for name in sorted({name for pair in worst for name in pair.links}):
+        link = links[name]
+        places = np.concatenate([pair.places[name] for pair in worst if name in pair.links])
+        places[:, 3] = np.clip(GAP_SHARE * FASTER**k * places[:, 3], settings.finest, link.bounds.tolerance)
+        known = link.bounds.tight
+        link.bounds = replace(link.bounds, tight=places if known is None else np.concatenate([known, places]))
+        robot = link.fit(robot, settings.spheres, seed)
+    return robot
+
+
+def _worst(refusals: Refusals, refused: float) -> list[PairRefusals]:
+    """As few pairs as leave the others well within what may be refused."""
+    left = sum(pair.by_spheres for pair in refusals.pairs)
+    worst = []
+    for pair in refusals.pairs:
+        if left <= LEFT * refused:
+            break
+        worst.append(pair)
+        left -= pair.by_spheres
+    return worst
+
+
+def _floor(robot: Robot, link: str) -> tuple[ndarray, float] | None:
+    """The plane z = 0 of the base in the link's frame, for a link that moves but never tilts or rises: a
+    robot may stand on a table there. If the link's own meshes reach lower, the plane is below them."""
+    if robot.link_frame(link) == 0:
+        return None  # never checked against the scene
+    links = Links(robot)
+    T_base_link = links.poses(links.random(20, np.random.default_rng(0)))[link]
+    if np.ptp(T_base_link[:, 2], axis=0).max() > 1e-6:
+        return None
+    up, height = T_base_link[0, 2, :3], T_base_link[0, 2, 3]
+    lowest = min(float((mesh.vertices @ up).min()) for mesh in robot.meshes[link])
+    return up, min(-height, lowest - FLOOR)

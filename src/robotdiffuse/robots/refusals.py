@@ -1,0 +1,138 @@
+"""How many free configurations covering spheres and convex parts refuse, pair by pair of links, and where."""
+
+# Coal's Python module has no type information.
+# pyright: reportAttributeAccessIssue=false
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import coal
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.robots.allowed_collisions import Links, coal_pose
+from robotdiffuse.robots.convex_parts import Surface
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.sphere_kernels import deepest_touches
+
+CUBE = 0.01
+"""Of the places where spheres touch one is kept of each cube with this edge [m]."""
+
+MOST_PLACES = 500
+"""Configurations from which places are taken, of each pair."""
+FORGIVEN = 0.003
+"""Share of the configurations with the narrowest gaps that a pair may go on to refuse."""
+
+
+@dataclass(frozen=True)
+class PairRefusals:
+    """A pair of links that is checked."""
+
+    links: tuple[str, str]
+    colliding: float
+    """Share of the configurations in which the true meshes collide."""
+    by_parts: float
+    """Share of the free configurations in which convex parts of the two collide."""
+    by_spheres: float
+    """The same of spheres; those that parts refuse too are among them."""
+    places: dict[str, Float[ndarray, "n 4"]]
+    """In the frame of each of the two links: where spheres touch though the parts are apart, and how far the
+    parts are from each other then, at least [m]."""
+
+
+@dataclass(frozen=True)
+class Refusals:
+    """What of the free configurations is refused, for touching itself where its true meshes do not."""
+
+    free: float
+    """Share of the configurations in which the true meshes are free."""
+    by_parts: float
+    """Share of those that convex parts refuse."""
+    by_spheres: float
+    """Share of those that covering spheres refuse."""
+    pairs: tuple[PairRefusals, ...]
+    """Those that refuse most first."""
+
+
+def measure_refusals(
+    robot: Robot, surfaces: Mapping[str, tuple[Surface, ...]], samples: int, rng: np.random.Generator
+) -> Refusals:
+    """Of configurations uniform within the limits of the planned joints, others held as they are.
+
+    `surfaces` are the true meshes of the links; they are asked only where convex parts collide, and those
+    only where spheres do.
+    """
+    links = Links(robot)
+    q = links.random(samples, rng)
+    for column, joint in enumerate(links.joints):
+        if joint.name in robot.locked:
+            q[:, column] = robot.locked[joint.name]
+    poses = links.poses(q)
+    trees = {link: tuple(map(_tree, parts)) for link, parts in surfaces.items()}
+    found = []
+    for a, b in robot.checked_pairs():
+        T_a_b = np.linalg.inv(poses[a]) @ poses[b]
+        depth, middle = deepest_touches(T_a_b, robot.spheres[a], robot.spheres[b])
+        spheres = depth > 0
+        parts, meshes = np.zeros(samples, dtype=bool), np.zeros(samples, dtype=bool)
+        for i in np.flatnonzero(spheres):
+            parts[i] = links.collide(poses, a, b, int(i))
+            if parts[i]:
+                meshes[i] = _collide(trees[a], trees[b], poses[a][i], poses[b][i])
+        found.append((spheres, parts, meshes, middle, T_a_b))
+    if not found:
+        return Refusals(1.0, 0.0, 0.0, ())
+    free = ~np.any([meshes for _, _, meshes, _, _ in found], axis=0)
+    count = max(int(free.sum()), 1)
+    pairs = []
+    for (a, b), (spheres, parts, meshes, middle, T_a_b) in zip(robot.checked_pairs(), found, strict=True):
+        idle = np.flatnonzero(spheres & ~parts & free)[:MOST_PLACES]
+        gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in idle])
+        # the narrowest few stay refused
+        wide = gaps >= np.sort(gaps)[: int(samples * FORGIVEN * len(idle) / max(spheres.sum(), 1)) + 1].max(
+            initial=0.0
+        )
+        idle, gaps = idle[wide], gaps[wide]
+        on_b = np.einsum("nji,nj->ni", T_a_b[idle, :3, :3], middle[idle] - T_a_b[idle, :3, 3])
+        places = {a: _one_per_cube(middle[idle], gaps), b: _one_per_cube(on_b, gaps)}
+        shares = (float((parts & free).sum() / count), float((spheres & free).sum() / count))
+        pairs.append(PairRefusals((a, b), float(meshes.mean()), *shares, places))
+    by_parts = np.any([parts for _, parts, _, _, _ in found], axis=0)
+    by_spheres = np.any([spheres for spheres, _, _, _, _ in found], axis=0)
+    return Refusals(
+        float(free.mean()),
+        float((by_parts & free).sum() / count),
+        float((by_spheres & free).sum() / count),
+        tuple(sorted(pairs, key=lambda pair: -pair.by_spheres)),
+    )
+
+
+def _one_per_cube(points: Float[ndarray, "n 3"], gaps: Float[ndarray, "n"]) -> Float[ndarray, "m 4"]:
+    """Of each cube the place with the narrowest gap."""
+    order = np.argsort(gaps)
+    rows = np.column_stack([points, gaps])[order]
+    return rows[np.unique(np.floor(rows[:, :3] / CUBE), axis=0, return_index=True)[1]]
+
+
+def _tree(surface: Surface) -> "coal.BVHModelOBBRSS":
+    model = coal.BVHModelOBBRSS()
+    model.beginModel(len(surface.faces), len(surface.vertices))
+    model.addVertices(np.ascontiguousarray(surface.vertices))
+    model.addTriangles(np.ascontiguousarray(surface.faces, dtype=np.int32))
+    model.endModel()
+    return model
+
+
+def _collide(
+    first: tuple["coal.BVHModelOBBRSS", ...],
+    second: tuple["coal.BVHModelOBBRSS", ...],
+    T_a: ndarray,
+    T_b: ndarray,
+) -> bool:
+    """Whether surfaces of two links cross (one within the other is not found)."""
+    request, result = coal.CollisionRequest(), coal.CollisionResult()
+    place_a, place_b = coal_pose(T_a), coal_pose(T_b)
+    return any(
+        coal.collide(one, place_a, other, place_b, request, result) for one in first for other in second
+    )
