@@ -89,6 +89,7 @@ def fit_spheres(
         centers = _thin_out(room, coarse, _first_cover(room, coarse, places, settings), settings)
         covers.append(centers)
     centers = _with_enough(room, fine, min(covers, key=len), settings)
+    centers, _ = _relax(room, fine, centers, settings.rounds, -np.inf)  # as little as so many can
     return _without_holes(solid, inside, _with_radii(room, fine, centers))
 
 
