@@ -9,7 +9,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 from numpy import ndarray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.robots.groups import passive_notes, planned_joints, refuse_linkages
@@ -25,6 +25,8 @@ ACCELERATION_PER_VELOCITY = 4.0
 """URDF has no acceleration limit: full speed after a quarter of a second [1/s]."""
 JERK_PER_ACCELERATION = 10.0
 """Nor one for jerk: full acceleration after a tenth of a second [1/s]."""
+THIN = 1e-3
+"""Least thickness of a hull [m]: of a sheet, spheres and distances would have none to go by."""
 HULL_NOTE = 1.05
 """Hulls larger than their mesh by more than this factor are noted."""
 
@@ -92,17 +94,23 @@ def read_urdf(
 
 
 def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
-    """Convex hull with outward faces; a flat set of points is given a hair of thickness."""
-    try:
-        hull = ConvexHull(points)
-    except QhullError:
-        hull = ConvexHull(points, qhull_options="QJ")
+    """Convex hull with outward faces; points thinner than `THIN` in a direction are given that thickness."""
+    points = _thick(points)
+    hull = ConvexHull(points)
     used, index = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = points[used], index.reshape(hull.simplices.shape)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     inwards = np.einsum("fd,fd->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     faces[inwards] = faces[inwards][:, ::-1]
     return ConvexMesh(vertices, faces)
+
+
+def _thick(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+    """The points, and others beside them along the principal axes in which they are thin: around each."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    for axis in axes[np.ptp(points @ axes.T, axis=0) < THIN]:
+        points = np.concatenate([points - axis * THIN / 2, points + axis * THIN / 2])
+    return points
 
 
 def robot_name(path: str | Path, packages: dict[str, str | Path] | None = None) -> str:
@@ -355,7 +363,10 @@ class _Tree:
         except Exception as error:  # trimesh's readers raise whatever they meet
             raise InputError(f"{self.path}: link {link}: cannot read {file}: {error}") from None
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.vertices) < 4:
-            raise InputError(f"{self.path}: link {link}: {file} holds no triangle mesh")
+            raise InputError(
+                f"{self.path}: link {link}: {file} holds no triangle mesh with four corners; repair it or "
+                f"take its element out"
+            )
         hull = convex_hull(np.array(mesh.vertices, dtype=np.float64))
         volume = trimesh.Trimesh(hull.vertices, hull.faces, process=False).volume
         if not mesh.is_watertight or volume > HULL_NOTE * mesh.volume:
