@@ -68,7 +68,6 @@ def fine() -> trimesh.Trimesh:
     return mesh
 
 
-SHEET = trimesh.Trimesh([[0, 0, 0], [0.02, 0, 0], [0.02, 0.02, 0], [0, 0.02, 0]], [[0, 1, 2], [0, 2, 3]])
 VISUAL = '<visual><geometry><box size="0.05 0.05 0.05"/></geometry></visual>'
 CAPSULE = '<collision><geometry><capsule radius="0.03" length="0.05"/></geometry></collision>'
 XACRO = '<robot name="made" xmlns:xacro="http://www.ros.org/wiki/xacro">{}</robot>'
@@ -115,7 +114,6 @@ WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
     "links without geometry": (text(robot(ARM).replace(link("j3_link"), link("j3_link", ""))), 6),
     "a mesh of 200,000 triangles": (solid(fine()), 7),
     "a mesh with degenerate triangles": (solid(degenerate(), "part.obj"), 7),
-    "a sheet of no thickness": (solid(SHEET), 7),
     "a mesh in millimetres": (solid(trimesh.creation.box([60, 60, 60]), more='scale="0.001 0.001 0.001"'), 7),
     "a mirrored mesh": (solid(box(), more='scale="1 -1 1"'), 7),
     "a mesh with an ending in capitals": (solid(box(), "PART.STL"), 7),
