@@ -87,6 +87,19 @@ def test_two_arms_are_listed_and_asked_about(tmp_path: Path) -> None:
         read_urdf(file, group="middle")
 
 
+@pytest.mark.parametrize(
+    "first, second, names",
+    [
+        ("left_fr3_joint", "right_fr3_joint", "left_fr3 .*, right_fr3 "),
+        ("l/joint_", "r/joint_", "l .*, r "),
+        ("joint_1", "joint_2", "joint_16_link .*, joint_26_link "),
+    ],
+)
+def test_names_of_arms(first: str, second: str, names: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"2 arms: {names}"):
+        read_urdf(written(tmp_path, chain("base", row(first, 6)), chain("base", row(second, 6))))
+
+
 def test_four_legs_are_no_arm(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has 4 arms"):
         read_urdf(written(tmp_path, *(chain("base", row(f"leg{i}_", 3)) for i in "abcd")))

@@ -67,6 +67,25 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
     assert content_hash(file) != digest  # of what it stands for, not of the file
 
 
+def test_xacro_includes_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever the program runs; and a .urdf may be one."""
+    pytest.importorskip("xacrodoc")
+    mesh(tmp_path / "some_arm")
+    (tmp_path / "some_arm" / "part").mkdir()
+    xacro(tmp_path / "some_arm" / "part", PARTS, "arm.xacro")
+    content = link("base") + '<xacro:include filename="part/arm.xacro"/>'
+    file = xacro(tmp_path / "some_arm", content, "made.urdf")
+    monkeypatch.chdir("/")
+    assert read_urdf(file).dof == 4
+
+
+def test_prefixes_of_simulators_need_no_declaration(tmp_path: Path) -> None:
+    more = '<drake:group name="a:b"><drake:member link="x"/></drake:group><!-- see http://a.b -->'
+    file = written(tmp_path, chain("base", row("j", 3)), more)
+    file.write_text(file.read_text().replace('velocity="2"', 'velocity="2" drake:acceleration="3"'))
+    assert read_urdf(file).dof == 3
+
+
 def test_xacro_that_cannot_be_compiled_says_what_helps(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

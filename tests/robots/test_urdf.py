@@ -19,7 +19,8 @@ from robotdiffuse.robots.limits import read_limits, with_limits
 from robotdiffuse.robots.preparation import PreparationSettings
 from robotdiffuse.robots.robot import TURNS, Robot
 from robotdiffuse.robots.sphere_fitting import covered
-from robotdiffuse.robots.urdf import content_hash, read_urdf
+from robotdiffuse.robots.urdf import THIN, content_hash, convex_hull, read_urdf
+from robotdiffuse.transforms import rotation_from_rpy
 
 ARM = """<robot name="tiny">
   <link name="base"><collision><origin xyz="0 0 0.05"/>
@@ -99,6 +100,24 @@ def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
         text = ARM.replace(BOX, f'<mesh filename="{name}" scale="2 2 1"/>')
         robot = read_urdf(urdf(package / "urdf", text))
         assert np.linalg.norm(robot.meshes["upper"][0].vertices[:, :2], axis=1).max() == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize(
+    "corners, thin",
+    [
+        ([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]], 1),
+        ([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 1e-7]], 2),
+        ([[0.1, 0.1, 0.1]] * 4, 3),
+    ],
+)
+def test_what_has_no_thickness_is_given_some(corners: list[list[float]], thin: int) -> None:
+    """A sheet, a line and a point, turned: a hull about them, by half a millimetre each way."""
+    turned = np.array(corners, float) @ rotation_from_rpy(0.3, -0.8, 1.2).T
+    hull = convex_hull(turned)
+    solid = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
+    size = np.sort(solid.bounding_box_oriented.primitive.extents)
+    np.testing.assert_allclose(size[:thin], THIN, rtol=0.01)
+    assert solid.is_watertight and solid.volume > 0 and solid.contains(turned.mean(0)[None]).all()
 
 
 MESH = '<mesh filename="package://a/b.stl"/>'

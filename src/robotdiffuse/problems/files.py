@@ -257,7 +257,7 @@ def _robot(name: object, locked: object, folder: Path) -> Robot:
         raise InputError(
             f"robot is {shown(name)}; it must be a bundled name ({', '.join(ROBOTS)}) or a URDF file"
         )
-    if name not in ROBOTS and (name.endswith((".urdf", ".xml")) or "/" in name):
+    if name not in ROBOTS and (name.endswith((".urdf", ".xacro", ".xml")) or "/" in name):
         name = str((folder / name).absolute())
     if not isinstance(locked, dict):
         raise InputError(f"locked is {shown(locked)}; it must map names of joints to values")

@@ -26,7 +26,7 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
     text = str(name)
     if (Path(name) / ROBOT_FILE).is_file():
         robot = _read(Path(name), str(Path(name).resolve()))
-    elif isinstance(name, Path) or text.endswith((".urdf", ".xml")) or "/" in text or "\\" in text:
+    elif isinstance(name, Path) or text.endswith((".urdf", ".xacro", ".xml")) or "/" in text or "\\" in text:
         robot = _from_urdf(Path(name))
     else:
         robot = _by_name(text)
@@ -80,16 +80,22 @@ def _added() -> dict[str, Path]:
 
 def _from_urdf(urdf: Path) -> Robot:
     from robotdiffuse.robots.add import add_robot, user_robots
-    from robotdiffuse.robots.urdf import content_hash, read_urdf
+    from robotdiffuse.robots.urdf import content_hash, robot_name
 
     digest, source = content_hash(urdf), str(urdf.resolve())
-    for folder in _added().values():
+    made: dict[str, Robot] = {}
+    for name, folder in _added().items():
         try:
             if _digest(folder, _state(folder / ROBOT_FILE)) == digest:
-                return _read(folder, source)
+                made[name] = _read(folder, source)
         except InputError:
             continue  # a damaged folder of another robot is no reason to fail
-    name = read_urdf(urdf).name
-    report = add_robot(urdf, out=user_robots() / f"{name}-{digest[:8]}")
+    if len({(robot.base, robot.joint_names) for robot in made.values()}) > 1:
+        raise InputError(
+            f"{urdf} is the robots {', '.join(made)}, which plan different joints; name one of them instead"
+        )
+    if made:
+        return next(iter(made.values()))
+    report = add_robot(urdf, out=user_robots() / f"{robot_name(urdf)}-{digest[:8]}")
     note = f"spheres were fitted to {urdf.name} ({report.sphere_count}) and kept in {report.folder}"
     return replace(report.robot, notes=(*report.robot.notes, note), source=source)

@@ -20,6 +20,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import ConvexMesh
 
+THIN = 1e-3
+"""Least thickness of a hull [m]: of a sheet, spheres and distances would have none to go by."""
 CUTS = np.arange(1, 10) / 10
 """Where a part may be cut, along each axis, as shares of its length."""
 STEP = 1e-4
@@ -87,17 +89,23 @@ def convex_parts(
 
 
 def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
-    """Convex hull with outward faces; a flat set of points is given a hair of thickness."""
-    try:
-        hull = ConvexHull(points)
-    except QhullError:
-        hull = ConvexHull(points, qhull_options="QJ")
+    """Convex hull with outward faces; points thinner than `THIN` in a direction are given that thickness."""
+    points = _thick(points)
+    hull = ConvexHull(points)
     used, index = np.unique(hull.simplices, return_inverse=True)
     vertices, faces = points[used], index.reshape(hull.simplices.shape)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     inwards = np.einsum("fd,fd->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
     faces[inwards] = faces[inwards][:, ::-1]
     return ConvexMesh(vertices, faces)
+
+
+def _thick(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+    """The points, and others beside them along the principal axes in which they are thin: around each."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    for axis in axes[np.ptp(points @ axes.T, axis=0) < THIN]:
+        points = np.concatenate([points - axis * THIN / 2, points + axis * THIN / 2])
+    return points
 
 
 def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:

@@ -11,6 +11,8 @@ from robotdiffuse.robots.srdf import Srdf
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """In the name of a joint: it is a gripper's, if few joints follow it."""
+ENDINGS = "_-/0123456789 "
+"""Of what the names of an arm's joints have in common."""
 PINCH, GRASP = 2, 3
 """Movable joints in a row that a way from a branching has at most if the branching is a gripper's: of two
 ways, as two fingers are, and of more."""
@@ -33,7 +35,8 @@ class Arm:
         """What its own joints' names have in common at their beginning, else the tip."""
         columns = zip(*self.joints[-self.own :], strict=False)
         same = takewhile(lambda letters: len({*letters}) == 1, columns)
-        return "".join(letters[0] for letters in same).rstrip("_-/0123456789 ") or self.tip
+        common = "".join(letters[0] for letters in same).rstrip(ENDINGS)
+        return common.removesuffix("joint").rstrip("_-/ ") or self.tip
 
 
 class JointTree:

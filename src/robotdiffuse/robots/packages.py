@@ -9,6 +9,8 @@ from robotdiffuse.errors import InputError
 
 MOST_PACKAGES = 32
 """Packages of a xacro file that are looked for one after the other."""
+PREFIX = re.compile(rb"""</?([A-Za-z_][\w.-]*):[\w.-]+|\s([A-Za-z_][\w.-]*):[\w.-]+\s*=\s*["']""")
+"""The prefix of an element or of an attribute."""
 MISSING = re.compile(r"Package not found: (\S+)")
 """What xacrodoc says of a package."""
 
@@ -75,23 +77,37 @@ def urdf_text(path: Path, packages: Packages) -> bytes:
         text = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot read the URDF {path}: {error.strerror}") from None
-    return _compiled(path, packages) if path.suffix == ".xacro" or b"<xacro:" in text else text
+    if path.suffix == ".xacro" or b"<xacro:" in text:
+        text = _compiled(path, packages)
+    return _with_prefixes(text)
+
+
+def _with_prefixes(text: bytes) -> bytes:
+    """The XML with undeclared prefixes declared: simulators' elements, as <drake:member>, often lack it."""
+    used = {found for pair in PREFIX.findall(text) for found in pair if found}
+    missing = sorted(name for name in used - {b"xml", b"xmlns"} if b"xmlns:" + name not in text)
+    declared = b"".join(b' xmlns:%s="%s"' % (name, name) for name in missing)
+    return text.replace(b"<robot", b"<robot" + declared, 1) if missing else text
 
 
 def _compiled(path: Path, packages: Packages) -> bytes:
     try:
-        from xacrodoc import XacroDoc
-        from xacrodoc import packages as known
+        import xacro
+        from xacrodoc import packages as known  # which xacro asks from then on
     except ImportError:
         raise InputError(
             f"{path} is a xacro file; install what compiles it, pip install 'robotdiffuse[xacro]', or "
             f"compile it elsewhere: xacro {path.name} > {path.name.split('.')[0]}.urdf"
         ) from None
     known.reset()
+    known.walk_up_from(path)
     known.update_package_cache(packages.folders)
     for _ in range(MOST_PACKAGES):
         try:
-            return XacroDoc.from_file(path.resolve(), resolve_packages=False).dom.toxml("utf-8")
+            xacro.init_stacks(str(path.resolve()))  # what is included is looked for from here
+            document = xacro.parse(None, str(path.resolve()))
+            xacro.process_doc(document, mappings={})
+            return document.toxml("utf-8")  # type: ignore[attr-defined]
         except Exception as error:  # xacro raises whatever it meets, and wraps what was raised within it
             why = " ".join(str(error).split())
             missing = MISSING.search(why)

@@ -358,7 +358,10 @@ class _Tree:
         except Exception as error:  # trimesh's readers raise whatever they meet
             raise InputError(f"{self.path}: link {link}: cannot read {file}: {error}") from None
         if not isinstance(mesh, trimesh.Trimesh) or len(mesh.vertices) < 4:
-            raise InputError(f"{self.path}: link {link}: {file} holds no triangle mesh")
+            raise InputError(
+                f"{self.path}: link {link}: {file} holds no triangle mesh with four corners; repair it or "
+                f"take its element out"
+            )
         scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"link {link}: mesh scale")
         return Surface(np.array(mesh.vertices, np.float64) * scale, np.array(mesh.faces, np.int64))
 
