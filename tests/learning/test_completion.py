@@ -180,3 +180,18 @@ def test_temperature_and_calibration() -> None:
     assert average_precision(np.array([0.9, 0.8, 0.1], np.float32), np.array([True, False, True])) == (
         pytest.approx((1 + 2 / 3) / 2)
     )
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_bundled_weights_know_more_than_how_much_is_occupied(family: str) -> None:
+    """Average precision over unknown voxels of 2 cm above ground: of a guess, the share that is occupied."""
+    samples = draw_samples((family,), PANDA, [11, 12, 13, 14])
+    network, above = load_completion(), training.voxel_centers()[..., 2] > 0.02
+    with torch.no_grad():
+        p = network.probabilities(*(torch.from_numpy(a) for a in (samples.seen, samples.behind))).numpy()
+    truth = unpack_fine(samples.truth)
+    asked = ((samples.seen & (FREE | OCCUPIED)) == 0) & training.reachable() & above
+    stated = np.stack([unpack_fine(pack_fine(one > 0.1)) for one in p])
+    called, true = stated[asked], truth[asked]
+    assert called[true].mean() > 0.4, "recall"
+    assert true[called].mean() > 3 * true.mean(), "precision"
