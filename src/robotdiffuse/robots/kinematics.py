@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.transforms import rotation_about, transform
 
 Z = np.array([0.0, 0.0, 1.0])
@@ -14,9 +14,12 @@ def link_pose(robot: Robot, q: Float[ndarray, "dof"], link: str) -> Float[ndarra
     """T_base_link at one configuration, in NumPy; InputError for an unknown link."""
     T = np.eye(4)
     for j in range(robot.link_frame(link)):
-        motion = transform(Z * q[j]) if robot.prismatic[j] else transform(0 * Z, rotation_about(Z, q[j]))
-        T = T @ robot.frame_offsets[j] @ motion
+        T = T @ robot.frame_offsets[j] @ _motion(robot, j, q[j])
     return T @ robot.T_frame_link(link)
+
+
+def _motion(robot: Robot, j: int, q: float) -> Float[ndarray, "4 4"]:
+    return transform(Z * q) if robot.prismatic[j] else transform(0 * Z, rotation_about(Z, q))
 
 
 def link_origins(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 3"]:
@@ -32,3 +35,24 @@ def link_origins(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[n
             motion[:, 0, 1] = -motion[:, 1, 0]
         T = T @ robot.frame_offsets[j] @ motion
     return (T @ robot.T_frame_link(link))[:, :3, 3]
+
+
+@once_per_robot
+def _spheres_by_frame(robot: Robot) -> list[Float[ndarray, "n 4"]]:
+    """Collision spheres in the frames that they are fixed to."""
+    parts: list[list[ndarray]] = [[np.zeros((0, 4))] for _ in range(robot.dof + 1)]
+    for link, spheres in robot.spheres.items():
+        T = robot.T_frame_link(link)
+        placed = np.column_stack([spheres[:, :3] @ T[:3, :3].T + T[:3, 3], spheres[:, 3]])
+        parts[robot.link_frame(link)].append(placed)
+    return [np.concatenate(part) for part in parts]
+
+
+def placed_spheres(robot: Robot, q: Float[ndarray, "dof"]) -> Float[ndarray, "n 4"]:
+    """The collision spheres at one configuration, x y z radius in the base frame [m]."""
+    parts, T = [], np.eye(4)
+    for j, spheres in enumerate(_spheres_by_frame(robot)):
+        if j:
+            T = T @ robot.frame_offsets[j - 1] @ _motion(robot, j - 1, q[j - 1])
+        parts.append(np.column_stack([spheres[:, :3] @ T[:3, :3].T + T[:3, 3], spheres[:, 3]]))
+    return np.concatenate(parts)

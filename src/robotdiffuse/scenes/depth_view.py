@@ -25,8 +25,9 @@ CLOUD_WIDTH, CLOUD_HEIGHT = 320, 240
 class DepthView:
     """A depth image of a pinhole camera, in the frame of the robot's base.
 
-    A pixel without a return, 0, negative or not finite, says nothing: neither that space is free nor that it
-    is occupied. Raises InputError for arrays of the wrong shape and for poses that are none.
+    A pixel without a return, 0, negative or not a number, says nothing: neither that space is free nor that
+    it is occupied. One that is +inf saw nothing as far as the camera sees (as in ROS, REP 117). Raises
+    InputError for arrays of the wrong shape and for poses that are none.
     """
 
     depth: Float32[ndarray, "h w"]
@@ -54,7 +55,8 @@ class DepthView:
         orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
         if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():
             raise InputError(
-                f"view.T_base_camera is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1"
+                f"view.T_base_camera is {shown(T)}; it must be a rotation and a translation over "
+                "a row 0 0 0 1"
             )
         configuration = self.configuration
         if configuration is not None:
