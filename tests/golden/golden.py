@@ -121,7 +121,7 @@ def command(*arguments: str) -> None:
 
 
 def make_data(folder: Path) -> None:
-    mix = ",".join(f"{name}=1" for name in FAMILIES)
+    mix = ",".join(f"{name}=1" for name, _ in PLANS)
     sizes = ("--trajectories", "60", "--shard", "60", "--goals", "3", "--seed", "5", "--workers", "1")
     with patch.object(
         factory, "on_this_machine", lambda call, calls, _: (one for one in enumerate(starmap(call, calls)))

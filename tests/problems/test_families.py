@@ -76,5 +76,5 @@ def test_impossible_problems(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_unknown_families_are_refused_with_those_known() -> None:
-    with pytest.raises(InputError, match=r"family 'rap'.*crate, rop, rop_dense"):
+    with pytest.raises(InputError, match=r"family 'rap'.*crate, kitchen, rop, rop_dense"):
         load_family("rap")

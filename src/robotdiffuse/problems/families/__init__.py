@@ -16,6 +16,8 @@ FAMILIES = Registry(
         "shelf": Entry(f"{HERE}.shelf:SHELF", "from one compartment of a bookcase to another"),
         "crate": Entry(f"{HERE}.crate:CRATE", "in and out of open-topped boxes on the ground"),
         "table": Entry(f"{HERE}.table:TABLE", "between the things on a table, and beneath it"),
+        "clutter": Entry(f"{HERE}.clutter:CLUTTER", "between many small things on a table"),
+        "kitchen": Entry(f"{HERE}.kitchen:KITCHEN", "in ovens, cupboards and on a counter"),
     },
 )
 """New ones at the end: the seeds of held-out problems go by the place in this table."""

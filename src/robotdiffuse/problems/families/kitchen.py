@@ -1,0 +1,168 @@
+"""A kitchenette: a counter with appliances, open in front or solid, and cupboards above it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.random import Generator
+
+from robotdiffuse.problems.families.family import PositiveRange
+from robotdiffuse.problems.families.furniture import (
+    AHEAD,
+    DOWN,
+    PLACE_TRIES,
+    Built,
+    Corner,
+    Furniture,
+    Region,
+    Square,
+    Standing,
+    Thing,
+    count,
+    is_free,
+)
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.settings import Natural, Positive, Share
+
+BENEATH = 0.25
+"""Counters at least this high may be open in front, with a region beneath [m]."""
+
+
+@dataclass(frozen=True)
+class Kitchen(Furniture):
+    """A counter against a wall. On it stand ovens, open in front, solid appliances and loose things; above it
+    hang cupboards, whose doors may stand open. Regions are the insides of ovens, cupboards and of a counter
+    that is open in front, where the hand points ahead, and free spots on the counter. Lengths in [m]."""
+
+    reach: Positive = 0.85
+    """A hand that points ahead reaches farther than one that points down."""
+    objects: tuple[Natural, Natural] = (1, 5)
+    distance: PositiveRange = (0.3, 0.45)
+    """From the base to the middle of the near edge."""
+    height: PositiveRange = (0.05, 0.4)
+    """Of the counter's upper side."""
+    depth: PositiveRange = (0.4, 0.55)
+    width: PositiveRange = (0.9, 1.5)
+    thickness: PositiveRange = (0.01, 0.03)
+    """Of all boards and walls."""
+    open_share: Share = 0.6
+    """Share of the counters, of those that are high enough, that are open in front."""
+    ovens: tuple[Natural, Natural] = (0, 2)
+    solids: tuple[Natural, Natural] = (0, 2)
+    """Number of solid appliances."""
+    appliance_width: PositiveRange = (0.3, 0.45)
+    """Of ovens; solid appliances have half of it to all."""
+    appliance_depth: PositiveRange = (0.22, 0.38)
+    appliance_height: PositiveRange = (0.22, 0.36)
+    cupboards: tuple[Natural, Natural] = (0, 3)
+    """Side by side, in the middle of the wall."""
+    cupboard_width: PositiveRange = (0.28, 0.45)
+    cupboard_depth: PositiveRange = (0.2, 0.33)
+    cupboard_height: PositiveRange = (0.26, 0.4)
+    above: PositiveRange = (0.38, 0.55)
+    """From the counter to the cupboards."""
+    door_share: Share = 0.3
+    """Share of the cupboards whose door is there, and stands open."""
+    spots: tuple[Natural, Natural] = (1, 2)
+    spot_size: PositiveRange = (0.12, 0.2)
+
+    @property
+    def most_obstacles(self) -> int:
+        wall, hollow, cupboards = 1, 5, 3 + 2 * self.cupboards[1]
+        return wall + hollow * (1 + self.ovens[1]) + self.solids[1] + cupboards + self.objects[1]
+
+    def build(self, rng: Generator) -> Built | None:
+        frame = Standing(self, self.distance, rng)
+        depth, side = rng.uniform(*self.depth), rng.uniform(*self.width) / 2
+        height, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
+        shapes: list[Box | Sphere] = []
+        regions: list[Region] = []
+
+        def hollow(low: Corner, high: Corner, name: str) -> None:
+            """Open in front; its inside is a region."""
+            (x, y, z), (far, left, top) = low, high
+            shapes.append(frame.box(low, (far, left, z + t), name))
+            shapes.append(frame.box((x, y, top - t), high, name))
+            shapes.append(frame.box((x, y, z + t), (far, y + t, top - t), name))
+            shapes.append(frame.box((x, left - t, z + t), (far, left, top - t), name))
+            shapes.append(frame.box((far - t, y + t, z + t), (far, left - t, top - t), name))
+            regions.append(frame.region((x, y + t, z + t), (far - t, left - t, top - t), AHEAD))
+
+        if height > BENEATH and rng.random() < self.open_share:
+            hollow((0.0, -side, 0.0), (depth, side, height), "counter")
+        else:
+            shapes.append(frame.box((0.0, -side, 0.0), (depth, side, height), "counter"))
+        hang = height + rng.uniform(*self.above)
+        top = self._cupboards(frame, depth, hang, t, shapes, regions, rng)
+        shapes.append(frame.box((depth, -side, 0.0), (depth + t, side, top), "wall"))
+        taken: list[Square] = []
+
+        def place(half_x: float, half_y: float) -> tuple[float, float] | None:
+            """A free place on the counter."""
+            for _ in range(PLACE_TRIES if 2 * half_x < depth and half_y < side else 0):
+                x = float(rng.uniform(half_x, depth - half_x))
+                y = float(rng.uniform(half_y - side, side - half_y))
+                if is_free((x, y, half_x, half_y), taken):
+                    taken.append((x, y, half_x, half_y))
+                    return x, y
+            return None
+
+        ovens, solids = count(self.ovens, rng), count(self.solids, rng)
+        for i in range(ovens + solids):
+            a, b = rng.uniform(*self.appliance_depth) / 2, rng.uniform(*self.appliance_width) / 2
+            b *= 1.0 if i < ovens else rng.uniform(0.5, 1.0)
+            spot = place(a, b)
+            if spot is None:
+                return None
+            (x, y), high = spot, height + rng.uniform(*self.appliance_height)
+            low_corner, high_corner = (x - a, y - b, height), (x + a, y + b, high)
+            if i < ovens:
+                hollow(low_corner, high_corner, "oven")
+            else:
+                shapes.append(frame.box(low_corner, high_corner, "appliance"))
+        for _ in range(count(self.spots, rng)):
+            half = rng.uniform(*self.spot_size) / 2
+            spot = place(half, half)
+            if spot is None:
+                return None
+            (x, y), high = spot, height + 2 * half
+            regions.append(frame.region((x - half, y - half, height), (x + half, y + half, high), DOWN))
+        for _ in range(count(self.objects, rng)):
+            thing = Thing(self, rng)
+            spot = place(thing.half, thing.half)
+            if spot is None:
+                return None
+            shapes.append(thing.placed(frame, *spot, height))
+        return shapes, regions
+
+    def _cupboards(
+        self,
+        frame: Standing,
+        depth: float,
+        low: float,
+        t: float,
+        shapes: list[Box | Sphere],
+        regions: list[Region],
+        rng: Generator,
+    ) -> float:
+        """Adds the cupboards and their insides; returns the height of their top."""
+        widths = rng.uniform(*self.cupboard_width, count(self.cupboards, rng))
+        front, top = depth - rng.uniform(*self.cupboard_depth), low + rng.uniform(*self.cupboard_height)
+        if not len(widths):
+            return top
+        sides = np.concatenate([[0.0], np.cumsum(widths + t)])
+        sides -= (sides[-1] + t) / 2
+        left, right = float(sides[0]), float(sides[-1]) + t
+        for z in (low, top - t):
+            shapes.append(frame.box((front, left, z), (depth, right, z + t), "cupboard"))
+        shapes += [
+            frame.box((front, y, low + t), (depth, y + t, top - t), "cupboard") for y in sides.tolist()
+        ]
+        for y, w in zip(sides[:-1].tolist(), widths.tolist(), strict=True):
+            regions.append(frame.region((front, y + t, low + t), (depth, y + t + w, top - t), AHEAD))
+            if rng.random() < self.door_share:  # at a right angle, hinged at its left or right
+                hinge = y if rng.random() < 0.5 else y + w + t
+                shapes.append(frame.box((front - w, hinge, low), (front, hinge + t, top), "door"))
+        return top
+
+
+KITCHEN = Kitchen()
