@@ -73,3 +73,8 @@ def shares(text: str) -> dict[str, float]:
     if len({name for name, _, _ in pairs}) < len(pairs):
         raise argparse.ArgumentTypeError(f"{text!r} names a family twice")
     return {name: not_negative(number) for name, _, number in pairs}
+
+
+def names(text: str) -> tuple[str, ...]:
+    """NAME,NAME,..."""
+    return tuple(part.strip() for part in text.split(","))

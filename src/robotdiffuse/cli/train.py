@@ -1,10 +1,10 @@
-"""robotdiffuse train encoder, train planner, train baseline"""
+"""robotdiffuse train encoder, train completion, train planner, train baseline"""
 
 import argparse
 import os
 from contextlib import nullcontext
 
-from robotdiffuse.cli.arguments import count, natural, positive, share
+from robotdiffuse.cli.arguments import count, names, natural, positive, share
 from robotdiffuse.errors import InputError
 
 SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
@@ -18,7 +18,7 @@ PARTS = (
 def add(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "train",
-        help="train the encoder, the planner's network or a baseline",
+        help="train the encoder, the completing network, the planner's or a baseline",
         description="Train a network. Ctrl-C stops after a checkpoint; the same command continues. Several "
         "processes, each with a GPU of its own if there are as many: "
         "torchrun --nproc-per-node N -m robotdiffuse train ...",
@@ -34,6 +34,18 @@ def add(commands: argparse._SubParsersAction) -> None:
     _add_shared(encoder)
     _add_device(encoder)
     encoder.set_defaults(run=run_encoder)
+
+    completion = kinds.add_parser(
+        "completion",
+        help="the network that completes what cameras see",
+        description="Train the network that says what is where depth cameras do not see, on random scenes.",
+    )
+    completion.add_argument("--families", type=names, metavar="NAMES", help="of the scenes (all of them)")
+    completion.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the arm in the pictures")
+    completion.add_argument("--workers", type=natural, metavar="N", help="processes that draw samples (1)")
+    _add_shared(completion)
+    _add_device(completion)
+    completion.set_defaults(run=run_completion)
 
     planner = kinds.add_parser(
         "planner",
@@ -127,6 +139,17 @@ def run_encoder(arguments: argparse.Namespace) -> int:
         given["minutes"] = None
     settings = EncoderTraining(**given)  # type: ignore[arg-type]
     _report(train_encoder(settings, arguments.out), arguments.out)
+    return 0
+
+
+def run_completion(arguments: argparse.Namespace) -> int:
+    from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
+
+    given = _given(arguments, ("families", "robot", "workers", "device", *SHARED))
+    if "minutes" in given:
+        given["samples"] = None
+    settings = CompletionTraining(**given)  # type: ignore[arg-type]
+    _report(train_completion(settings, arguments.out), arguments.out)
     return 0
 
 

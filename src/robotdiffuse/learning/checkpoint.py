@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.files import write_atomically
+from robotdiffuse.learning.completion.network import CompletionNetwork, CompletionSettings
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.learning.motion_model import MotionModel
@@ -73,7 +74,8 @@ def fingerprint(module: nn.Module) -> str:
 
 def _pack(module: nn.Module) -> dict[str, Tensor]:
     """Matrices of layers in fp16, which is finer than the bf16 that they are used in; the rest as it is."""
-    half = {f"{name}.weight" for name, part in module.named_modules() if isinstance(part, nn.Linear)}
+    kinds = (nn.Linear, nn.Conv3d)
+    half = {f"{name}.weight" for name, part in module.named_modules() if isinstance(part, kinds)}
     return {name: t.half() if name in half else t for name, t in module.state_dict().items()}
 
 
@@ -170,6 +172,30 @@ def load_encoder(folder: str | FilePath) -> Encoder:
     encoder = make_encoder(about["network"], kind.from_json(about.get("settings"), f"{where}: settings"))
     _fill(encoder, tensors, FilePath(folder) / "encoder.safetensors")
     return encoder.requires_grad_(False).eval()
+
+
+def save_completion(network: CompletionNetwork, folder: str | FilePath, training: dict[str, Any]) -> None:
+    """Write completion.safetensors and completion.json. `training`: how it was trained, for the reader."""
+    about = {"network": "completion", "settings": network.settings.to_json(), "training": training}
+    _save(network, FilePath(folder), "completion", about)
+
+
+def load_completion(folder: str | FilePath | None = None) -> CompletionNetwork:
+    """The completing network of a folder, or the one that comes with the package, ready to use.
+
+    Raises InputError if there is none, naming the command that trains it, and for damaged files.
+    """
+    place = BUNDLED / "completion" if folder is None else FilePath(folder)
+    if not (place / "completion.json").is_file():
+        raise InputError(
+            f"{place} holds no weights of the completing network; train them: robotdiffuse train completion "
+            "--out FOLDER"
+        )
+    tensors, about = _read(place, "completion")
+    where = str(place / "completion.json")
+    network = CompletionNetwork(CompletionSettings.from_json(about.get("settings"), f"{where}: settings"))
+    _fill(network, tensors, place / "completion.safetensors")
+    return network.requires_grad_(False).eval()
 
 
 def save_network(name: str, network: Network, folder: str | FilePath, training: dict[str, Any]) -> None:

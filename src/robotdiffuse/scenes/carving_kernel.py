@@ -6,6 +6,8 @@ Projective: each voxel is looked up in the image, and not each ray followed thro
 import numpy as np
 from numba import njit
 
+from robotdiffuse.scenes.ray_kernel import rectangle
+
 HIDDEN, FREE, BEHIND, SHADOW, OUT = 0, 1, 2, 3, 4
 """What a view says of a voxel: nothing, all of it seen free, behind a surface, behind the arm, not in the
 image."""
@@ -60,15 +62,7 @@ def _arm(depth, intrinsics, spheres):
     mask = np.zeros((h, w), np.bool_)
     for s in range(len(spheres)):
         x, y, z, r = spheres[s]
-        if z + r <= _ZERO:
-            continue
-        near = max(z - r, np.float32(0.02))
-        u0, u1 = max(0, int((x - r) / near * fx + cx)), min(w - 1, int((x + r) / near * fx + cx) + 1)
-        v0, v1 = max(0, int((y - r) / near * fy + cy)), min(h - 1, int((y + r) / near * fy + cy) + 1)
-        if x - r < _ZERO:
-            u0 = max(0, int(min((x - r) / near, (x - r) / (z + r)) * fx + cx))
-        if y - r < _ZERO:
-            v0 = max(0, int(min((y - r) / near, (y - r) / (z + r)) * fy + cy))
+        v0, v1, u0, u1 = rectangle(x, y, z, r, intrinsics, h, w)
         for v in range(v0, v1 + 1):
             ry = (np.float32(v) - cy) / fy
             for u in range(u0, u1 + 1):

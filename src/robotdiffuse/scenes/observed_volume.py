@@ -16,8 +16,9 @@ from robotdiffuse.scenes.depth_view import DepthView
 
 VOXEL = 0.04
 """Edge of a voxel [m]."""
-LOW = (-1.12, -1.12, -0.08)
-"""Least corner of the volume, in the frame of the base [m]."""
+LOW = (-1.12, -1.12, -0.1)
+"""Least corner of the volume, in the frame of the base [m]: a floor at z = 0 is in the middle of voxels, and
+not between two layers of them."""
 SHAPE = (56, 56, 32)
 """Voxels along x, y and z: all that an arm of a reach of 1.1 m on a table gets near."""
 ARM_MARGIN = 0.015

@@ -90,6 +90,10 @@ class Family(Protocol):
         """Of a scene, the floor left out."""
         ...
 
+    def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
+        """A random scene. `keep_out` are spheres, x y z radius, that nothing but the floor may enter."""
+        ...
+
     def draw(self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION) -> Drawn:
         """A random problem with up to so many goals; the same state of `rng` gives the same one.
 

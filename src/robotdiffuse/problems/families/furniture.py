@@ -152,6 +152,9 @@ class Furniture(Ranges, ABC):
             f"{MAX_TRIES} draws; change distance or reach"
         )
 
+    def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
+        return self.furnish(rng, keep_out).scene
+
     def draw(self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION) -> Drawn:
         """Start and goals are poses with the fingers in two of the regions, whatever the target."""
         keep_out = base_spheres(robot)

@@ -1,0 +1,38 @@
+"""What is where no camera saw: an auto-encoder that completes observed volumes, trained on random scenes."""
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+from jaxtyping import Float32
+from numpy import ndarray
+
+from robotdiffuse.learning.completion.samples import pack
+
+if TYPE_CHECKING:
+    from robotdiffuse.learning.completion.network import CompletionNetwork
+    from robotdiffuse.scenes.observed_volume import ObservedVolume
+
+
+def imagine(
+    volume: "ObservedVolume", network: "CompletionNetwork | None" = None
+) -> Float32[ndarray, "112 112 64"]:
+    """The probability that each voxel of 2 cm holds an obstacle; 0 where it was seen free.
+
+    The grid begins at the volume's LOW. `network`: None for the one that comes with the package. Computed in
+    bf16 where the processor does so fast.
+    """
+    import torch
+
+    from robotdiffuse.learning.training.batches import fast_bf16
+
+    network = _bundled() if network is None else network
+    seen, behind = (torch.from_numpy(array)[None] for array in pack(volume))
+    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+        return network.probabilities(seen, behind)[0].numpy()
+
+
+@cache
+def _bundled() -> "CompletionNetwork":
+    from robotdiffuse.learning.checkpoint import load_completion
+
+    return load_completion()

@@ -1,0 +1,170 @@
+"""What the completing network learns from: fresh scenes, seen by cameras that a person would place.
+
+Nothing here loads PyTorch, so that processes that only draw samples start quickly.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from numpy import ndarray
+from numpy.random import Generator
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.problems.families import load_family
+from robotdiffuse.problems.families.family import Range, base_spheres
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.depth_view import DepthView
+from robotdiffuse.scenes.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
+from robotdiffuse.scenes.ray_caster import DepthNoise, looking_at, ray_cast, voxels_within
+from robotdiffuse.scenes.scene import Scene
+
+FINE = VOXEL / 2
+"""Edge of the voxels that are predicted [m]."""
+FINE_SHAPE = (2 * SHAPE[0], 2 * SHAPE[1], 2 * SHAPE[2])
+STEP = 0.01
+"""Depths behind surfaces are kept in whole steps of this [m]."""
+OCCUPIED, FREE, SHADOW, OUT_OF_VIEW = 1, 2, 4, 8
+"""Bits of `Sample.seen`."""
+
+
+@dataclass(frozen=True)
+class CameraPlaces:
+    """Where cameras stand. Lengths in [m], angles in [rad]."""
+
+    distance: Range = (1.2, 2.0)
+    """From the base's axis, on the ground."""
+    height: Range = (0.4, 1.6)
+    front_share: float = 0.75
+    """Share of the cameras that are in front, on the arm's side of the obstacles."""
+    front: float = 2.0
+    """How far from there they may stand, seen from the base."""
+    target_spread: float = 0.2
+    """Standard deviation of what is in the middle of the image from a place before the arm."""
+    field_of_view: Range = (0.75, 1.1)
+    """Vertical."""
+    roll: float = 0.05
+    """Standard deviation."""
+
+    def draw(self, scene: Scene, rng: Generator) -> tuple[ndarray, float]:
+        """T_base_camera, and the vertical field of view."""
+        middle = np.mean(
+            [s.bounds.mean(axis=0)[:2] for s in scene.shapes if s.name != "floor"] or [np.zeros(2)], axis=0
+        )
+        bearing = np.arctan2(-middle[1], -middle[0]) + rng.uniform(-self.front, self.front)
+        if rng.random() >= self.front_share:
+            bearing = rng.uniform(-np.pi, np.pi)
+        away = rng.uniform(*self.distance)
+        position = np.array([away * np.cos(bearing), away * np.sin(bearing), rng.uniform(*self.height)])
+        target = np.array([*(middle / 2), 0.3]) + self.target_spread * rng.standard_normal(3)
+        T = looking_at(position, target, self.roll * rng.standard_normal())
+        return T, rng.uniform(*self.field_of_view)
+
+
+CAMERAS = CameraPlaces()
+SIZE = (160, 120)
+"""Width and height of images [pixels]."""
+SECOND_VIEW = 0.3
+"""Share of the samples with two views."""
+NOISY = 0.5
+"""Share of the samples with noise, of up to twice the usual strength."""
+NO_RANGE = 0.5
+"""Share of these in which what is out of range returns nothing, as with most real cameras."""
+
+NO_FLOOR = 0.1
+"""Share of the samples without a floor: the arm stands on a pedestal."""
+
+
+class Sample(NamedTuple):
+    """An observed volume and what is true of it, packed."""
+
+    seen: UInt8[ndarray, "56 56 32"]
+    """Bits."""
+    behind: UInt8[ndarray, "56 56 32"]
+    """In steps of STEP."""
+    truth: UInt8[ndarray, "56 56 32"]
+    """Whether the eight voxels of 2 cm in each hold obstacles: bit 4 x + 2 y + z."""
+
+
+class Samples(NamedTuple):
+    """Many of them: the same arrays with one more axis in front."""
+
+    seen: UInt8[ndarray, "n 56 56 32"]
+    behind: UInt8[ndarray, "n 56 56 32"]
+    truth: UInt8[ndarray, "n 56 56 32"]
+
+
+def pack(volume: ObservedVolume) -> tuple[UInt8[ndarray, "56 56 32"], UInt8[ndarray, "56 56 32"]]:
+    """`seen` and `behind` of a sample."""
+    seen = np.zeros(SHAPE, np.uint8)
+    bits = (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW)
+    for bit, of in zip(bits, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=True):
+        seen |= of * np.uint8(bit)
+    return seen, np.minimum(np.rint(volume.behind / STEP), 255).astype(np.uint8)
+
+
+def true_voxels(scene: Scene) -> Bool[ndarray, "112 112 64"]:
+    """Which voxels of 2 cm hold obstacles."""
+    return voxels_within(scene, LOW, FINE, FINE_SHAPE)
+
+
+def pack_fine(fine: Bool[ndarray, "112 112 64"]) -> UInt8[ndarray, "56 56 32"]:
+    """`truth` of a sample."""
+    out = np.zeros(SHAPE, np.uint8)
+    for bit in range(8):
+        out |= fine[bit >> 2 :: 2, bit >> 1 & 1 :: 2, bit & 1 :: 2] * np.uint8(1 << bit)
+    return out
+
+
+def unpack_fine(truth: UInt8[ndarray, "*b"]) -> Bool[ndarray, "*b 8"]:
+    """The eight bits of each."""
+    return (truth[..., None] >> np.arange(8, dtype=np.uint8) & 1).astype(np.bool_)
+
+
+def camera_view(
+    scene: Scene, robot: Robot, q: Float[ndarray, "dof"], rng: Generator, cameras: CameraPlaces = CAMERAS
+) -> DepthView:
+    """What a camera sees from a random place."""
+    T, angle = cameras.draw(scene, rng)
+    focal = SIZE[1] / 2 / np.tan(angle / 2)
+    intrinsics = (focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+    return ray_cast(scene, T, intrinsics, SIZE, robot, q)
+
+
+def random_configuration(checker: CollisionChecker, robot: Robot, rng: Generator) -> Float[ndarray, "dof"]:
+    """Uniform among the free ones, or any if they are hard to find."""
+    q = rng.uniform(robot.lower, robot.upper, (64, robot.dof))
+    free = np.flatnonzero(checker.free(q))
+    return q[free[0]] if len(free) else q[0]
+
+
+def draw_sample(families: Sequence[str], robot: Robot, rng: Generator) -> Sample:
+    """A random scene of one of the families, and what one or two cameras see of it."""
+    family = load_family(families[int(rng.integers(len(families)))])
+    scene = family.scene(rng, base_spheres(robot))
+    if rng.random() < NO_FLOOR:
+        scene = Scene([shape for shape in scene.shapes if shape is not family.floor])
+    q = random_configuration(CollisionChecker(robot, scene), robot, rng)
+    views = [camera_view(scene, robot, q, rng) for _ in range(1 + (rng.random() < SECOND_VIEW))]
+    if rng.random() < NOISY:
+        strength, blind = 2 * rng.random(), rng.random() < NO_RANGE
+        usual = DepthNoise()
+        noise = DepthNoise(
+            strength * usual.spread, strength * usual.missing, min(strength * usual.flying, 0.9)
+        )
+        views = [noise.applied(_blind(view) if blind else view, rng) for view in views]
+    seen, behind = pack(observe(views, robot, q))
+    return Sample(seen, behind, pack_fine(true_voxels(scene)))
+
+
+def _blind(view: DepthView) -> DepthView:
+    depth = np.where(np.isfinite(view.depth), view.depth, 0.0)
+    return DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)
+
+
+def draw_samples(families: Sequence[str], robot: Robot, seeds: Sequence[int]) -> Samples:
+    """A sample for each seed."""
+    drawn = [draw_sample(families, robot, np.random.default_rng(seed)) for seed in seeds]
+    return Samples(*(np.stack(arrays) for arrays in zip(*drawn, strict=True)))

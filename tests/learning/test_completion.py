@@ -1,0 +1,182 @@
+"""The completing network: what it is told and says, its training, and its weights."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.learning.checkpoint import load_completion, save_completion
+from robotdiffuse.learning.completion import imagine
+from robotdiffuse.learning.completion.ahead import SamplesAhead
+from robotdiffuse.learning.completion.network import (
+    CompletionNetwork,
+    CompletionSettings,
+    folded,
+    unfolded,
+    voxel_centers,
+)
+from robotdiffuse.learning.completion.samples import (
+    FREE,
+    OCCUPIED,
+    Samples,
+    draw_samples,
+    pack,
+    pack_fine,
+    true_voxels,
+    unpack_fine,
+)
+from robotdiffuse.learning.training import completion as training
+from robotdiffuse.learning.training.completion import (
+    CompletionTraining,
+    average_precision,
+    calibration_error,
+    fitted_temperature,
+    train_completion,
+)
+from robotdiffuse.problems.families import FAMILIES, load_family
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.observed_volume import SHAPE, observe
+from robotdiffuse.scenes.ray_caster import looking_at, ray_cast
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box
+
+PANDA = load_robot("panda")
+HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+SMALL = CompletionSettings(channels=(8, 8, 8), blocks=(1, 1, 1))
+TINY = CompletionTraining(samples=8, batch=2, workers=0, network=SMALL, families=("rop", "table"))
+
+
+@pytest.fixture(autouse=True)
+def few_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("VALIDATION", "CALIBRATION", "CHECKED"):
+        monkeypatch.setattr(training, name, 1)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_samples_tell_the_truth(family: str) -> None:
+    """Next to nothing of what is seen free is occupied, and most of what is seen occupied is."""
+    samples = draw_samples((family,), PANDA, range(4))
+    truth = unpack_fine(samples.truth)
+    free, occupied = (samples.seen & FREE) > 0, (samples.seen & OCCUPIED) > 0
+    assert free.mean() > 0.05 and truth[free].mean() < 1e-3
+    assert truth[occupied].any(axis=-1).mean() > 0.85, "the rest touch a corner"
+    assert (samples.behind[free | occupied] == 0).all()
+
+
+def test_voxels_pack_and_unpack() -> None:
+    scene = load_family("table").scene(np.random.default_rng(0))
+    fine = true_voxels(scene)
+    bits = unpack_fine(pack_fine(fine))
+    for place in np.argwhere(bits.any(axis=-1))[::97]:
+        for bit in range(8):
+            offset = (bit >> 2, bit >> 1 & 1, bit & 1)
+            assert bits[(*place, bit)] == fine[tuple(2 * place + offset)]
+    assert bits.sum() == fine.sum()
+
+
+def test_folding_and_unfolding_are_inverse() -> None:
+    x = torch.arange(8 * 12 * 4 * 2).reshape(2, 8, 12, 4)
+    assert (unfolded(folded(x))[..., 0] == x).all()
+    assert folded(x)[1, 2, 3, 1].tolist() == x[1, 4:6, 6:8, 2:4].ravel().tolist()
+
+
+def test_what_the_network_is_told() -> None:
+    scene = Scene([Box((0.5, 0.0, 0.3), (0.1, 0.6, 0.6))])
+    T = looking_at(np.array([-1.0, 0.3, 1.0]), np.array([0.5, 0.0, 0.3]))
+    view = ray_cast(scene, T, (130.0, 130.0, 79.5, 59.5), (160, 120), PANDA, HOME)
+    volume = observe([view], PANDA, HOME)
+    seen, behind = (torch.from_numpy(array)[None] for array in pack(volume))
+    network = CompletionNetwork(SMALL)
+    told = network.features(seen, behind)[0].reshape(7, 8, 28, 28, 16).permute(0, 2, 3, 4, 1)
+    planes = [unfolded(plane[None])[0, ..., 0].numpy() for plane in told]
+    for plane, of in zip(
+        planes, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=False
+    ):
+        assert (plane == of).all() and of.any()
+    np.testing.assert_allclose(planes[4], volume.behind / 0.5, atol=0.011)
+    np.testing.assert_allclose(planes[5], voxel_centers()[..., 2], atol=1e-6)
+    np.testing.assert_allclose(planes[6], np.hypot(*np.moveaxis(voxel_centers()[..., :2], -1, 0)), atol=1e-6)
+
+
+def test_what_is_imagined_is_where_it_was_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small network learns one sample by heart: the voxels of its answer are those of the truth."""
+    settings = replace(TINY, learning_rate=1e-2)
+    trainee = training._CompletionTrainee(settings, training.Processes("cpu"))
+    rng = np.random.default_rng(1)
+    scene = load_family("table").scene(rng)
+    T = looking_at(np.array([-1.2, 0.4, 1.0]), np.array([0.3, 0.0, 0.2]))
+    view = ray_cast(scene, T, (120.0, 120.0, 79.5, 59.5), (160, 120), PANDA, HOME)
+    volume = observe([view], PANDA, HOME)
+    fine = true_voxels(scene)
+    seen, behind = pack(volume)
+    sample = Samples(seen[None], behind[None], pack_fine(fine)[None])
+    monkeypatch.setattr(trainee.ahead, "next", lambda rng: sample)
+    optimizer = torch.optim.Adam(trainee.module.parameters(), lr=5e-3)
+    losses = []
+    for _ in range(60):
+        optimizer.zero_grad()
+        loss = trainee.loss(0.0, rng)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < 0.3 * losses[0]
+    p = imagine(volume, trainee.module)
+    assert p.shape == tuple(2 * n for n in SHAPE) and p.dtype == np.float32
+    free = volume.free.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    assert (p[free] == 0).all()
+    reach = trainee._reachable.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    asked = ~free & reach
+    assert average_precision(p[asked], fine[asked]) > 2 * fine[asked].mean()
+
+
+def test_training_is_resumed_exactly_with_samples_drawn_ahead_or_not(tmp_path: Path) -> None:
+    report = train_completion(TINY, str(tmp_path / "whole"))
+    train_completion(replace(TINY, samples=4), str(tmp_path / "parts"))
+    again = train_completion(TINY, str(tmp_path / "parts"))
+    assert again.keys() == report.keys() and report["samples"] == 8
+    whole = load_completion(tmp_path / "whole")
+    assert whole.temperature > 0 and not any(p.requires_grad for p in whole.parameters())
+    rng, other = np.random.default_rng(2), np.random.default_rng(2)
+    ahead, alone = (SamplesAhead(("rop",), PANDA, 2, workers) for workers in (1, 0))
+    for _ in range(3):
+        a, b = ahead.next(rng), alone.next(other)
+        assert all((x == y).all() for x, y in zip(a, b, strict=True))
+    skipped = np.random.default_rng(3)
+    assert (ahead.next(skipped).seen == alone.next(np.random.default_rng(3)).seen).all()
+    ahead.close()
+
+
+def test_unknown_families_are_refused() -> None:
+    with pytest.raises(InputError, match=r"families.*rap.*crate"):
+        replace(TINY, families=("rap",))
+
+
+def test_weights_in_files(tmp_path: Path) -> None:
+    network = CompletionNetwork(SMALL)
+    network.temperature.fill_(1.25)
+    save_completion(network, tmp_path, {})
+    loaded = load_completion(tmp_path)
+    assert loaded.settings == SMALL and loaded.temperature == 1.25
+    seen = torch.zeros(1, *SHAPE, dtype=torch.uint8)
+    with torch.no_grad():
+        np.testing.assert_allclose(
+            loaded.probabilities(seen, seen).numpy(), network.probabilities(seen, seen).numpy(), atol=2e-3
+        )
+    with pytest.raises(InputError, match="robotdiffuse train completion"):
+        load_completion(tmp_path / "nothing")
+
+
+def test_temperature_and_calibration() -> None:
+    rng = np.random.default_rng(4)
+    logits = rng.normal(size=200_000).astype(np.float32) * 2
+    truth = rng.random(len(logits)) < 1 / (1 + np.exp(-logits))
+    assert fitted_temperature(3 * logits, truth) == pytest.approx(3, rel=0.03)
+    p = 1 / (1 + np.exp(-logits))
+    assert calibration_error(p, truth) < 0.01 < 0.1 < calibration_error(p**3, truth)
+    assert average_precision(p, truth) == pytest.approx(average_precision(p**3, truth))
+    assert average_precision(np.array([0.9, 0.8, 0.1], np.float32), np.array([True, False, True])) == (
+        pytest.approx((1 + 2 / 3) / 2)
+    )
