@@ -64,7 +64,8 @@ TRAIN = {
     "mpinets": ("baseline", "mpinets", "--data", "{data}"),
     "trajectory_prior": ("baseline", "trajectory_prior", "--data", "{data}"),
 }
-"""Every trainable thing: what follows `robotdiffuse train`."""
+"""Every trainable thing but the completing network, which draws its samples itself: what follows
+`robotdiffuse train`."""
 
 Entry = dict[str, object]
 

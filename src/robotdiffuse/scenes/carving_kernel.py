@@ -26,10 +26,12 @@ FLYING = np.float32(0.03)
 """A pixel so much nearer than one neighbour and farther than the opposite one belongs to neither [m]..."""
 FLYING_PIXELS = np.float32(4.0)
 """... or, if that is more, so many times the width of a pixel at its distance."""
+FAST = {"contract", "reassoc", "arcp", "nsz"}
+"""All of fastmath but what assumes that nothing is infinite or not a number."""
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def _cleaned(depth, focal):
     """Depths, FAR where the ray met nothing, NOTHING where it returned nothing or between two surfaces."""
     h, w = depth.shape
@@ -54,7 +56,7 @@ def _cleaned(depth, focal):
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def _arm(depth, intrinsics, spheres):
     """Which pixels lie in the spheres, [n, 4] x y z radius in the camera's frame."""
     h, w = depth.shape
@@ -73,7 +75,7 @@ def _arm(depth, intrinsics, spheres):
     return mask
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def _pooled(depth, factor):
     """Least depth of blocks of pixels, and how many of them returned nothing, summed from the upper left."""
     h, w = (depth.shape[0] + factor - 1) // factor, (depth.shape[1] + factor - 1) // factor
@@ -97,7 +99,7 @@ def _pooled(depth, factor):
     return least, missing
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def _windows(least, levels):
     """Least depth of the square of 2^k cells below and right of each cell, for each k: a sparse table."""
     h, w = least.shape
@@ -115,7 +117,7 @@ def _windows(least, levels):
     return table
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def _least(table, v0, v1, u0, u1):
     """Least depth of the cells of a rectangle, ends included."""
     k = 0
@@ -129,7 +131,7 @@ def _least(table, v0, v1, u0, u1):
     return least
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def _count(depth, arm, intrinsics, T, low, voxel, counts):
     """Adds up the points, those of the arm left out, that lie in each voxel."""
     fx, fy, cx, cy = intrinsics
@@ -157,7 +159,7 @@ def _count(depth, arm, intrinsics, T, low, voxel, counts):
                 flat[at[u]] += 1
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
     """What a view says of each voxel, in state [nx ny nz], and how far behind a surface it is [m].
 
@@ -198,17 +200,18 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
                 if counts[i, j, k] > 0:
                     pixels = fx * fy * (voxel / z) ** 2
                     counts[i, j, k] = max(0, counts[i, j, k] - int(SOLID * pixels))
-                # half the width and height of what the voxel's corners span in the image
-                du, dv = _ZERO, _ZERO
-                for c in range(3):
-                    du, dv = du + abs(T[c, 0] - x * T[c, 2]), dv + abs(T[c, 1] - y * T[c, 2])
-                du, dv = fx * half * du / (z - ez), fy * half * dv / (z - ez)
-                u0, u1 = int((u - du + _HALF) * share), int((u + du + _HALF) * share)
-                v0, v1 = int((v - dv + _HALF) * share), int((v + dv + _HALF) * share)
-                inside = u - du >= -_HALF and v - dv >= -_HALF and u1 < w and v1 < h
-                u0, v0, u1, v1 = max(0, u0), max(0, v0), min(w - 1, u1), min(h - 1, v1)
                 front = raw[row, column]
                 if front > z + ez or front <= _ZERO:
+                    # half the width and height of what the voxel's corners span in the image
+                    du, dv = _ZERO, _ZERO
+                    for c in range(3):
+                        du += abs(T[c, 0] - x * T[c, 2])
+                        dv += abs(T[c, 1] - y * T[c, 2])
+                    du, dv = fx * half * du / (z - ez), fy * half * dv / (z - ez)
+                    u0, u1 = int((u - du + _HALF) * share), int((u + du + _HALF) * share)
+                    v0, v1 = int((v - dv + _HALF) * share), int((v + dv + _HALF) * share)
+                    inside = u - du >= -_HALF and v - dv >= -_HALF and u1 < w and v1 < h
+                    u0, v0, u1, v1 = max(0, u0), max(0, v0), min(w - 1, u1), min(h - 1, v1)
                     lost = (
                         missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]
                     )
