@@ -91,15 +91,15 @@ def test_free_voxels_hold_no_point_of_any_pixel(seed: int) -> None:
 
 
 def test_several_views_add_up() -> None:
-    front, back = view(flat(WALL)), view(flat(0.8), camera(x=-1.6, back=True))
+    front, back = view(flat(WALL)), view(flat(0.82), camera(x=-1.6, back=True))
     both = observe([front, back], PANDA, AWAY)
     for one in (observe([front], PANDA, AWAY), observe([back], PANDA, AWAY)):
         assert both.occupied[one.occupied].all()
         assert (both.free | both.occupied)[one.free].all()
     x, occupied, free, behind = ahead(both)
-    assert occupied.sum() == 2 and free[x > 0.8].all() and free[x < -0.83].all()
+    assert occupied.sum() == 2 and free[x > 0.8].all() and free[x < -0.81].all()
     between = ~occupied & ~free
-    least = np.minimum(x + 0.8, 0.77 - x)
+    least = np.minimum(x + 0.78, 0.77 - x)
     np.testing.assert_allclose(behind[between], least[between], atol=1e-5)
 
 
