@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from numpy import ndarray
 from torch import Tensor, nn
 
-from robotdiffuse.learning.completion.samples import FREE, OCCUPIED, OUT_OF_VIEW, SHADOW, STEP
+from robotdiffuse.learning.completion.samples import BITS, FREE, STEP
 from robotdiffuse.scenes.observed_volume import LOW, SHAPE, VOXEL
 from robotdiffuse.settings import Count, Settings
 
@@ -118,10 +118,10 @@ class CompletionNetwork(nn.Module):
         seen, behind = folded(seen), folded(behind)
         out = seen.new_empty((*seen.shape[:4], 8 * CHANNELS), dtype=kind)
         parts = out.split(8, dim=-1)
-        for part, bit in zip(parts, (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW), strict=False):
+        for part, bit in zip(parts[: len(BITS)], BITS, strict=True):
             part.copy_((seen & bit) != 0)
-        parts[4].copy_(behind).mul_(STEP / BEHIND)
-        out[..., 40:] = self.places
+        parts[len(BITS)].copy_(behind).mul_(STEP / BEHIND)
+        out[..., -self.places.shape[-1] :] = self.places
         return out.permute(0, 4, 1, 2, 3)
 
     def code(self, features: Float[Tensor, "n 56 28 28 16"]) -> tuple[Tensor, Tensor, Tensor]:

@@ -27,7 +27,8 @@ FINE_SHAPE = (2 * SHAPE[0], 2 * SHAPE[1], 2 * SHAPE[2])
 STEP = 0.01
 """Depths behind surfaces are kept in whole steps of this [m]."""
 OCCUPIED, FREE, SHADOW, OUT_OF_VIEW = 1, 2, 4, 8
-"""Bits of `Sample.seen`."""
+BITS = (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW)
+"""Of `Sample.seen`."""
 
 
 @dataclass(frozen=True)
@@ -99,8 +100,7 @@ class Samples(NamedTuple):
 def pack(volume: ObservedVolume) -> tuple[UInt8[ndarray, "56 56 32"], UInt8[ndarray, "56 56 32"]]:
     """`seen` and `behind` of a sample."""
     seen = np.zeros(SHAPE, np.uint8)
-    bits = (OCCUPIED, FREE, SHADOW, OUT_OF_VIEW)
-    for bit, of in zip(bits, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=True):
+    for bit, of in zip(BITS, (volume.occupied, volume.free, volume.shadow, volume.out_of_view), strict=True):
         seen |= of * np.uint8(bit)
     return seen, np.minimum(np.rint(volume.behind / STEP), 255).astype(np.uint8)
 
