@@ -11,6 +11,7 @@ import numpy as np
 
 from robotdiffuse.learning.completion.samples import Samples, draw_samples
 from robotdiffuse.processes import interrupts_not_passed_on, prepare_worker
+from robotdiffuse.registry import Added, added
 from robotdiffuse.robots.robot import Robot
 
 NICE = 5
@@ -33,7 +34,7 @@ class SamplesAhead:
         self._pool: ProcessPoolExecutor | None = None
         if workers:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(workers, context, _begin)
+            self._pool = ProcessPoolExecutor(workers, context, _begin, (added(),))
         self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
 
     def next(self, rng: np.random.Generator) -> Samples:
@@ -65,6 +66,6 @@ class SamplesAhead:
         self._pending.append((seeds, job))
 
 
-def _begin() -> None:
-    prepare_worker()
+def _begin(entries: Added) -> None:
+    prepare_worker(entries)
     os.nice(NICE)
