@@ -1,6 +1,7 @@
 """robotdiffuse plan, robotdiffuse demo"""
 
 import argparse
+from dataclasses import replace
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 DEMO = "shelf.yaml"
 DEMO_TIME_LIMIT = 5.0
 """[s]"""
+DEMO_CAMERA, DEMO_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
+"""Where `demo --camera` looks from, and at [m]."""
 
 
 def add_plan(commands: argparse._SubParsersAction) -> None:
@@ -61,6 +64,12 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         metavar="M",
         help="distance to keep to obstacles where it can be kept (default: the problem's, or 0.01 m)",
     )
+    parser.add_argument(
+        "--unseen",
+        metavar="POLICY",
+        help="what space that the problem's views do not show is taken for: optimistic (free), padded, "
+        "imagined or occupied (default: what the problem says, or optimistic)",
+    )
     for what in ("velocity", "acceleration"):
         parser.add_argument(
             f"--{what}-scaling",
@@ -90,6 +99,11 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
         help="plan a bundled problem and draw the motion",
         description="Plan a bundled problem with obstacles; write demo.png and demo.html to this folder.",
     )
+    parser.add_argument(
+        "--camera",
+        action="store_true",
+        help="plan on what one depth camera sees of it; demo_true.png shows the motion in the true scene",
+    )
     parser.set_defaults(run=run_demo)
 
 
@@ -105,6 +119,8 @@ def run_plan(arguments: argparse.Namespace) -> int:
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
     problem = load_problem(arguments.problem, arguments.index)
+    if arguments.unseen is not None:
+        problem = with_policy(problem, arguments.unseen)
     result = solve(
         problem,
         name,
@@ -134,6 +150,17 @@ def run_plan(arguments: argparse.Namespace) -> int:
     return 0 if result.solved else 1
 
 
+def with_policy(problem: "Problem", unseen: str) -> "Problem":
+    """The problem with this policy for unseen space; InputError for an unknown one, and without views."""
+    from robotdiffuse.errors import InputError
+    from robotdiffuse.problems.problem import check_unseen
+
+    check_unseen("--unseen", unseen)
+    if not problem.views:
+        raise InputError(f"--unseen {unseen} is for problems that cameras saw; this one has no views")
+    return replace(problem, unseen=unseen)
+
+
 def run_demo(arguments: argparse.Namespace) -> int:
     from robotdiffuse.files import check_output
     from robotdiffuse.planners import DEFAULT_PLANNER
@@ -142,14 +169,38 @@ def run_demo(arguments: argparse.Namespace) -> int:
     outputs = [check_output(file, ENDINGS) for file in ("demo.png", "demo.html")]
     with as_file(files("robotdiffuse") / "examples" / DEMO) as file:
         problem = load_problem(file)
+    true = problem
+    if arguments.camera:
+        outputs.append(check_output("demo_true.png", ENDINGS))
+        problem = through_camera(true)
     result = solve(problem, DEFAULT_PLANNER, time_limit=DEMO_TIME_LIMIT)
     print_result(result)
-    if result.trajectory is None:
+    if result.trajectory is None or result.path is None:
         return 1
+    if arguments.camera:
+        from robotdiffuse.verify import verify
+
+        violation = verify(true, result.path).violation
+        print("in the true scene:", "free" if violation is None else violation.message)
     for file in outputs:
-        draw(problem, result, file)
+        draw(true if file.name == "demo_true.png" else problem, result, file)
         print(f"wrote {file.resolve()}")
     return 0
+
+
+def through_camera(problem: "Problem") -> "Problem":
+    """The problem with what a depth camera behind the arm's shoulder sees of the scene in place of it."""
+    import numpy as np
+
+    from robotdiffuse.problems.problem import IMAGINED
+    from robotdiffuse.scenes.ray_caster import looking_at, ray_cast
+    from robotdiffuse.scenes.scene import Scene
+
+    T_base_camera = looking_at(np.array(DEMO_CAMERA), np.array(DEMO_TARGET))
+    width, height = 640, 480
+    intrinsics = (460.0, 460.0, (width - 1) / 2, (height - 1) / 2)
+    view = ray_cast(problem.scene, T_base_camera, intrinsics, (width, height), problem.robot, problem.start)
+    return replace(problem, scene=Scene(), views=(view,), unseen=IMAGINED)
 
 
 def solve(
