@@ -187,7 +187,7 @@ def inputs(model: MotionModel) -> Inputs:
     """Of one pass of the denoiser, by its own shapes."""
     settings, generator = model.settings, torch.Generator().manual_seed(SEED)
     features = model.dof * (2 + settings.sees_gradients) + settings.sees_clearances * len(model.robot.links)
-    condition = settings.encoder_settings.code + 2 * model.dof
+    condition = settings.code + 2 * model.dof
     shapes = ((SAMPLES, model.rows, features), (SAMPLES,), (SAMPLES, condition))
     first, level, last = (torch.rand(shape, generator=generator) for shape in shapes)
     return first, level, last

@@ -152,7 +152,7 @@ def test_what_the_denoiser_sees() -> None:
         checker.cost_gradients(at, MARGIN, self_margin=-1.0)[0] for at in (q.reshape(-1, 7)[hit], inwards)
     ]
     assert hit.sum() > 3 and (costs[1] > costs[0]).all()
-    sampled = model.sample(np.zeros(model.settings.encoder_settings.code), q[0, 0], q[0, -1], 2, rng, told, 2)
+    sampled = model.sample(np.zeros(model.settings.code), q[0, 0], q[0, -1], 2, rng, told, 2)
     assert sampled.shape == (2, 16, 7)
 
 

@@ -239,7 +239,7 @@ def model_with(name: str, null_condition: bool = False) -> MotionModel:
 
 
 def sample(model: MotionModel, scale: float = 1.0) -> np.ndarray:
-    code = np.ones(model.settings.encoder_settings.code, np.float32)
+    code = np.ones(model.settings.code, np.float32)
     start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
 
     def clearances(q: np.ndarray) -> np.ndarray:

@@ -339,7 +339,7 @@ def test_joint_training_changes_the_encoder(name, data, tmp_path):
     fresh = small(name)
     train_planner(planned, str(tmp_path / "out"))
     model = load_model(tmp_path / "out", box_arm())
-    assert type(model.encoder) is ENCODERS.load(name)
+    assert model.encoder is not None and type(model.encoder) is ENCODERS.load(name)
     trained = dict(model.encoder.named_parameters())
     moved = {key for key, p in fresh.named_parameters() if (trained[key] - p).abs().max() > 1e-3}
     own = ("decoder", "query") if name in ALONE else ()  # what only reconstructs takes no part
@@ -372,7 +372,8 @@ def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
     save_encoder(small(name), tmp_path / "encoder", {})
     before = fingerprint(load_encoder(tmp_path / "encoder"))
     train_planner(planner(data, str(tmp_path / "encoder")), str(tmp_path / "out"))
-    assert fingerprint(load_model(tmp_path / "out").encoder) == before
+    encoder = load_model(tmp_path / "out").encoder
+    assert encoder is not None and fingerprint(encoder) == before
     assert fingerprint(load_encoder(tmp_path / "encoder")) == before
 
 

@@ -192,8 +192,9 @@ def test_the_panda_goes_on_from_what_it_is_committed_to() -> None:
     checker = CollisionChecker(robot, Scene([Sphere([0.5, 0.0, 0.4], 0.15)]))
     start, goal = (np.array([side, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785]) for side in (0.9, -0.9))
     code = encode(model, checker, 320, rng)
-    moving = RobotDiffuse().sample(model, checker, code, start, goal[None], rng)
-    prefix = moving.q[np.argmax(moving.free)][10:18].astype(float)
+    drawn = RobotDiffuse().draw(model, checker, code, start, goal[None], rng)
+    moving = next(q for q in drawn if checker.free(q).all())
+    prefix = moving[10:18].astype(float)
     guidance = CollisionGuidance(checker)
     q = model.sample(
         code,

@@ -19,6 +19,12 @@ def surface(mesh: trimesh.Trimesh) -> Surface:
     return Surface(np.array(mesh.vertices), np.array(mesh.faces))
 
 
+def _together(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    made = trimesh.util.concatenate(meshes)
+    assert isinstance(made, trimesh.Trimesh)
+    return made
+
+
 def boxes(*corners: tuple[tuple[float, ...], tuple[float, ...]]) -> trimesh.Trimesh:
     """Axis-aligned boxes [low, high] in one mesh, as they are: with inner walls where they meet."""
     made = [
@@ -28,7 +34,7 @@ def boxes(*corners: tuple[tuple[float, ...], tuple[float, ...]]) -> trimesh.Trim
         )
         for low, high in corners
     ]
-    return trimesh.util.concatenate(made)
+    return _together(made)
 
 
 L = boxes(((0, 0, 0), (0.3, 0.1, 0.1)), ((0, 0, 0.1), (0.1, 0.1, 0.4)))
@@ -75,7 +81,7 @@ def test_a_frame_stays_open() -> None:
 def test_holes_that_are_closed_count_as_solid() -> None:
     ball = trimesh.creation.icosphere(3, 0.1)
     inner = trimesh.creation.icosphere(3, 0.08)
-    assert len(convex_parts((surface(trimesh.util.concatenate([ball, inner])),))) == 1
+    assert len(convex_parts((surface(_together([ball, inner])),))) == 1
 
 
 def test_simplified_hulls_hold_the_hull() -> None:

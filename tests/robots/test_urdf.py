@@ -15,11 +15,12 @@ from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.add import add_robot
 from robotdiffuse.robots.allowed_collisions import SamplingSettings
 from robotdiffuse.robots.bundle import read_bundle, read_source, write_bundle
+from robotdiffuse.robots.convex_parts import THIN, convex_hull
 from robotdiffuse.robots.limits import read_limits, with_limits
 from robotdiffuse.robots.preparation import PreparationSettings
 from robotdiffuse.robots.robot import TURNS, Robot
 from robotdiffuse.robots.sphere_fitting import covered
-from robotdiffuse.robots.urdf import THIN, content_hash, convex_hull, read_urdf
+from robotdiffuse.robots.urdf import content_hash, read_urdf
 from robotdiffuse.transforms import rotation_from_rpy
 
 ARM = """<robot name="tiny">

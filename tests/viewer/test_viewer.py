@@ -39,11 +39,11 @@ def arm() -> Robot:
     """Three bars: a turning pillar, a hinge with its axis off z, a slide."""
     quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     z, y = np.array([0.0, 0, 1]), np.array([0.0, 1, 0])
-    limits = {"lower": -3.0, "upper": 3.0, "velocity": 2.0, "acceleration": 5.0, "jerk": 50.0}
+    limits = (-3.0, 3.0, 2.0, 5.0, 50.0)
     joints = (
-        Joint("turn", "revolute", "base", "pillar", transform(np.array([0, 0, 0.1])), z, **limits),
-        Joint("hinge", "revolute", "pillar", "arm", transform(np.array([0, 0, 0.4]), quarter), y, **limits),
-        Joint("slide", "prismatic", "arm", "tip", transform(np.array([0, 0, 0.3])), z, **limits),
+        Joint("turn", "revolute", "base", "pillar", transform(np.array([0, 0, 0.1])), z, *limits),
+        Joint("hinge", "revolute", "pillar", "arm", transform(np.array([0, 0, 0.4]), quarter), y, *limits),
+        Joint("slide", "prismatic", "arm", "tip", transform(np.array([0, 0, 0.3])), z, *limits),
     )
     meshes = {"base": (bar(0.1),), "pillar": (bar(0.4),), "arm": (bar(0.3),), "tip": (bar(0.2),)}
     spheres = {"tip": np.array([[0, 0, 0.1, 0.12]])}
