@@ -41,6 +41,7 @@ EXTRAS = {
     "pybullet": {"simulation"},
     "pybullet_data": {"simulation"},
     "ompl": {"planners"},
+    "OpenEXR": {"scenes"},
     "ray": {"processes"},
     "zarr": {"data"},
     "accelerate": {"learning"},

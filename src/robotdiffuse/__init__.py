@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from robotdiffuse.results import PlanResult as PlanResult
     from robotdiffuse.results import load_result as load_result
     from robotdiffuse.robots import load_robot as load_robot
+    from robotdiffuse.scenes.depth_view import DepthView as DepthView
     from robotdiffuse.scenes.scene import Scene as Scene
     from robotdiffuse.scenes.shapes import Box as Box
     from robotdiffuse.scenes.shapes import Capsule as Capsule
@@ -48,6 +49,7 @@ _HOME = {
     "load_problem": "robotdiffuse.problems.files",
     "load_robot": "robotdiffuse.robots",
     "Scene": "robotdiffuse.scenes.scene",
+    "DepthView": "robotdiffuse.scenes.depth_view",
     "Box": "robotdiffuse.scenes.shapes",
     "Capsule": "robotdiffuse.scenes.shapes",
     "Cylinder": "robotdiffuse.scenes.shapes",

@@ -72,7 +72,7 @@ def _planned(
         idle.put(worker)
 
     def one(problem: Problem) -> PlanResult:
-        asked = problem.scene, problem.start, problem.goal, problem.notes, problem.clearance
+        asked = tuple(getattr(problem, field.name) for field in fields(problem) if field.name != "robot")
         worker = idle.get()
         try:
             return worker.call(_plan, number[problem.robot], asked)
@@ -115,8 +115,7 @@ def _prepare(loaded: Loaded, robots: list[Robot], request: dict[str, Any]) -> No
 
 def _plan(robot: int, asked: tuple) -> PlanResult:
     assert _state is not None
-    scene, start, goal, notes, clearance = asked
-    problem = Problem(_state.robots[robot], scene, start, goal, notes, clearance)
+    problem = Problem(_state.robots[robot], *asked)
     if problem.robot not in _state.warm:
         _state.planner.warm_up(problem)
         _state.warm.add(problem.robot)

@@ -10,16 +10,18 @@ import yaml
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.problems.moveit import MoveItRequest, moveit_frames, moveit_request, moveit_scene
-from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem, check_clearance
+from robotdiffuse.problems.problem import OPTIMISTIC, JointGoal, PoseGoal, Problem, check_clearance
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.scenes.depth_view import DepthView
+from robotdiffuse.scenes.depth_view_files import read_views, view_entry
 from robotdiffuse.scenes.files import check_fields, read_scene, read_text, read_yaml, scene_entries
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import numbers, shown, unit_quaternion, vector
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
 FIELDS = ("robot", "scene", "start", "goal")
-OPTIONAL = ("locked", "clearance")
+OPTIONAL = ("locked", "clearance", "views", "unseen")
 GOALS = ("joints", "joint_set", "pose")
 
 
@@ -111,12 +113,16 @@ def problem_record(
     record: dict[str, object] = {
         "robot": robot,
         "locked": problem.robot.locked,
-        "scene": scene_entries(problem.scene, folder),
+        "scene": scene_entries(problem.known_scene, folder),
         "start": problem.start.tolist(),
         "goal": asked,
     }
     if problem.clearance is not None:
         record["clearance"] = problem.clearance
+    if problem.views:
+        record["views"] = [view_entry(view, folder) for view in problem.views]
+    if problem.unseen != OPTIMISTIC:
+        record["unseen"] = problem.unseen
     return record
 
 
@@ -201,7 +207,14 @@ def _moveit_problem(scene_file: Path, robot: Robot | None) -> Problem:
         raise InputError(f"{prefix}{error}") from None
 
 
-def _requested(robot: Robot, scene: Scene, request: MoveItRequest, clearance: float | None = None) -> Problem:
+def _requested(
+    robot: Robot,
+    scene: Scene,
+    request: MoveItRequest,
+    clearance: float | None = None,
+    views: tuple[DepthView, ...] = (),
+    unseen: str = OPTIMISTIC,
+) -> Problem:
     held = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     held -= {*robot.joint_names}
     locked = {name: value for name, value in request.start.items() if name in held}
@@ -215,9 +228,9 @@ def _requested(robot: Robot, scene: Scene, request: MoveItRequest, clearance: fl
 
     start = values("start_state", request.start)
     if request.pose_goal is not None:
-        return Problem(robot, scene, start, PoseGoal(*request.pose_goal), clearance=clearance)
+        return Problem(robot, scene, start, PoseGoal(*request.pose_goal), (), clearance, views, unseen)
     goals = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
-    return Problem(robot, scene, start, JointGoal(goals), clearance=clearance)
+    return Problem(robot, scene, start, JointGoal(goals), (), clearance, views, unseen)
 
 
 def _json(where: str, text: str) -> object:
@@ -244,10 +257,13 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
             scene = moveit_scene(content, frames, file.parent)
         else:
             scene, notes = read_scene(values["scene"], folder)
+        views, more = read_views(values.get("views", []), folder)
+        unseen = values.get("unseen", OPTIMISTIC)
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames)
-            return _requested(robot, scene, request, clearance)
-        return Problem(robot, scene, values["start"], _goal(values["goal"]), notes, clearance)
+            return _requested(robot, scene, request, clearance, views, unseen)
+        goal, notes = _goal(values["goal"]), (*notes, *more)
+        return Problem(robot, scene, values["start"], goal, notes, clearance, views, unseen)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

@@ -1,9 +1,9 @@
-"""Problem: a robot, a scene, a start and a goal.
+"""Problem: a robot, a scene, a start and a goal; and what cameras saw of the scene.
 
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, no_type_check
 
@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import numbers, shown
 
@@ -21,6 +22,10 @@ LIMIT_SLACK = 1e-5
 """Configurations that exceed a joint limit by no more than this are clamped, with a note [rad]."""
 RIGID_SLACK = 1e-4
 """How far the rotation part of a pose may be from orthonormal, by entry."""
+OPTIMISTIC, PADDED, IMAGINED, OCCUPIED = "optimistic", "padded", "imagined", "occupied"
+UNSEEN = (OPTIMISTIC, PADDED, IMAGINED, OCCUPIED)
+"""What space that no view saw is taken for: free; free but near what was seen; as the completing network
+imagines it; occupied. See `planners/unseen.py`."""
 
 
 @no_type_check
@@ -82,6 +87,8 @@ class Problem:
     kept as they are, and whole turns of a goal do not matter. Raises InputError for everything else that no
     planner could work with: wrong lengths, values that are not finite or out of limits, a goal frame that the
     robot does not move. Collisions of start and goal are found by the planners.
+
+    With views, the problem's scene is the given one and what they saw beside it, as points (`SeenPoints`).
     """
 
     robot: Robot
@@ -93,6 +100,10 @@ class Problem:
     clearance: float | None = None
     """Distance to obstacles that is to be kept where start, goal and passages allow it [m]; None: what the
     call of the planner says."""
+    views: tuple[DepthView, ...] = ()
+    """Pictures that depth cameras took of the scene."""
+    unseen: str = OPTIMISTIC
+    """What space that no view saw is taken for, one of UNSEEN; of no account without views."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
@@ -118,7 +129,22 @@ class Problem:
             goal = JointGoal(
                 np.stack([_configuration(self.robot, *row, notes) for row in zip(fields, rows, strict=True)])
             )
-        for key, value in {"start": start, "goal": goal, "notes": tuple(notes)}.items():
+        views = _views(self.robot, self.views)
+        check_unseen("unseen", self.unseen)
+        scene = self.scene
+        if views:
+            from robotdiffuse.problems.seen import seen_shapes  # compiled code, which only views need
+
+            scene = self.known_scene
+            ends = goal.positions if isinstance(goal, JointGoal) else start[None]
+            scene = Scene([*scene.shapes, *seen_shapes(views, self.robot, scene, start, ends)])
+        for key, value in {
+            "scene": scene,
+            "start": start,
+            "goal": goal,
+            "notes": tuple(notes),
+            "views": views,
+        }.items():
             object.__setattr__(self, key, value)
 
     if TYPE_CHECKING:
@@ -131,7 +157,15 @@ class Problem:
             goal: ArrayLike | JointGoal | PoseGoal,
             notes: tuple[str, ...] = (),
             clearance: float | None = None,
+            views: Sequence[DepthView] = (),
+            unseen: str = OPTIMISTIC,
         ) -> None: ...
+
+    @property
+    def known_scene(self) -> Scene:
+        """The scene as it was given: without what the views saw."""
+        known = [shape for shape in self.scene.shapes if not isinstance(shape, SeenPoints)]
+        return self.scene if len(known) == len(self.scene.shapes) else Scene(known)
 
     load: ClassVar[Callable[..., "Problem"]]
     """`problems.files.load_problem`, put here by the package: files know problems, not the reverse."""
@@ -143,6 +177,25 @@ def check_clearance(field: str, value: object) -> float:
     if clearance is None or clearance.ndim != 0 or not 0 <= clearance < np.inf:
         raise InputError(f"{field} is {shown(value)}; it must be a distance of at least 0 m")
     return float(clearance)
+
+
+def check_unseen(field: str, value: object) -> str:
+    """The value as one of UNSEEN; InputError for anything else."""
+    if not isinstance(value, str) or value not in UNSEEN:
+        raise unknown_name(f"policy in {field}:", str(value), UNSEEN)
+    return value
+
+
+def _views(robot: Robot, views: object) -> tuple[DepthView, ...]:
+    if not isinstance(views, list | tuple) or not all(isinstance(view, DepthView) for view in views):
+        raise InputError(f"views is {shown(views)}; it must be a list of rd.DepthView")
+    for i, view in enumerate(views):
+        if view.configuration is not None and len(view.configuration) != robot.dof:
+            raise InputError(
+                f"views[{i}].configuration has {len(view.configuration)} values; {robot.name} has "
+                f"{robot.dof} planned joints: {', '.join(robot.joint_names)}"
+            )
+    return tuple(views)
 
 
 def _configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:

@@ -12,7 +12,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.scenes.shapes import numbers, shown, vector
+from robotdiffuse.scenes.shapes import PointCloud, numbers, shown, vector
 
 RIGID_SLACK = 1e-4
 """How far the rotation of a camera's pose may be from orthonormal, by entry."""
@@ -38,6 +38,10 @@ class DepthView:
     """x to the right in the image, y down, z ahead: the optical frame of ROS and OpenCV."""
     configuration: Float[ndarray, "dof"] | None = None
     """The arm's when the picture was taken; None: the problem's start."""
+    cloud: Float[ndarray, "n 3"] | None = None
+    """The points themselves [m], where the image was made of a cloud: it holds only the nearest ones."""
+    source: dict[str, str | float] | None = None
+    """How a problem file names the picture: `depth`, a file, and its `scale`, or `cloud`."""
 
     def __post_init__(self) -> None:
         depth, T = numbers(self.depth), numbers(self.T_base_camera)
@@ -78,10 +82,14 @@ class DepthView:
             intrinsics: ArrayLike,
             T_base_camera: ArrayLike,
             configuration: ArrayLike | None = None,
+            cloud: Float[ndarray, "n 3"] | None = None,
+            source: dict[str, str | float] | None = None,
         ) -> None: ...
 
     def points(self) -> Float[ndarray, "n 3"]:
-        """One for each pixel that returned, row by row."""
+        """Those of the cloud, or one for each pixel that returned, row by row."""
+        if self.cloud is not None:
+            return self.cloud
         rows, columns = np.nonzero(np.isfinite(self.depth) & (self.depth > 0))
         z = self.depth[rows, columns].astype(np.float64)
         fx, fy, cx, cy = self.intrinsics
@@ -94,6 +102,7 @@ class DepthView:
         points: Float[ndarray, "n 3"],
         T_base_camera: Float[ndarray, "4 4"],
         configuration: Float[ndarray, "dof"] | None = None,
+        source: dict[str, str | float] | None = None,
     ) -> "DepthView":
         """The image that a camera has of a cloud in the base frame: each pixel its nearest point.
 
@@ -122,4 +131,8 @@ class DepthView:
         np.minimum.at(depth, at[inside, 1] * width + at[inside, 0], z[inside])
         intrinsics = (1 / pixel, 1 / pixel, -low[0] / pixel, -low[1] / pixel)
         image = np.where(np.isfinite(depth), depth, 0.0).reshape(height, width)
-        return cls(image, intrinsics, T, configuration)
+        return cls(image, intrinsics, T, configuration, points, source)
+
+
+class SeenPoints(PointCloud):
+    """What a problem has of its views, beside the shapes that it was given."""

@@ -164,7 +164,7 @@ def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str,
 def _values(shape: Shape, folder: Path | None) -> dict[str, object]:
     file = getattr(shape, "file", None)
     left_out = {"file"} if file is None else {*CONTENT[shape.kind], "file"}
-    values: dict[str, object] = {} if file is None else {"file": _name_from(folder, Path(file))}
+    values: dict[str, object] = {} if file is None else {"file": name_from(folder, Path(file))}
     for f in fields(shape):  # type: ignore[arg-type]
         value = getattr(shape, f.name)
         if f.name not in left_out:
@@ -176,7 +176,7 @@ def _values(shape: Shape, folder: Path | None) -> dict[str, object]:
     return values
 
 
-def _name_from(folder: Path | None, file: Path) -> str:
+def name_from(folder: Path | None, file: Path) -> str:
     """Relative for files in the folder and below it, so that the folder can be moved."""
     file = file.resolve()
     if folder is None:
