@@ -44,6 +44,18 @@ class PlanResult:
     the returned path's."""
     refused: str = ""
     """What was wrong with the last path that the judge refused, a `verify.Violation.kind`; "" if none was."""
+    rung: str = ""
+    """For a scene that cameras saw: which obstacles in unseen space the motion keeps clear of, e.g. "points
+    padded by 9 cm"; "as seen": of none. "" where no view was given."""
+    confidence: float | None = None
+    """For a scene that cameras saw: how likely the motion is free of what they did not see. `verified` says
+    that it is free of what they saw."""
+    swept_probability: float | None = None
+    """That the voxels it passes through are occupied, summed, where an imagination of unseen space was asked
+    for: what `confidence` is told from."""
+    unseen_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Least and greatest corner of a box, in the base frame, around the unseen space that the motion crosses
+    where that is likeliest to be occupied [m]; None where it crosses none."""
 
     @property
     def solved(self) -> bool:
@@ -115,6 +127,10 @@ def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any
         "notes": list(result.notes),
         "progress": [list(found) for found in result.progress],
         "refused": result.refused,
+        "rung": result.rung,
+        "confidence": result.confidence,
+        "swept_probability": result.swept_probability,
+        "unseen_region": None if result.unseen_region is None else [list(at) for at in result.unseen_region],
         "joint_names": [],
         "waypoints": None if result.path is None else result.path.positions.tolist(),
         "times": [],
@@ -156,7 +172,18 @@ def _result(record: dict[str, Any]) -> PlanResult:
         notes=_names(record, "notes") if "notes" in record else (),
         progress=_progress(record),
         refused=_text(record, "refused") if "refused" in record else "",
+        rung=_text(record, "rung") if "rung" in record else "",
+        confidence=_number_or_none(record, "confidence"),
+        swept_probability=_number_or_none(record, "swept_probability"),
+        unseen_region=_box(record, "unseen_region"),
     )
+
+
+def _box(record: dict[str, Any], name: str) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    if record.get(name) is None:
+        return None
+    low, high = _rows(record, name, 2, 3).tolist()
+    return tuple(low), tuple(high)
 
 
 def _progress(record: dict[str, Any]) -> tuple[tuple[float, float], ...]:

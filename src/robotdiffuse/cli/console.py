@@ -7,6 +7,10 @@ if TYPE_CHECKING:
     from robotdiffuse.verify import Report
 
 
+KEEPS_CLEAR = {"as seen": "what was seen", "unseen is occupied": "all that was not seen free"}
+"""Of some rungs."""
+
+
 def clearances(motion: "PlanResult | Report") -> str:
     """The least [mm], and where they are known those to the scene and between links."""
     names = ("min_clearance", "scene_clearance", "self_clearance")
@@ -28,6 +32,13 @@ def print_result(result: "PlanResult") -> None:
     if result.path is not None:
         rows.append(("path", f"{len(result.path.positions)} waypoints, length {result.path.length:.3f} rad"))
         rows.append(("verified", "yes"))
+    if result.rung:
+        rows.append(("keeps clear of", KEEPS_CLEAR.get(result.rung, f"what was seen, and {result.rung}")))
+    if result.confidence is not None:
+        rows.append(("confidence", f"{100 * result.confidence:.0f} % that it is free of what was not seen"))
+    if result.unseen_region is not None:
+        low, high = (", ".join(f"{at:.2f}" for at in corner) for corner in result.unseen_region)
+        rows.append(("crosses unseen", f"from ({low}) to ({high}) m"))
     if result.min_clearance is not None:
         rows.append(("least clearance", clearances(result)))
     if result.trajectory is not None:

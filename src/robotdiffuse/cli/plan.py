@@ -1,6 +1,7 @@
 """robotdiffuse plan, robotdiffuse demo"""
 
 import argparse
+from dataclasses import replace
 from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -61,6 +62,12 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         metavar="M",
         help="distance to keep to obstacles where it can be kept (default: the problem's, or 0.01 m)",
     )
+    parser.add_argument(
+        "--unseen",
+        metavar="POLICY",
+        help="what space that the problem's views do not show is taken for: optimistic (free), padded, "
+        "imagined or occupied (default: what the problem says, or optimistic)",
+    )
     for what in ("velocity", "acceleration"):
         parser.add_argument(
             f"--{what}-scaling",
@@ -105,6 +112,8 @@ def run_plan(arguments: argparse.Namespace) -> int:
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
     problem = load_problem(arguments.problem, arguments.index)
+    if arguments.unseen is not None:
+        problem = with_policy(problem, arguments.unseen)
     result = solve(
         problem,
         name,
@@ -132,6 +141,17 @@ def run_plan(arguments: argparse.Namespace) -> int:
     if arguments.view and result.trajectory is not None:
         show(outputs[-1])
     return 0 if result.solved else 1
+
+
+def with_policy(problem: "Problem", unseen: str) -> "Problem":
+    """The problem with this policy for unseen space; InputError for an unknown one, and without views."""
+    from robotdiffuse.errors import InputError
+    from robotdiffuse.problems.problem import check_unseen
+
+    check_unseen("--unseen", unseen)
+    if not problem.views:
+        raise InputError(f"--unseen {unseen} is for problems that cameras saw; this one has no views")
+    return replace(problem, unseen=unseen)
 
 
 def run_demo(arguments: argparse.Namespace) -> int:

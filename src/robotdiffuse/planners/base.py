@@ -57,10 +57,20 @@ class Planner(ABC, Generic[Own]):
         velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses.
         jerk: most jerk of any joint of the timed motion [rad/s³]. None: no limit, the fastest motion.
 
+        Where cameras saw the scene, `problem.unseen` says what the rest is taken for: `planners/unseen.py`.
+
         Raises InputError for arguments that are none of these, and where `prepare` does.
         """
         self.prepare(problem.robot)
         request = Request(until, clearance, velocity_scaling, acceleration_scaling, jerk)
+        if problem.views:
+            from robotdiffuse.planners.unseen import plan_beside_unseen
+
+            return plan_beside_unseen(self, problem, time_limit, seed, request)
+        return self.attempt(problem, time_limit, seed, request)
+
+    def attempt(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
+        """`plan` in the problem's scene as it is."""
         call = Call(self.name, problem, time_limit, seed, request)
         ends = usable_ends(call)
         return ends if isinstance(ends, PlanResult) else self.solve(call, ends)

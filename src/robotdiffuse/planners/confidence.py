@@ -1,0 +1,33 @@
+"""How likely a motion is free of what no camera saw: fitted on the calibration half of the problems of
+`benchmarks/unseen.py`.
+
+python benchmarks/unseen.py --fit
+"""
+
+import math
+
+RATES: dict[str, float] = {
+    "as seen": 0.5,
+    "points padded by 9 cm": 0.9,
+    "points padded by 6 cm": 0.8,
+    "points padded by 4 cm": 0.7,
+    "unseen is occupied": 0.99,
+}
+"""Share of the motions of a rung that were free in the true scene, where nothing is imagined."""
+BY_RISK: dict[str, tuple[float, float]] = {
+    "imagined": (3.0, -0.7),
+    "as seen": (0.0, -0.3),
+}
+"""Where voxels were imagined, for motions of imagined rungs and for those as seen: the log odds of a motion
+that sweeps a probability of 1, and how they change with its logarithm."""
+LEAST_RISK = 0.01
+"""Summed probabilities below this count as this."""
+
+
+def confidence(rung: str, risk: float | None = None) -> float:
+    """The probability that a motion is free in truth. `risk` is the probability, summed over the voxels, that
+    it sweeps; None where none was imagined."""
+    if risk is None:
+        return RATES[rung]
+    odds, slope = BY_RISK["as seen" if rung == "as seen" else "imagined"]
+    return 1 / (1 + math.exp(-(odds + slope * math.log(max(risk, LEAST_RISK)))))

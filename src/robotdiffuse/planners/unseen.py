@@ -1,0 +1,187 @@
+"""Planning in a scene that cameras saw a part of: what is taken for occupied beside what was seen.
+
+One way for all planners: a chain of rungs, each the scene as seen with more obstacles, the most careful
+first; the first that has a motion answers. So every motion keeps clear of what was seen, and of as much
+beside it as lets it pass:
+
+- padded: points seen, padded by 9 cm, by 6, by 4; then as seen.
+- imagined: voxels that the completing network finds occupied with a probability above 0.05, 0.1, 0.2; then as
+  seen. Of several motions of a rung, the one that sweeps the least probability.
+- occupied: every voxel that no view saw, and nothing after it.
+- optimistic: as seen.
+
+Start and goal are taken to be free, so space around them is carved out of these obstacles, not of what was
+seen.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray
+
+from robotdiffuse.collision.arrays import compile_robot
+from robotdiffuse.planners.call import Call, Request
+from robotdiffuse.planners.confidence import confidence
+from robotdiffuse.planners.ends import usable_ends
+from robotdiffuse.planners.rungs import CARVED, FINE, FINE_SHAPE, Rung, rungs, voxels_in
+from robotdiffuse.planners.swept_kernel import sweep
+from robotdiffuse.problems.problem import IMAGINED, OCCUPIED, OPTIMISTIC, JointGoal, Problem
+from robotdiffuse.results import PlanResult
+from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.scenes.observed_volume import LOW, ObservedVolume, observe
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.types import Path
+
+if TYPE_CHECKING:
+    from robotdiffuse.planners.base import Planner
+
+CANDIDATES = 4
+"""Motions of a rung that the one of least probability is chosen from."""
+SHARE = 0.5
+"""Of the time that is left, for a rung that others come after."""
+LEAST = 0.01
+"""Share of the time limit that every call of the planner has at least."""
+AS_SEEN = "as seen"
+"""The rung without any further obstacles."""
+
+
+def plan_beside_unseen(
+    planner: "Planner",
+    problem: Problem,
+    time_limit: float,
+    seed: int,
+    request: Request,
+    imagined: Float32[ndarray, "nx ny nz"] | None = None,
+) -> PlanResult:
+    """A motion as the problem's policy asks for it, within the time limit [s]; see the head of this file.
+
+    `imagined`: the probability that each fine voxel of the observed volume is occupied, in place of what the
+    completing network says. The result says which rung it comes from, how likely the motion is free in truth
+    and which unseen space it crosses.
+    """
+    if problem.unseen == IMAGINED and imagined is None:
+        from robotdiffuse.learning.completion import (  # pyright: ignore[reportMissingImports]
+            imagine,  # PyTorch, before the clock starts
+        )
+    else:
+        imagine = None
+    call = Call(planner.name, problem, time_limit, seed, request)
+    volume = observe(problem.views, problem.robot, problem.start)
+    if imagine is not None:
+        imagined = imagine(volume)
+    unseen = _Unseen(problem, volume, imagined)
+    as_seen = replace(problem, views=())
+    if problem.unseen != OPTIMISTIC:
+        goals = _goals(call, as_seen)
+        if isinstance(goals, PlanResult):
+            return goals
+        for rung in rungs(problem, volume, imagined):
+            results = list(_climb(planner, call, request, rung, goals, imagined is not None))
+            solved = [result for result in results if result.solved]
+            if solved:
+                return unseen.judged(min(solved, key=unseen.risk), rung.name)
+            if problem.unseen == OCCUPIED:
+                why = "no motion keeps out of all space that no view saw"
+                return replace(results[-1], reason=f"{why}: {results[-1].reason}")
+    result = _attempt(planner, call, request, as_seen, call.time_limit, seed)
+    return unseen.judged(result, AS_SEEN) if result.solved else result
+
+
+def _goals(call: Call, as_seen: Problem) -> Float[ndarray, "n dof"] | PlanResult:
+    """The goal configurations, those of a pose that are free of what was seen; or why there are none."""
+    if isinstance(as_seen.goal, JointGoal):
+        return as_seen.goal.positions
+    ends = usable_ends(Call(call.planner, as_seen, call.time_limit, call.seed))
+    return ends if isinstance(ends, PlanResult) else np.stack(ends.goals)
+
+
+def _attempt(
+    planner: "Planner", call: Call, request: Request, problem: Problem, until: float, seed: int
+) -> PlanResult:
+    """A call of the planner within this one, that ends by `until` [s since the call]."""
+    began = call.elapsed
+    result = planner.attempt(problem, max(until - began, LEAST * call.time_limit), seed, request)
+    progress = tuple((began + at, length) for at, length in result.progress)
+    return replace(result, planning_time=began + result.planning_time, progress=progress, seed=call.seed)
+
+
+def _climb(
+    planner: "Planner", call: Call, request: Request, rung: Rung, goals: Float[ndarray, "n dof"], choose: bool
+) -> Iterator[PlanResult]:
+    """Results of a rung in its share of the time; one if it finds no motion, or there is nothing to `choose`
+    by. Of several goals, those that need the least carving."""
+    problem, last = call.problem, call.problem.unseen == OCCUPIED
+    until = call.elapsed + (1.0 if last else SHARE) * (call.time_limit - call.elapsed)
+    start, *ends = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))
+    needed = np.array([rung.touched(spheres) for spheres in ends])
+    easiest = np.flatnonzero(needed == needed.min())
+    obstacles = rung.obstacles(np.concatenate([start, *(ends[i] for i in easiest)]))
+    scene = Scene([*problem.scene.shapes, obstacles])
+    more = replace(problem, scene=scene, goal=JointGoal(goals[easiest]), views=())
+    for number in range(CANDIDATES if choose else 1):
+        if number and call.elapsed >= until:
+            return
+        result = _attempt(planner, call, request, more, until, call.seed + number)
+        yield result
+        if not result.solved:
+            return
+
+
+class _Unseen:
+    """Space that no view saw, and what motions cross of it."""
+
+    def __init__(
+        self, problem: Problem, volume: ObservedVolume, imagined: Float32[ndarray, "nx ny nz"] | None
+    ) -> None:
+        self.problem, self.volume = problem, volume
+        goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
+        ends = [placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals)]
+        unknown = volume.unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2) & ~voxels_in(
+            np.concatenate(ends), CARVED
+        )
+        self.unknown: Bool[ndarray, "nx ny nz"] = unknown
+        self.probability = None if imagined is None else np.where(unknown, imagined, np.float32(0))
+        """Of what is unknown, less what the arm fills at the ends."""
+
+    def swept(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
+        """The unknown voxels that the arm passes through."""
+        out = np.zeros(FINE_SHAPE, np.bool_)
+        low, edge = np.array(LOW, np.float32), np.float32(FINE)
+        sweep(compile_robot(self.problem.robot), path.positions.astype(np.float32), low, edge, out)
+        return out & self.unknown
+
+    def risk(self, result: PlanResult) -> float:
+        """Summed probability of the voxels that a motion sweeps; 0 where none is imagined."""
+        assert result.path is not None
+        return 0.0 if self.probability is None else float(self.probability[self.swept(result.path)].sum())
+
+    def judged(self, result: PlanResult, rung: str) -> PlanResult:
+        """The result with what is known of its motion in unseen space."""
+        assert result.path is not None
+        risk = None if self.probability is None else self.risk(result)
+        return replace(
+            result,
+            rung=rung,
+            confidence=confidence(rung, risk),
+            swept_probability=risk,
+            unseen_region=self.region(result.path),
+        )
+
+    def region(self, path: Path) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+        """The corners of a box around that connected part of the unseen space that the arm passes through
+        which is likeliest to be occupied; the largest where nothing is imagined."""
+        from scipy.ndimage import find_objects, label  # which takes long to import
+
+        swept = self.swept(path)
+        if not swept.any():
+            return None
+        parts = np.zeros(swept.shape, np.int32)
+        label(swept, output=parts)
+        weights = None if self.probability is None else self.probability[swept]
+        part = int(np.bincount(parts[swept], weights).argmax())
+        box = find_objects(parts)[part - 1]
+        low, high = (np.array([getattr(side, end) for side in box]) for end in ("start", "stop"))
+        return tuple((low * FINE + LOW).round(3).tolist()), tuple((high * FINE + LOW).round(3).tolist())
