@@ -69,13 +69,14 @@ def test_the_arm_is_filtered_as_it_stood_then() -> None:
 
 
 def test_flying_pixels_are_removed() -> None:
-    """At the edge between the ball and a wall behind it, a pixel between the two is no point."""
+    """At the edge between the ball and a wall behind it, pixels anywhere between the two are no points."""
     depth = picture(BALL_ROW)
     depth[depth == 0] = 2.4
     edge = np.argwhere(np.diff((depth < 2).astype(int), axis=1) == 1)
-    depth[edge[:, 0], edge[:, 1]] = 1.9
+    depth[edge[:, 0], edge[:, 1]] = np.random.default_rng(0).uniform(1.6, 2.2, len(edge))
     points = seen_points([DepthView(depth, K, T)], PANDA, START)
-    assert len(edge) > 20 and not ((points[:, 0] > -0.3) & (points[:, 0] < 0.2)).any()
+    between = (points[:, 0] > -0.3) & (points[:, 0] < 0.5)
+    assert len(edge) > 20 and between.sum() < 0.15 * len(edge)
 
 
 def test_clouds_and_several_views_add_up() -> None:

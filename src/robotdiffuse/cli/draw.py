@@ -13,14 +13,21 @@ ENDINGS = (".html", ".png")
 
 
 def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
-    """Draw the motion of a solved result in its scene, by the ending of the file."""
+    """Draw the motion of a solved result in its scene, by the ending of the file; with it what was imagined
+    beside what cameras saw, if it was."""
     motion = result.trajectory or result.path
     assert motion is not None, "only a solved result has a motion"
     if file.suffix.lower() == ".html":
         from robotdiffuse.viewer.html import write_replay as write
     else:
         from robotdiffuse.viewer.picture import write_picture as write
-    write(problem.robot, problem.scene, motion, file, result=result)
+    scene = problem.scene
+    if problem.views and problem.unseen == "imagined":
+        from robotdiffuse.planners.unseen import imagined_obstacles
+        from robotdiffuse.scenes.scene import Scene
+
+        scene = Scene([*scene.shapes, imagined_obstacles(problem)])
+    write(problem.robot, scene, motion, file, result=result)
 
 
 def show(file: Path) -> None:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 DEMO = "shelf.yaml"
 DEMO_TIME_LIMIT = 5.0
 """[s]"""
+DEMO_CAMERA, DEMO_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
+"""Where `demo --camera` looks from, and at [m]."""
 
 
 def add_plan(commands: argparse._SubParsersAction) -> None:
@@ -97,6 +99,11 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
         help="plan a bundled problem and draw the motion",
         description="Plan a bundled problem with obstacles; write demo.png and demo.html to this folder.",
     )
+    parser.add_argument(
+        "--camera",
+        action="store_true",
+        help="plan on what one depth camera sees of it; demo_true.png shows the motion in the true scene",
+    )
     parser.set_defaults(run=run_demo)
 
 
@@ -162,14 +169,38 @@ def run_demo(arguments: argparse.Namespace) -> int:
     outputs = [check_output(file, ENDINGS) for file in ("demo.png", "demo.html")]
     with as_file(files("robotdiffuse") / "examples" / DEMO) as file:
         problem = load_problem(file)
+    true = problem
+    if arguments.camera:
+        outputs.append(check_output("demo_true.png", ENDINGS))
+        problem = through_camera(true)
     result = solve(problem, DEFAULT_PLANNER, time_limit=DEMO_TIME_LIMIT)
     print_result(result)
-    if result.trajectory is None:
+    if result.trajectory is None or result.path is None:
         return 1
+    if arguments.camera:
+        from robotdiffuse.verify import verify
+
+        violation = verify(true, result.path).violation
+        print("in the true scene:", "free" if violation is None else violation.message)
     for file in outputs:
-        draw(problem, result, file)
+        draw(true if file.name == "demo_true.png" else problem, result, file)
         print(f"wrote {file.resolve()}")
     return 0
+
+
+def through_camera(problem: "Problem") -> "Problem":
+    """The problem with what a depth camera behind the arm's shoulder sees of the scene in place of it."""
+    import numpy as np
+
+    from robotdiffuse.problems.problem import IMAGINED
+    from robotdiffuse.scenes.ray_caster import looking_at, ray_cast
+    from robotdiffuse.scenes.scene import Scene
+
+    T_base_camera = looking_at(np.array(DEMO_CAMERA), np.array(DEMO_TARGET))
+    width, height = 640, 480
+    intrinsics = (460.0, 460.0, (width - 1) / 2, (height - 1) / 2)
+    view = ray_cast(problem.scene, T_base_camera, intrinsics, (width, height), problem.robot, problem.start)
+    return replace(problem, scene=Scene(), views=(view,), unseen=IMAGINED)
 
 
 def solve(

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
+from robotdiffuse.collision.arrays import compile_scene_for, reach
 from robotdiffuse.planners.swept_kernel import mark
 from robotdiffuse.problems.problem import IMAGINED, OCCUPIED, PADDED, Problem
-from robotdiffuse.problems.seen_kernel import sphere_distances
-from robotdiffuse.scenes.depth_view import SeenPoints
+from robotdiffuse.problems.seen_kernel import near_scene, sphere_distances
+from robotdiffuse.scenes.depth_view import SeenPoints, UnseenPoints
 from robotdiffuse.scenes.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume
 from robotdiffuse.scenes.point_cloud import voxel_thin
-from robotdiffuse.scenes.shapes import PointCloud
 
 PADDINGS = (0.09, 0.06, 0.04)
 """[m]"""
@@ -29,7 +29,7 @@ CARVED = 0.01
 """Voxels nearer to an end's covering spheres than this are none [m]."""
 FINE = VOXEL / 2
 """Edge of an imagined voxel [m]."""
-FINE_SHAPE = tuple(2 * n for n in SHAPE)
+FINE_SHAPE = (2 * SHAPE[0], 2 * SHAPE[1], 2 * SHAPE[2])
 
 
 class Rung(ABC):
@@ -42,7 +42,7 @@ class Rung(ABC):
         """How many of them have to be carved out for the arm's covering spheres, x y z radius [m]."""
 
     @abstractmethod
-    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> PointCloud:
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
         """What is left of them then."""
 
 
@@ -64,8 +64,8 @@ class Padded(Rung):
     def touched(self, spheres: Float32[ndarray, "n 4"]) -> int:
         return int(self._touched(spheres).sum())
 
-    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> PointCloud:
-        return PointCloud(self.points[~self._touched(spheres)], self.padding, name="padded")
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
+        return UnseenPoints(self.points[~self._touched(spheres)], self.padding, name="padded")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +74,7 @@ class Voxels(Rung):
 
     name: str
     occupied: Bool[ndarray, "nx ny nz"]
+    problem: Problem
 
     @property
     def edge(self) -> float:
@@ -85,8 +86,9 @@ class Voxels(Rung):
     def touched(self, spheres: Float32[ndarray, "n 4"]) -> int:
         return int(self._touched(spheres).sum())
 
-    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> PointCloud:
-        """Those at the surface: the arm, which starts outside, cannot get within."""
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
+        """Those at the surface, for the arm, which starts outside, cannot get within; without those that it
+        cannot reach and those in shapes that are known."""
         left = self.occupied & ~self._touched(spheres)
         within = left.copy()
         for axis in range(3):
@@ -94,7 +96,12 @@ class Voxels(Rung):
             rows[0][1:] &= rows[1][:-1]
             rows[0][:-1] &= rows[1][1:]
         points = (np.argwhere(left & ~within) + 0.5) * self.edge + LOW
-        return PointCloud(points, self.edge / 2, name="unseen")
+        robot, known = self.problem.robot, self.problem.known_scene
+        points = points[np.linalg.norm(points, axis=1) < reach(robot) + self.edge]
+        if known.shapes:
+            inside = np.float32(self.edge / 2 - 1e-3)
+            points = points[~near_scene(compile_scene_for(robot, known), points.astype(np.float32), inside)]
+        return UnseenPoints(points, self.edge / 2, name="unseen")
 
 
 def voxels_in(
@@ -122,6 +129,6 @@ def rungs(
     elif problem.unseen == IMAGINED:
         assert imagined is not None
         for threshold in THRESHOLDS:
-            yield Voxels(f"imagined, p > {threshold:g}", imagined > threshold)
+            yield Voxels(f"imagined, p > {threshold:g}", imagined > threshold, problem)
     elif problem.unseen == OCCUPIED:
-        yield Voxels("unseen is occupied", volume.unknown)
+        yield Voxels("unseen is occupied", volume.unknown, problem)

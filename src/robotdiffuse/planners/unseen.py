@@ -14,7 +14,6 @@ Start and goal are taken to be free, so space around them is carved out of these
 seen.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -31,6 +30,7 @@ from robotdiffuse.planners.swept_kernel import sweep
 from robotdiffuse.problems.problem import IMAGINED, OCCUPIED, OPTIMISTIC, JointGoal, Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.scenes.depth_view import UnseenPoints
 from robotdiffuse.scenes.observed_volume import LOW, ObservedVolume, observe
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.types import Path
@@ -39,10 +39,14 @@ if TYPE_CHECKING:
     from robotdiffuse.planners.base import Planner
 
 CANDIDATES = 4
-"""Motions of a rung that the one of least probability is chosen from."""
+"""Motions of a rung that the one of least probability is chosen from ..."""
+SAFE = 0.1
+"""... unless one sweeps no more than this."""
+RESERVED = 0.3
+"""Share of the time limit that is kept for the motion as seen, where it may be asked for."""
 SHARE = 0.5
-"""Of the time that is left, for a rung that others come after."""
-LEAST = 0.01
+"""Of the rest that is left, for a rung that others come after."""
+LEAST = 0.1
 """Share of the time limit that every call of the planner has at least."""
 AS_SEEN = "as seen"
 """The rung without any further obstacles."""
@@ -63,31 +67,42 @@ def plan_beside_unseen(
     and which unseen space it crosses.
     """
     if problem.unseen == IMAGINED and imagined is None:
-        from robotdiffuse.learning.completion import (  # pyright: ignore[reportMissingImports]
-            imagine,  # PyTorch, before the clock starts
-        )
+        from robotdiffuse.learning.completion import imagine  # PyTorch, before the clock starts
     else:
         imagine = None
     call = Call(planner.name, problem, time_limit, seed, request)
     volume = observe(problem.views, problem.robot, problem.start)
     if imagine is not None:
         imagined = imagine(volume)
-    unseen = _Unseen(problem, volume, imagined)
+    chain = _Chain(planner, call, request, _Unseen(problem, volume, imagined))
     as_seen = replace(problem, views=())
     if problem.unseen != OPTIMISTIC:
         goals = _goals(call, as_seen)
         if isinstance(goals, PlanResult):
             return goals
         for rung in rungs(problem, volume, imagined):
-            results = list(_climb(planner, call, request, rung, goals, imagined is not None))
-            solved = [result for result in results if result.solved]
-            if solved:
-                return unseen.judged(min(solved, key=unseen.risk), rung.name)
-            if problem.unseen == OCCUPIED:
+            last = problem.unseen == OCCUPIED
+            left = (1 - RESERVED) * call.time_limit - call.elapsed
+            if not last and left < LEAST * call.time_limit:
+                break
+            until = call.time_limit if last else call.elapsed + SHARE * left
+            result = chain.best(_beside(problem, rung, goals), rung.name, until)
+            if last and not result.solved:
                 why = "no motion keeps out of all space that no view saw"
-                return replace(results[-1], reason=f"{why}: {results[-1].reason}")
-    result = _attempt(planner, call, request, as_seen, call.time_limit, seed)
-    return unseen.judged(result, AS_SEEN) if result.solved else result
+                return replace(result, reason=f"{why}: {result.reason}")
+            if last or result.solved:
+                return result
+    return chain.best(as_seen, AS_SEEN, call.time_limit)
+
+
+def imagined_obstacles(problem: Problem) -> UnseenPoints:
+    """What the completing network finds likely beside what the problem's views saw: for pictures."""
+    from robotdiffuse.learning.completion import imagine
+
+    volume = observe(problem.views, problem.robot, problem.start)
+    *_, last = rungs(replace(problem, unseen=IMAGINED), volume, imagine(volume))
+    arm = placed_spheres(problem.robot, problem.start).astype(np.float32)
+    return last.obstacles(arm)
 
 
 def _goals(call: Call, as_seen: Problem) -> Float[ndarray, "n dof"] | PlanResult:
@@ -98,36 +113,46 @@ def _goals(call: Call, as_seen: Problem) -> Float[ndarray, "n dof"] | PlanResult
     return ends if isinstance(ends, PlanResult) else np.stack(ends.goals)
 
 
-def _attempt(
-    planner: "Planner", call: Call, request: Request, problem: Problem, until: float, seed: int
-) -> PlanResult:
-    """A call of the planner within this one, that ends by `until` [s since the call]."""
-    began = call.elapsed
-    result = planner.attempt(problem, max(until - began, LEAST * call.time_limit), seed, request)
-    progress = tuple((began + at, length) for at, length in result.progress)
-    return replace(result, planning_time=began + result.planning_time, progress=progress, seed=call.seed)
-
-
-def _climb(
-    planner: "Planner", call: Call, request: Request, rung: Rung, goals: Float[ndarray, "n dof"], choose: bool
-) -> Iterator[PlanResult]:
-    """Results of a rung in its share of the time; one if it finds no motion, or there is nothing to `choose`
-    by. Of several goals, those that need the least carving."""
-    problem, last = call.problem, call.problem.unseen == OCCUPIED
-    until = call.elapsed + (1.0 if last else SHARE) * (call.time_limit - call.elapsed)
+def _beside(problem: Problem, rung: Rung, goals: Float[ndarray, "n dof"]) -> Problem:
+    """The problem in the scene as seen with a rung's obstacles; of several goals, with those that need the
+    least carving."""
     start, *ends = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))
     needed = np.array([rung.touched(spheres) for spheres in ends])
     easiest = np.flatnonzero(needed == needed.min())
     obstacles = rung.obstacles(np.concatenate([start, *(ends[i] for i in easiest)]))
     scene = Scene([*problem.scene.shapes, obstacles])
-    more = replace(problem, scene=scene, goal=JointGoal(goals[easiest]), views=())
-    for number in range(CANDIDATES if choose else 1):
-        if number and call.elapsed >= until:
-            return
-        result = _attempt(planner, call, request, more, until, call.seed + number)
-        yield result
-        if not result.solved:
-            return
+    return replace(problem, scene=scene, goal=JointGoal(goals[easiest]), views=())
+
+
+class _Chain:
+    """The calls of a planner within a call."""
+
+    def __init__(self, planner: "Planner", call: Call, request: Request, unseen: "_Unseen") -> None:
+        self.planner, self.call, self.request, self.unseen = planner, call, request, unseen
+
+    def best(self, problem: Problem, rung: str, until: float) -> PlanResult:
+        """The motion that sweeps the least probability, of several that are there by `until` [s since the
+        call]; of one, where nothing is imagined. Or the result that says why there is none."""
+        found: list[PlanResult] = []
+        while len(found) < (1 if self.unseen.probability is None else CANDIDATES):
+            if found and (self.call.elapsed >= until or self.unseen.risk(found[-1]) <= SAFE):
+                break
+            result = self._attempt(problem, until, self.call.seed + len(found))
+            if not result.solved and not found:
+                return result
+            if not result.solved:
+                break
+            found.append(result)
+        chosen = min(found, key=self.unseen.risk)
+        spent = chosen.planning_time if len(found) == 1 else self.call.elapsed
+        return replace(self.unseen.judged(chosen, rung), planning_time=spent)
+
+    def _attempt(self, problem: Problem, until: float, seed: int) -> PlanResult:
+        call, began = self.call, self.call.elapsed
+        limit = max(until - began, LEAST * call.time_limit)
+        result = self.planner.attempt(problem, limit, seed, self.request)
+        progress = tuple((began + at, length) for at, length in result.progress)
+        return replace(result, planning_time=began + result.planning_time, progress=progress, seed=call.seed)
 
 
 class _Unseen:

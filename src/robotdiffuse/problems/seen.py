@@ -7,7 +7,13 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.arrays import compile_scene_for, reach
-from robotdiffuse.problems.seen_kernel import gather_cloud, gather_image, near_scene, sphere_distances
+from robotdiffuse.problems.seen_kernel import (
+    gather_cloud,
+    gather_image,
+    near_scene,
+    sphere_distances,
+    supported,
+)
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
@@ -25,6 +31,10 @@ KNOWN = 0.01
 """Points nearer than this to a known shape are its own [m]."""
 AROUND = 0.3
 """Points are kept this far beyond the robot's reach [m]."""
+FEW = 3
+"""Points in a cell, alone among empty ones, that are not taken for a sensor's mistake."""
+FARTHEST = 2.0
+"""Where a camera is that is to see a cell well [m]."""
 CELLS = 1 << 15
 """That there is room for at first."""
 
@@ -53,8 +63,15 @@ def seen_points(
             if count < 0:
                 break
         if count >= 0:
-            return sums[:count, :3] / sums[:count, 3:]
+            kept = supported(keys, cells, sums, count, np.float32(_least(views, voxel)))
+            return sums[:count, :3][kept] / sums[:count, 3:][kept]
         room *= 4
+
+
+def _least(views: Sequence[DepthView], voxel: float) -> int:
+    """Points that make a cell one that was seen: a few, where images are so fine that it should have many."""
+    focal = min((0.0 if view.cloud is not None else view.intrinsics[0] for view in views), default=0.0)
+    return FEW if (voxel * focal / FARTHEST) ** 2 >= FEW**2 else 1
 
 
 def seen_shapes(

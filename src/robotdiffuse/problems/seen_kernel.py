@@ -5,9 +5,10 @@ from numba import njit
 
 from robotdiffuse.collision.kernels.distance import scene_distance
 
-PIXELS, SHARE = np.float32(10.0), np.float32(0.015)
-"""Neighbours whose depths differ by more than so many widths of a pixel there, and by more than this share of
-the depth, are on different surfaces."""
+PIXELS, SHARE = np.float32(4.0), np.float32(0.01)
+"""Neighbours whose depths differ by less than so many widths of a pixel there, or by less than this share of
+the depth, are on the same surface."""
+_AROUND = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
 _ZERO = np.float32(0.0)
 
 
@@ -110,20 +111,38 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
     return count
 
 
+@njit(cache=True, nogil=True)
+def supported(keys, cells, sums, count, least):
+    """Which cells hold at least so many points, or are next to one that does."""
+    out = np.empty(count, np.bool_)
+    for at in range(len(keys)):
+        if keys[at] == -1:
+            continue
+        enough = sums[cells[at], 3] >= least
+        for i in range(-1, 2):
+            for j in range(-1, 2):
+                for k in range(-1, 2):
+                    if not enough:
+                        near = _slot(keys, keys[at] + (i << 42) + (j << 21) + k)
+                        enough = keys[near] != -1 and sums[cells[near], 3] >= least
+        out[cells[at]] = enough
+    return out
+
+
 @njit(cache=True, nogil=True, inline="always")
 def _flies(depth, v, u, d, jump):
-    """Whether a pixel hangs between a near and a far surface: sensors mix the two at edges."""
+    """Whether fewer than two of the eight pixels around are on the same surface: at edges, sensors mix the
+    depths of the near and the far one."""
     h, w = depth.shape
-    if 0 < u < w - 1 and _between(depth[v, u - 1], d, depth[v, u + 1], jump):
-        return True
-    return 0 < v < h - 1 and _between(depth[v - 1, u], d, depth[v + 1, u], jump)
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _between(one, d, other, jump):
-    if not (one > _ZERO and other > _ZERO):
-        return False
-    return (one + jump < d and d + jump < other) or (other + jump < d and d + jump < one)
+    alike = 0
+    for k in range(8):
+        dv, du = _AROUND[k]
+        y, x = v + dv, u + du
+        if 0 <= y < h and 0 <= x < w and abs(depth[y, x] - d) < jump:
+            alike += 1
+            if alike == 2:
+                return False
+    return True
 
 
 @njit(cache=True, nogil=True)

@@ -136,3 +136,7 @@ class DepthView:
 
 class SeenPoints(PointCloud):
     """What a problem has of its views, beside the shapes that it was given."""
+
+
+class UnseenPoints(PointCloud):
+    """What is taken for occupied beside what was seen."""

@@ -12,6 +12,7 @@ from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual import load_visual
+from robotdiffuse.scenes.depth_view import SeenPoints, UnseenPoints
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
 from robotdiffuse.types import Path, Trajectory
@@ -20,6 +21,8 @@ START, GOAL = (0x4F, 0x7F, 0xD9), (0x10, 0xA3, 0x7F)
 """sRGB colours of both ends of a motion; the trace runs from one to the other."""
 OBSTACLES = ((0xD9, 0x7B, 0x5C), (0xE0, 0x9A, 0x5F), (0xC9, 0x6A, 0x6A), (0xD8, 0xAE, 0x63))
 FURNITURE = (0xCD, 0xC0, 0xAC)
+SEEN, UNSEEN = (0x4F, 0x7C, 0xAC), (0xB9, 0x8A, 0xD9)
+"""What cameras saw, and what is taken for occupied beside it."""
 FURNITURE_SIZE = 0.7
 """Obstacles with a longer side than this are walls and tables, in a quiet colour [m]."""
 CREASE = np.radians(38)
@@ -139,10 +142,13 @@ def timed(motion: Path | Trajectory) -> tuple[Float[ndarray, "n"], Float[ndarray
 
 def obstacle_colors(scene: Scene) -> list[tuple[int, int, int]]:
     """An sRGB colour for each shape."""
-    return [
-        FURNITURE if _extent(shape) > FURNITURE_SIZE else OBSTACLES[i % len(OBSTACLES)]
-        for i, shape in enumerate(scene.shapes)
-    ]
+    return [_color(shape, OBSTACLES[i % len(OBSTACLES)]) for i, shape in enumerate(scene.shapes)]
+
+
+def _color(shape: Shape, own: tuple[int, int, int]) -> tuple[int, int, int]:
+    if isinstance(shape, SeenPoints | UnseenPoints):
+        return SEEN if isinstance(shape, SeenPoints) else UNSEEN
+    return FURNITURE if _extent(shape) > FURNITURE_SIZE else own
 
 
 def _extent(shape: Shape) -> float:
@@ -231,6 +237,8 @@ def facts(motion: Path | Trajectory, result: PlanResult | None) -> list[tuple[st
     rows.append(("path length", f"{length:.2f} rad"))
     if result is not None and result.min_clearance is not None:
         rows.append(("clearance", f"{result.min_clearance * 1e3:.1f} mm"))
+    if result is not None and result.confidence is not None:
+        rows.append(("free in unseen space", f"{100 * result.confidence:.0f} %"))
     if isinstance(motion, Trajectory):
         rows.append(("duration", f"{motion.duration:.2f} s"))
     else:

@@ -1,0 +1,284 @@
+"""What the camera does not see: motions planned on depth views, judged in the true scene.
+
+    python benchmarks/unseen.py [--problems 300] [--views 1] [--noise] [--records unseen.jsonl]
+    python benchmarks/unseen.py --report --records unseen.jsonl
+    python benchmarks/unseen.py --fit --records unseen.jsonl
+
+Problems are held-out ones of the families that the straight line does not solve and a search in the true
+scene does. Cameras stand where a person would place them, 1.4 to 1.8 m away, in front more often than behind;
+the floor is known, all else is seen. Every method plans with AORRTC and the same CPU time. A motion is free
+if the judge finds path and timed motion valid in the true scene. What was tried is kept in a file of records
+and not tried again; `--report` prints the tables that are kept in benchmarks/results/unseen.txt, and `--fit`
+the constants of planners/confidence.py, from the calibration half: problems with even numbers.
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from report import header, print_table, progress
+
+from robotdiffuse.evaluation.statistics import compare, wilson_interval
+from robotdiffuse.files import JsonLines
+from robotdiffuse.learning.completion.samples import CameraPlaces, true_voxels
+from robotdiffuse.planners import call, load_planner
+from robotdiffuse.planners.call import Request
+from robotdiffuse.planners.confidence import LEAST_RISK
+from robotdiffuse.planners.unseen import plan_beside_unseen
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
+from robotdiffuse.problems.problem import IMAGINED, Problem
+from robotdiffuse.results import PlanResult
+from robotdiffuse.scenes.depth_view import DepthView
+from robotdiffuse.scenes.ray_caster import DepthNoise, ray_cast
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.verify import verify, verify_trajectory
+
+LIMIT = 1.0
+"""CPU time of every method on every problem [s]."""
+SEARCH = 1.0
+"""CPU time of the search that says whether a problem can be solved in the true scene [s]."""
+CAMERAS = CameraPlaces(distance=(1.4, 1.8), height=(0.5, 1.4), target_spread=0.1, roll=0.0)
+SIZE = (640, 480)
+METHODS = {"as seen": "optimistic", "occupied": "occupied", "padded": "padded", "imagined": IMAGINED}
+TRUE = "true voxels"
+"""As imagined, with the voxels of 2 cm that obstacles fill in truth."""
+PLANNER = load_planner("aorrtc")
+Row = dict[str, Any]
+
+
+class CpuClock:
+    """Time limits are of CPU time here: a machine that others share gives every method the same."""
+
+    perf_counter = staticmethod(time.process_time)
+
+
+def problems(family: str, count: int, known: set[int]) -> Iterator[tuple[int, Problem]]:
+    """Held-out problems that are neither trivial nor unsolved in the true scene, with their numbers; up to
+    the greatest that is `known` to be so, these are all."""
+    number = 0
+    while count:
+        if number in known or (number > max(known, default=-1) and _hard(held_out_problem(family, number))):
+            yield number, held_out_problem(family, number)
+            count -= 1
+        number += 1
+
+
+def _hard(problem: Problem) -> bool:
+    trivial = line_length(problem, lambda of, path: verify(of, path).valid) is not None
+    return not trivial and PLANNER.plan(problem, time_limit=SEARCH, until="first").solved
+
+
+def views(problem: Problem, family: str, number: int, count: int, noisy: bool) -> list[DepthView]:
+    """What cameras see of the problem's scene, with the arm at its start."""
+    rng = np.random.default_rng([SEED, list(FAMILIES).index(family), number, 14])
+    taken = []
+    for _ in range(count):
+        T, angle = CAMERAS.draw(problem.scene, rng)
+        focal = SIZE[1] / 2 / np.tan(angle / 2)
+        intrinsics = (focal, focal, (SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
+        view = ray_cast(problem.scene, T, intrinsics, SIZE, problem.robot, problem.start)
+        taken.append(DepthNoise().applied(view, rng) if noisy else view)
+    return taken
+
+
+def tried(problem: Problem, partial: Problem, method: str) -> Row:
+    """What a method makes of what was seen, judged in the true scene."""
+    voxels = true_voxels(Scene(problem.scene.shapes[1:])).astype(np.float32) if method == TRUE else None
+    began = time.process_time()
+    asked = replace(partial, unseen=METHODS.get(method, IMAGINED))
+    result = plan_beside_unseen(PLANNER, asked, LIMIT, 0, Request(), voxels)
+    spent = time.process_time() - began
+    return {
+        "method": method,
+        "solved": result.solved,
+        "free": is_free(problem, result),
+        "rung": result.rung,
+        "confidence": result.confidence,
+        "risk": result.swept_probability,
+        "time": spent,
+        "reason": result.reason,
+    }
+
+
+def is_free(problem: Problem, result: PlanResult) -> bool:
+    """Whether the motion is one in the true scene."""
+    if result.path is None or result.trajectory is None:
+        return False
+    return verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+
+
+def run(arguments: argparse.Namespace, methods: list[str]) -> None:
+    """Try what is not in the records yet."""
+    call.time = CpuClock  # type: ignore[attr-defined]
+    kept = JsonLines(Path(arguments.records))
+    place = {"views": arguments.views, "noise": arguments.noise}
+    done = {(r["family"], r["number"], r["method"]) for r in kept.rows if place.items() <= r.items()}
+    each = arguments.problems // len(arguments.families)
+    warm = True
+    for family in arguments.families:
+        known = {row["number"] for row in kept.rows if row["family"] == family}
+        for number, problem in progress(list(problems(family, each, known)), family):
+            missing = [method for method in methods if (family, number, method) not in done]
+            if not missing:
+                continue
+            taken = views(problem, family, number, arguments.views, arguments.noise)
+            known = Scene(problem.scene.shapes[:1])
+            began = time.process_time()
+            partial = Problem(problem.robot, known, problem.start, problem.goal, views=taken)
+            spent = time.process_time() - began
+            if warm:
+                tried(problem, partial, IMAGINED if IMAGINED in missing else "padded")
+                warm = False
+            for method in missing:
+                row = tried(problem, partial, method)
+                kept.append({"family": family, "number": number, **place, "view_time": spent, **row})
+
+
+def table(rows: list[Row], title: str) -> None:
+    """Methods on the same problems: free in truth, plans, the first rung, times; and each family."""
+    families = list(dict.fromkeys(row["family"] for row in rows))
+    lines = []
+    for method in [*METHODS, TRUE]:
+        mine = [row for row in rows if row["method"] == method]
+        if not mine:
+            continue
+        free, solved = sum(row["free"] for row in mine), sum(row["solved"] for row in mine)
+        low, high = wilson_interval(free, len(mine))
+        first = [row for row in mine if row["rung"] == FIRST_RUNGS.get(method)]
+        shares = [np.mean([row["free"] for row in mine if row["family"] == family]) for family in families]
+        lines.append(
+            (
+                method,
+                len(mine),
+                f"{100 * free / len(mine):.1f} ({100 * low:.0f} to {100 * high:.0f})",
+                f"{100 * solved / len(mine):.0f}",
+                f"{100 * free / max(solved, 1):.0f}",
+                f"{100 * len(first) / len(mine):.0f}" if first else "",
+                f"{100 * np.mean([row['free'] for row in first]):.0f}" if first else "",
+                f"{1e3 * np.median([row['time'] for row in mine]):.0f}",
+                *(f"{100 * share:.0f}" for share in shares),
+            )
+        )
+    columns = ["%", "problems", "free in truth", "plans", "of them free"]
+    columns += ["first rung", "of it free", "ms", *families]
+    print_table(title, columns, lines)
+    base = {name: _free(rows, name) for name in [*METHODS, TRUE]}
+    for a, b in (("padded", "as seen"), ("imagined", "as seen"), ("imagined", "padded"), (TRUE, "imagined")):
+        both = base[a].keys() & base[b].keys()
+        if both:
+            pair = compare(*(np.array([1.0 if base[m][k] else np.nan for k in sorted(both)]) for m in (a, b)))
+            gain = 100 * (pair.a_only - pair.b_only) / len(both)
+            print(f"{a} over {b}: {gain:+.1f} points, p = {pair.p_success:.2g} (McNemar, exact)")
+    print()
+
+
+FIRST_RUNGS = {
+    "padded": "points padded by 9 cm",
+    "imagined": "imagined, p > 0.05",
+    TRUE: "imagined, p > 0.05",
+}
+
+
+def _free(rows: list[Row], method: str) -> dict[tuple[str, int], bool]:
+    return {(row["family"], row["number"]): row["free"] for row in rows if row["method"] == method}
+
+
+def calibration(rows: list[Row]) -> None:
+    """Stated confidence against the share that is free, on the half that it was not fitted on."""
+    for method in METHODS:
+        mine = [r for r in rows if r["method"] == method and r["solved"] and r["number"] % 2]
+        if not mine:
+            continue
+        stated, free = (np.array([row[name] for row in mine], float) for name in ("confidence", "free"))
+        lines, error = [], 0.0
+        for low in np.arange(0, 1, 0.2):
+            part = (stated >= low) & (stated < low + 0.2 + 1e-9 * (low > 0.7))
+            if part.any():
+                lines.append(
+                    (
+                        f"{low:.1f} to {low + 0.2:.1f}",
+                        int(part.sum()),
+                        f"{stated[part].mean():.2f}",
+                        f"{free[part].mean():.2f}",
+                    )
+                )
+                error += part.mean() * abs(stated[part].mean() - free[part].mean())
+        print_table(
+            f"Confidence of {method}, on problems with odd numbers",
+            ["stated", "motions", "mean", "free"],
+            lines,
+        )
+        print(f"expected error {error:.3f}\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Planning on depth views, judged in the true scene.")
+    parser.add_argument("--problems", type=int, default=300, help="(300)")
+    parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
+    parser.add_argument("--methods", nargs="+", default=[*METHODS, TRUE], help="(all)")
+    parser.add_argument("--views", type=int, default=1, help="(1)")
+    parser.add_argument("--noise", action="store_true")
+    parser.add_argument("--records", default="unseen.jsonl", help="(unseen.jsonl)")
+    parser.add_argument("--report", action="store_true")
+    parser.add_argument("--fit", action="store_true")
+    arguments = parser.parse_args()
+    if arguments.fit:
+        fit(JsonLines(Path(arguments.records)).rows)
+    elif arguments.report:
+        print(header("numba", "numpy", "torch"))
+        report(JsonLines(Path(arguments.records)).rows)
+    else:
+        run(arguments, arguments.methods)
+
+
+def report(rows: list[Row]) -> None:
+    places = dict.fromkeys((row["views"], row["noise"]) for row in rows)
+    for count, noisy in places:
+        some = [row for row in rows if (row["views"], row["noise"]) == (count, noisy)]
+        table(some, f"{count} {'noisy ' if noisy else ''}view{'s' if count > 1 else ''}")
+        if (count, noisy) == (1, False):
+            calibration(some)
+    spent = [row["view_time"] for row in rows]
+    print(f"From views to the problem's scene: {1e3 * np.median(spent):.0f} ms of CPU time (median)")
+
+
+def fit(rows: list[Row]) -> None:
+    """Print RATES and BY_RISK of planners/confidence.py."""
+    rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1 and not r["noise"]]
+    plain = [row for row in rows if row["risk"] is None]
+    for rung in dict.fromkeys(row["rung"] for row in plain):
+        free = [row["free"] for row in plain if row["rung"] == rung]
+        print(f'RATES "{rung}": {(sum(free) + 1) / (len(free) + 2):.2f} of {len(free)}')
+    for seen in (False, True):
+        some = [r for r in rows if r["method"] == "imagined" and (r["rung"] == "as seen") == seen]
+        if some:
+            free, risk = (np.array([row[name] for row in some], float) for name in ("free", "risk"))
+            print(
+                "BY_RISK",
+                "as seen" if seen else "imagined",
+                _logistic(np.log(np.maximum(risk, LEAST_RISK)), free),
+            )
+
+
+def _logistic(x: Float[ndarray, "n"], y: Float[ndarray, "n"]) -> tuple[float, float]:
+    """Log odds at 0 and their slope, which is not let above 0; with a prior of one motion of either kind."""
+    from scipy.optimize import minimize
+
+    def loss(w: ndarray) -> float:
+        odds = w[0] + w[1] * x
+        prior = np.logaddexp(0, -w[0]) + np.logaddexp(0, w[0])
+        return float(np.logaddexp(0, np.where(y > 0, -odds, odds)).sum() + prior)
+
+    found = minimize(loss, np.zeros(2), bounds=[(None, None), (None, 0.0)]).x
+    return round(float(found[0]), 2), round(float(found[1]), 2)
+
+
+if __name__ == "__main__":
+    main()
