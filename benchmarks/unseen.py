@@ -29,7 +29,7 @@ from robotdiffuse.files import JsonLines
 from robotdiffuse.learning.completion.samples import CameraPlaces, true_voxels
 from robotdiffuse.planners import call, load_planner
 from robotdiffuse.planners.call import Request
-from robotdiffuse.planners.confidence import LEAST_RISK
+from robotdiffuse.planners.confidence import LEAST_RISK, confidence
 from robotdiffuse.planners.unseen import plan_beside_unseen
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
@@ -196,7 +196,8 @@ def calibration(rows: list[Row]) -> None:
         mine = [r for r in rows if r["method"] == method and r["solved"] and r["number"] % 2]
         if not mine:
             continue
-        stated, free = (np.array([row[name] for row in mine], float) for name in ("confidence", "free"))
+        stated = np.array([confidence(row["rung"], row["risk"]) for row in mine])
+        free = np.array([row["free"] for row in mine], float)
         lines, error = [], 0.0
         for low in np.arange(0, 1, 0.2):
             part = (stated >= low) & (stated < low + 0.2 + 1e-9 * (low > 0.7))
