@@ -14,11 +14,12 @@ from robotdiffuse.planners import load_planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.add import add_robot
 from robotdiffuse.robots.allowed_collisions import SamplingSettings
+from robotdiffuse.robots.preparation import PreparationSettings
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.verify import verify
 
 ARM = chain("base", row("j", 6))
-QUICK = SamplingSettings(samples=100, descents=1)
+QUICK = PreparationSettings(sampling=SamplingSettings(samples=100, descents=1), samples=100, rounds=0)
 
 
 def solid(mesh: trimesh.Trimesh | bytes, file: str = "part.stl", more: str = "") -> Callable[[Path], Path]:
@@ -195,7 +196,7 @@ def test_awkward_arms_are_prepared_and_plan(name: str, tmp_path: Path) -> None:
     if name == "xacro":
         pytest.importorskip("xacrodoc")
     make, dof = WORKS[name]
-    report = add_robot(make(tmp_path), out=tmp_path / "robot", sampling=QUICK)
+    report = add_robot(make(tmp_path), out=tmp_path / "robot", settings=QUICK)
     made = report.robot
     assert made.dof == dof and all(part.covered for part in report.links)
     rng = np.random.default_rng(0)
@@ -212,6 +213,6 @@ def test_awkward_arms_are_prepared_and_plan(name: str, tmp_path: Path) -> None:
 def test_what_cannot_work_is_refused_by_one_line_that_says_what_to_do(name: str, tmp_path: Path) -> None:
     make, message = REFUSED[name]
     with pytest.raises(InputError, match=message) as error:
-        add_robot(make(tmp_path), out=tmp_path / "robot", sampling=QUICK)
+        add_robot(make(tmp_path), out=tmp_path / "robot", settings=QUICK)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "robot").exists()
