@@ -19,7 +19,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.verify import verify
 
 ARM = chain("base", row("j", 6))
-QUICK = PreparationSettings(sampling=SamplingSettings(samples=100, descents=1), samples=200, rounds=0)
+QUICK = PreparationSettings(sampling=SamplingSettings(samples=100, descents=1), samples=100, rounds=0)
 
 
 def solid(mesh: trimesh.Trimesh | bytes, file: str = "part.stl", more: str = "") -> Callable[[Path], Path]:
