@@ -39,7 +39,8 @@ class Space(NamedTuple):
 def distance(a, b):
     total = np.float32(0.0)
     for j in range(len(a)):
-        total += (a[j] - b[j]) * (a[j] - b[j])
+        d = np.float32(a[j] - b[j])
+        total += d * d
     return np.sqrt(total)
 
 
@@ -56,7 +57,7 @@ def path_length(path):
 def motion_free(space, a, b, block, work):
     """Whether the straight motion from a to b is free; b is checked, a is not.
 
-    Each block of 16 takes configurations spread over the whole motion, so that a collision anywhere tends to
+    Ends may be of any float type. Each block of 16 takes configurations spread over the whole motion, so that a collision anywhere tends to
     show in the first block (the rake of W. Thomason et al., "Motions in Microseconds", ICRA 2024).
     """
     if len(space.near_ends) == 0:
@@ -85,7 +86,7 @@ def padding_near(space, a, b, share, around):
     for m in range(len(space.near_ends)):
         total = np.float32(0.0)
         for j in range(dof):
-            d = a[j] + share * (b[j] - a[j]) - space.near_ends[m, j]
+            d = np.float32(a[j] + share * (b[j] - a[j]) - space.near_ends[m, j])
             total += d * d
         padding = min(
             padding, space.near_ends[m, dof] + RELAXATION_SLOPE * max(np.sqrt(total) - around, _ZERO)
@@ -99,13 +100,14 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
     dof = len(a)
     travel = np.float32(0.0)
     for j in range(dof):
-        travel += (t - s) * abs(b[j] - a[j]) * space.levers[j]
+        travel += (t - s) * np.float32(abs(b[j] - a[j])) * space.levers[j]
     blocks = max(int(np.ceil(travel / space.resolution / np.float32(W))), 1)
     step = (t - s) / np.float32(blocks * W)
     for k in range(blocks):
         shares = (ramp() * np.float32(blocks) + np.float32(blocks - k)) * step
         for j in range(dof):
-            store(block, j, 0, shares * (b[j] - a[j]) + (a[j] + s * (b[j] - a[j])))
+            far = np.float32(b[j] - a[j])
+            store(block, j, 0, shares * far + (np.float32(a[j]) + s * far))
         if block_hits(space.robot, space.scene, block, padding, True, work):
             return False
     return True
