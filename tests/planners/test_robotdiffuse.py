@@ -118,7 +118,7 @@ def test_search_answers_where_the_network_gives_nothing(planner, monkeypatch):
     assert verify(PROBLEM, result.path).valid
 
 
-def test_the_first_path_comes_before_the_network_is_asked(planner, monkeypatch):
+def test_the_first_path_comes_before_the_network_is_asked(monkeypatch):
     """So time that runs out while it samples costs no plan; and what is returned is no longer."""
     began = []
 
@@ -127,10 +127,11 @@ def test_the_first_path_comes_before_the_network_is_asked(planner, monkeypatch):
         time.sleep(0.3)
         return draw(self, *arguments)
 
+    planner = RobotDiffuse(RobotDiffuseSettings(network_share=0.9))  # which is due soon after the path
     planner.plan(PROBLEM, time_limit=10.0)
     monkeypatch.setattr(RobotDiffuse, "draw", late)
     start = time.perf_counter()
-    result = planner.plan(PROBLEM, time_limit=1.0, until="limit")
+    result = planner.plan(PROBLEM, time_limit=2.0, until="limit")
     assert result.path is not None and verify(PROBLEM, result.path).valid
     (first, longest), *_, (_, shortest) = result.progress
     assert first < began[0] and result.path.length == pytest.approx(shortest) and shortest <= longest

@@ -57,8 +57,9 @@ def path_length(path):
 def motion_free(space, a, b, block, work):
     """Whether the straight motion from a to b is free; b is checked, a is not.
 
-    Ends may be of any float type. Each block of 16 takes configurations spread over the whole motion, so that a collision anywhere tends to
-    show in the first block (the rake of W. Thomason et al., "Motions in Microseconds", ICRA 2024).
+    Ends may be of any float type. Each block of 16 takes configurations spread over the whole motion, so that
+    a collision anywhere tends to show in the first block (the rake of W. Thomason et al., "Motions in
+    Microseconds", ICRA 2024).
     """
     if len(space.near_ends) == 0:
         return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, block, work)
