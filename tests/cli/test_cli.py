@@ -27,6 +27,7 @@ from robotdiffuse.planners import PLANNERS, planner_settings
 from robotdiffuse.results import PlanResult, load_result
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.allowed_collisions import SamplingSettings
+from robotdiffuse.robots.preparation import PreparationSettings
 from robotdiffuse.types import Status
 
 ROOT = Path(__file__).parents[2]
@@ -363,7 +364,8 @@ def test_robot_add_with_srdf_and_robot_list(
 ) -> None:
     """Pairs that an SRDF or the command allows, the comparison with sampling, progress without a terminal."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
-    monkeypatch.setattr("robotdiffuse.robots.add.SamplingSettings", lambda: SamplingSettings(samples=100))
+    quick = PreparationSettings(sampling=SamplingSettings(samples=100), samples=100, rounds=0)
+    monkeypatch.setattr("robotdiffuse.robots.add.PreparationSettings", lambda: quick)
     file = written(tmp_path, chain("base", row("j", 4), xyz="0 0 0.07", limits='lower="-3" upper="3"'))
     pairs = ("base", "j4_link", "User"), ("base", "j3_link", "Never"), ("base", "j1_link", "Adjacent")
     rows = (f'<disable_collisions link1="{a}" link2="{b}" reason="{why}"/>' for a, b, why in pairs)
@@ -372,7 +374,7 @@ def test_robot_add_with_srdf_and_robot_list(
     assert run("robot", "add", str(file), "--allow", "j1_link", "j4_link") == 0
     told = capsys.readouterr()
     assert "made.srdf sees differently" in told.out and "User" in told.out and "named 1" in told.out
-    assert "0 of 6: spheres of base" in told.err and "6 of 6: done" in told.err
+    assert "5 of 11: spheres of base" in told.err and "11 of 11: done" in told.err
     allowed = load_robot("made").allowed_collisions
     assert frozenset(("j1_link", "j4_link")) in allowed
     assert frozenset(("base", "j4_link")) not in allowed  # found beside: compared, not taken

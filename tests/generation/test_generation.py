@@ -303,7 +303,7 @@ def test_workers_and_clusters_that_are_none_are_refused(tmp_path: Path) -> None:
         ({}, "mix is empty"),
         ({"rop": 0.0}, "share of rop is 0"),
         ({"rop": float("nan")}, "share of rop is nan"),
-        ({"kitchen": 1.0}, r"kitchen.*rop, rop_dense"),
+        ({"pantry": 1.0}, r"pantry.*rop, rop_dense"),
     ],
 )
 def test_bad_mixes_are_refused(mix: dict[str, float], message: str) -> None:
