@@ -7,8 +7,10 @@ import pytest
 from PIL import Image
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.scenes.depth_view import DepthView
+from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.depth_view_files import read_depth, read_views, view_entry
+from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_about, transform
 
 K = (50.0, 50.0, 31.5, 23.5)
@@ -121,3 +123,10 @@ def test_views_survive_their_files(tmp_path: Path) -> None:
 def test_what_is_wrong_in_a_file(entry: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         read_views([entry], Path())
+
+
+def test_points_that_were_seen_are_sampled_as_a_cloud() -> None:
+    """The network was asked for a scene with a kind of point cloud, and its surface looked for a mesh."""
+    points = np.random.default_rng(0).uniform(0.2, 0.5, (50, 3))
+    found = sample_surface(Scene([SeenPoints(points, 0.01)]), 20, np.random.default_rng(1))
+    assert len(found) == 20 and all((point == points).all(axis=1).any() for point in found)

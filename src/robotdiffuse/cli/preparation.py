@@ -15,7 +15,9 @@ def print_preparation(report: AddReport) -> None:
     links = [
         (of.link, of.parts, of.spheres, of.stick_out, "yes" if of.covered else "no") for of in report.links
     ]
-    share = [Column(name, "%", ".1f", scale=100.0) for name in ("colliding", "refused by parts", "by spheres")]
+    share = [
+        Column(name, "%", ".1f", scale=100.0) for name in ("colliding", "refused by parts", "by spheres")
+    ]
     pairs = [
         (", ".join(of.links), of.colliding, of.by_parts, of.by_spheres)
         for of in report.refusals.pairs[:MOST_PAIRS]

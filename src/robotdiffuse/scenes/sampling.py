@@ -106,6 +106,10 @@ DRAWS: dict[type[Shape], Callable[..., ndarray]] = {
 """By shape: n points, uniform by area, in the base frame; of a shape that is not here, on its triangles."""
 
 
+def _draw_of(shape: Shape) -> Callable[..., ndarray]:
+    return next((DRAWS[kind] for kind in type(shape).__mro__ if kind in DRAWS), _triangles)
+
+
 def sample_surface(
     scene: Scene, count: int, rng: Generator, region: VisibleRegion = PANDA_REGION
 ) -> Float[ndarray, "count 3"]:
@@ -123,7 +127,7 @@ def sample_surface(
     missing, draw = count, 2 * count
     for _ in range(ROUNDS):
         parts = rng.multinomial(draw, shares)
-        draws = [DRAWS.get(type(shape), _triangles) for shape in shapes]
+        draws = [_draw_of(shape) for shape in shapes]
         drawn = [f(s, int(n), rng) for f, s, n in zip(draws, shapes, parts, strict=True) if n > 0]
         points = np.concatenate(drawn)
         points = points[region.holds(points)]
