@@ -1,5 +1,6 @@
 """AORRTC: paths below the bound, shorter with time; `until`, the clearance and the scaling of a call."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,6 +16,7 @@ from robotdiffuse.planners import call
 from robotdiffuse.planners.aorrtc import kernel
 from robotdiffuse.planners.aorrtc.planner import AORRTC, AORRTCSettings
 from robotdiffuse.planners.rrt_connect import RRTConnect
+from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
@@ -189,3 +191,10 @@ def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
             assert np.array_equal(short[[0, -1]], path[[0, -1]])
             assert path_length(short) <= path_length(path) + 1e-4
             assert motions_free(space, short).all()
+
+
+def test_a_long_way_round_is_left_again() -> None:
+    """Bounded rounds found nothing below a first path that went round a shelf, where restarts did."""
+    problem = replace(held_out_problem("shelf", 3), clearance=0.0)
+    result = AORRTC(AORRTCSettings(patience=40_000)).plan(problem, time_limit=60.0)
+    assert result.path is not None and result.path.length < 8.0

@@ -1,7 +1,8 @@
 """AORRTC: a first path by RRT-Connect, then ever shorter ones by searches below the length of the last.
 
 Each round has fresh trees, which hold no path that is not shorter than the best one known; what a round finds
-is simplified, and bounds the next.
+is simplified, and bounds the next. Where that finds nothing for a while, rounds without bound have a share of
+the work: a bound is a simplified path, what trees hold is not.
 """
 
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ STEP = 1_000
 class AORRTCSettings(SearchSettings, name="aorrtc"):
     gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.005
     """Until "short", the search ends when its last doubling took off a smaller share of the length ..."""
-    patience: Natural = 2_000
+    patience: Natural = 8_000
     """... but not before so many iterations."""
 
 

@@ -26,6 +26,9 @@ FIRST_TRIES = 400
 """Iterations at a clearance before the next lower one is tried."""
 HELP_AFTER = 8_000
 """Iterations without a path before others are asked for one, and between two times that they are."""
+RESTART_AFTER = 1_000
+"""Iterations without a shorter path after which every third slice is of a round without bound: where it is
+tight, trees hold longer paths than simplification has made of a first one that goes the long way round."""
 SLICE = 100
 """Iterations between two looks at the clock."""
 NO_SHORTER = 1e-4
@@ -76,8 +79,8 @@ class AnytimeSearch:
         """The shortest paths, each when it was found, and where they come from."""
         self._lengths = list[tuple[int, float]]()
         self._state = random_state(call.seed)
-        self._trees: kernel.Trees | None = None
-        self._left = 0
+        self._rounds: list[_Round | None] = [None, None]
+        """The one below the bound, and one without bound."""
         wanted = [share * call.clearance for share in (1.0, 0.5, 0.25)]
         self._clearances = [*(kept for kept in wanted if kept > LEAST_CLEARANCE), LEAST_CLEARANCE, 0.0]
         self._enter(0)
@@ -141,7 +144,7 @@ class AnytimeSearch:
         self.best, self.length, self.stage = path, np.float32(length), stage
         self.history.append((path, stage))
         self._lengths.append((self.work, float(length)))
-        self._trees = None
+        self._rounds[0] = None
         self.call.improved(float(length))
         return True
 
@@ -156,7 +159,7 @@ class AnytimeSearch:
         self.settings = replace(self.settings, resolution=finer(self.settings.resolution))
         self.best = accepted
         self.length = np.float32(np.inf if accepted is None else path_length(accepted))
-        self._trees = None
+        self._rounds = [None, None]
         self._enter(self._level)
 
     def _enter(self, level: int) -> None:
@@ -181,19 +184,30 @@ class AnytimeSearch:
                 return
 
     def _slice(self) -> None:
-        """Some iterations of the round, and what they find."""
-        most = self.settings.iterations
-        if self._trees is None or self._left <= 0 or self._trees.sizes.max() >= self._trees.nodes.shape[1]:
-            self._trees = kernel.make_trees(self.start, self.goals, most + len(self.goals))
-            self._left = most
-        longest = np.float32(self.settings.range)
-        bound = self.length if self.bounded else np.float32(np.inf)
-        path = kernel.search(self.space, self._trees, self.goals, bound, longest, SLICE, self._state)
-        self.work, self._left, self._tried = self.work + SLICE, self._left - SLICE, self._tried + SLICE
+        """Some iterations of a round, and what they find."""
+        settings = self.settings
+        lost = self.work - (self._lengths[-1][0] if self._lengths else self.work)
+        free = self.bounded and lost >= RESTART_AFTER and self.work // SLICE % 3 == 2
+        now = self._rounds[free]
+        if now is None or now.left <= 0 or now.trees.sizes.max() >= now.trees.nodes.shape[1]:
+            trees = kernel.make_trees(self.start, self.goals, settings.iterations + len(self.goals))
+            now = self._rounds[free] = _Round(trees, settings.iterations)
+        bound = self.length if self.bounded and not free else np.float32(np.inf)
+        longest = np.float32(settings.range)
+        path = kernel.search(self.space, now.trees, self.goals, bound, longest, SLICE, self._state)
+        self.work, self._tried, now.left = self.work + SLICE, self._tried + SLICE, now.left - SLICE
         if len(path):
             self.found += 1
+            self._rounds[free] = None
             self.offer(path, self.name)
-            self._trees = None
+
+
+@dataclass
+class _Round:
+    """Trees, and the iterations that are left to them."""
+
+    trees: kernel.Trees
+    left: int
 
 
 class Answers:
