@@ -22,7 +22,7 @@ from helpers.factory_runs import (
 from robotdiffuse.errors import InputError
 from robotdiffuse.generation import GenerationSettings, factory, generate
 
-TRAJECTORIES, SHARD, WAYPOINTS = 36, 3, 16
+TRAJECTORIES, SHARD, WAYPOINTS = 72, 3, 16
 SHARDS = TRAJECTORIES // SHARD
 SETTINGS = GenerationSettings(trajectories=TRAJECTORIES, shard=SHARD, waypoints=WAYPOINTS)
 
@@ -44,8 +44,8 @@ def test_killed_at_random_moments_it_ends_in_the_same_data(
     for _ in range(2):
         run = start(tmp_path, TRAJECTORIES, SHARD, WAYPOINTS, 2)
         wait_for_shards(run, tmp_path, shards(tmp_path) + 1)
-        time.sleep(rng.uniform(0, 0.3))
-        assert len(members(run.pid)) >= 3, "the command and two workers"
+        time.sleep(rng.uniform(0, 0.1))
+        assert len(members(run.pid)) >= 2, "the command and a worker; the other may be at its start or end"
         run.kill()
         run.communicate(timeout=120)
         assert run.returncode == -signal.SIGKILL and shards(tmp_path) < SHARDS
