@@ -1,6 +1,7 @@
 """What the package makes of fixed inputs has not changed; see golden.py, which also says what was."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -18,6 +19,8 @@ def test_golden(section: str) -> None:
     made_on = json.loads(GOLDEN.read_text())["processor"]
     if section not in ANY_PROCESSOR and made_on != get_host_cpu_name():
         pytest.skip(f"the last bits of networks and searches are those of a processor {made_on}")
+    if section in ("weights", "plans") and "GOLDEN" not in os.environ:
+        pytest.skip("plans have time limits, which a busy machine exceeds: GOLDEN=1 compares them")
     command = [sys.executable, str(GOLDEN.with_suffix(".py")), "--only", section]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
