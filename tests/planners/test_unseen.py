@@ -14,7 +14,17 @@ from robotdiffuse.planners import load_planner
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Request
 from robotdiffuse.planners.confidence import RATES, confidence
-from robotdiffuse.planners.rungs import CARVED, FINE, FINE_SHAPE, PADDINGS, Padded, Voxels, rungs, voxels_in
+from robotdiffuse.planners.rungs import (
+    CARVED,
+    FINE,
+    FINE_SHAPE,
+    PADDINGS,
+    THRESHOLDS,
+    Padded,
+    Voxels,
+    rungs,
+    voxels_in,
+)
 from robotdiffuse.planners.swept_kernel import sweep
 from robotdiffuse.planners.unseen import AS_SEEN, plan_beside_unseen
 from robotdiffuse.problems.problem import PoseGoal, Problem
@@ -140,7 +150,8 @@ def test_thresholds_fall_from_rung_to_rung() -> None:
     volume = observe([taken(DEEP)], PANDA, START)
     p = np.random.default_rng(0).random(FINE_SHAPE).astype(np.float32) ** 3
     occupied = [rung.occupied for rung in rungs(partial("imagined"), volume, p) if isinstance(rung, Voxels)]
-    assert len(occupied) == 3 and all((b <= a).all() and b.sum() < a.sum() for a, b in pairwise(occupied))
+    assert len(occupied) == len(THRESHOLDS)
+    assert all((b <= a).all() and b.sum() < a.sum() for a, b in pairwise(occupied))
 
 
 def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:

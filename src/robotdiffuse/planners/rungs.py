@@ -23,7 +23,7 @@ PADDED_SHARE, PADDED_MORE = 1.3, 0.01
 lets them grow."""
 THIRD = 1 / 3
 """Cells that one point is kept of, as a share of its padding."""
-THRESHOLDS = (0.05, 0.1, 0.2)
+THRESHOLDS = (0.05, 0.1, 0.2, 0.35, 0.5)
 """Probabilities above which a voxel is an obstacle."""
 CARVED = 0.01
 """Voxels nearer to an end's covering spheres than this are none [m]."""

@@ -5,8 +5,8 @@ first; the first that has a motion answers. So every motion keeps clear of what 
 beside it as lets it pass:
 
 - padded: points seen, padded by 9 cm, by 6, by 4; then as seen.
-- imagined: voxels that the completing network finds occupied with a probability above 0.05, 0.1, 0.2; then as
-  seen. Of several motions of a rung, the one that sweeps the least probability.
+- imagined: voxels that the completing network finds occupied with a probability above 0.05, 0.1, 0.2, 0.35,
+  0.5; then as seen. Of several motions of a rung, one that sweeps little probability.
 - occupied: every voxel that no view saw, and nothing after it.
 - optimistic: as seen.
 
@@ -21,11 +21,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
-from robotdiffuse.collision.arrays import compile_robot
+from robotdiffuse.collision.arrays import compile_robot, compile_scene_for
 from robotdiffuse.planners.call import Call, Request
 from robotdiffuse.planners.confidence import confidence
 from robotdiffuse.planners.ends import usable_ends
-from robotdiffuse.planners.rungs import CARVED, FINE, FINE_SHAPE, Rung, rungs, voxels_in
+from robotdiffuse.planners.rungs import CARVED, FINE, FINE_SHAPE, Rung, Voxels, rungs, voxels_in
 from robotdiffuse.planners.swept_kernel import sweep
 from robotdiffuse.problems.problem import IMAGINED, OCCUPIED, OPTIMISTIC, JointGoal, Problem
 from robotdiffuse.results import PlanResult
@@ -33,21 +33,25 @@ from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.scenes.depth_view import UnseenPoints
 from robotdiffuse.scenes.observed_volume import LOW, ObservedVolume, observe
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.types import Path
+from robotdiffuse.types import FIRST, Path
 
 if TYPE_CHECKING:
     from robotdiffuse.planners.base import Planner
 
-CANDIDATES = 4
-"""Motions of a rung that the one of least probability is chosen from ..."""
+CANDIDATES = 8
+"""First motions of a rung that the one of least probability is chosen from ..."""
 SAFE = 0.1
 """... unless one sweeps no more than this."""
+AS_LIKELY = 0.01
+"""A shorter motion is taken whose confidence is less by no more than this."""
 RESERVED = 0.3
 """Share of the time limit that is kept for the motion as seen, where it may be asked for."""
-SHARE = 0.5
+SHARE = 0.25
 """Of the rest that is left, for a rung that others come after."""
 LEAST = 0.1
 """Share of the time limit that every call of the planner has at least."""
+SHOWN = 0.2
+"""Probability above which pictures show a voxel."""
 AS_SEEN = "as seen"
 """The rung without any further obstacles."""
 
@@ -82,11 +86,13 @@ def plan_beside_unseen(
             return goals
         for rung in rungs(problem, volume, imagined):
             last = problem.unseen == OCCUPIED
-            left = (1 - RESERVED) * call.time_limit - call.elapsed
-            if not last and left < LEAST * call.time_limit:
+            if not last and (1 - RESERVED) * call.time_limit - call.elapsed < LEAST * call.time_limit:
                 break
-            until = call.time_limit if last else call.elapsed + SHARE * left
-            result = chain.best(_beside(problem, rung, goals), rung.name, until)
+            beside = _beside(problem, rung, goals)
+            compile_scene_for(problem.robot, beside.scene)  # no part of the rung's share of the time
+            left = (1 - RESERVED) * call.time_limit - call.elapsed
+            until = call.time_limit if last else call.elapsed + max(SHARE * left, LEAST * call.time_limit)
+            result = chain.best(beside, rung.name, until)
             if last and not result.solved:
                 why = "no motion keeps out of all space that no view saw"
                 return replace(result, reason=f"{why}: {result.reason}")
@@ -100,9 +106,8 @@ def imagined_obstacles(problem: Problem) -> UnseenPoints:
     from robotdiffuse.learning.completion import imagine
 
     volume = observe(problem.views, problem.robot, problem.start)
-    *_, last = rungs(replace(problem, unseen=IMAGINED), volume, imagine(volume))
     arm = placed_spheres(problem.robot, problem.start).astype(np.float32)
-    return last.obstacles(arm)
+    return Voxels("likely", imagine(volume) > SHOWN, problem).obstacles(arm)
 
 
 def _goals(call: Call, as_seen: Problem) -> Float[ndarray, "n dof"] | PlanResult:
@@ -131,28 +136,49 @@ class _Chain:
         self.planner, self.call, self.request, self.unseen = planner, call, request, unseen
 
     def best(self, problem: Problem, rung: str, until: float) -> PlanResult:
-        """The motion that sweeps the least probability, of several that are there by `until` [s since the
-        call]; of one, where nothing is imagined. Or the result that says why there is none."""
-        found: list[PlanResult] = []
-        while len(found) < (1 if self.unseen.probability is None else CANDIDATES):
-            if found and (self.call.elapsed >= until or self.unseen.risk(found[-1]) <= SAFE):
-                break
-            result = self._attempt(problem, until, self.call.seed + len(found))
+        """A motion that is there by `until` [s since the call], or the result that says why there is none.
+
+        Where something is imagined, the shortest of those that are about as likely free as the likeliest:
+        of first motions, and of one made with the time that is left.
+        """
+        if self.unseen.probability is None:
+            result = self._attempt(problem, until, self.call.seed, self.request)
+            return self.unseen.judged(result, rung) if result.solved else result
+        found = list[_Motion]()
+        while len(found) < CANDIDATES:
+            quick = replace(self.request, until=FIRST)
+            result = self._attempt(problem, until, self.call.seed + len(found), quick)
             if not result.solved and not found:
                 return result
             if not result.solved:
                 break
-            found.append(result)
-        chosen = min(found, key=self.unseen.risk)
-        spent = chosen.planning_time if len(found) == 1 else self.call.elapsed
-        return replace(self.unseen.judged(chosen, rung), planning_time=spent)
+            found.append(_Motion(result, rung, self.unseen))
+            if self.call.elapsed >= until or found[-1].risk <= SAFE:
+                break
+        if self.request.until != FIRST and self.call.elapsed < until:
+            result = self._attempt(problem, until, self.call.seed, self.request)
+            found += [_Motion(result, rung, self.unseen)] if result.solved else []
+        likeliest = max(motion.likely for motion in found)
+        likely = [motion for motion in found if motion.likely >= likeliest - AS_LIKELY]
+        chosen = min(likely, key=lambda motion: motion.length)
+        return replace(self.unseen.judged(chosen.result, rung), planning_time=self.call.elapsed)
 
-    def _attempt(self, problem: Problem, until: float, seed: int) -> PlanResult:
+    def _attempt(self, problem: Problem, until: float, seed: int, request: Request) -> PlanResult:
         call, began = self.call, self.call.elapsed
         limit = max(until - began, LEAST * call.time_limit)
-        result = self.planner.attempt(problem, limit, seed, self.request)
+        result = self.planner.attempt(problem, limit, seed, request)
         progress = tuple((began + at, length) for at, length in result.progress)
         return replace(result, planning_time=began + result.planning_time, progress=progress, seed=call.seed)
+
+
+class _Motion:
+    """A motion of a rung where something is imagined."""
+
+    def __init__(self, result: PlanResult, rung: str, unseen: "_Unseen") -> None:
+        assert result.path is not None
+        self.result, self.length = result, result.path.length
+        self.risk = unseen.risk(result.path)
+        self.likely = confidence(rung, self.risk)
 
 
 class _Unseen:
@@ -178,15 +204,14 @@ class _Unseen:
         sweep(compile_robot(self.problem.robot), path.positions.astype(np.float32), low, edge, out)
         return out & self.unknown
 
-    def risk(self, result: PlanResult) -> float:
+    def risk(self, path: Path) -> float:
         """Summed probability of the voxels that a motion sweeps; 0 where none is imagined."""
-        assert result.path is not None
-        return 0.0 if self.probability is None else float(self.probability[self.swept(result.path)].sum())
+        return 0.0 if self.probability is None else float(self.probability[self.swept(path)].sum())
 
     def judged(self, result: PlanResult, rung: str) -> PlanResult:
         """The result with what is known of its motion in unseen space."""
         assert result.path is not None
-        risk = None if self.probability is None else self.risk(result)
+        risk = None if self.probability is None else self.risk(result.path)
         return replace(
             result,
             rung=rung,
