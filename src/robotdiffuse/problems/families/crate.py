@@ -11,6 +11,7 @@ from robotdiffuse.problems.families.furniture import (
     PLACE_TRIES,
     Built,
     Furniture,
+    NoRoomError,
     Region,
     Square,
     Standing,
@@ -48,7 +49,7 @@ class Crate(Furniture):
     def most_obstacles(self) -> int:
         return 6 * self.crates[1] + self.objects[1]
 
-    def build(self, rng: Generator) -> Built | None:
+    def build(self, rng: Generator) -> Built:
         shapes: list[Box | Sphere] = []
         regions: list[Region] = []
         taken: list[Square] = []
@@ -56,8 +57,6 @@ class Crate(Furniture):
             x, y = rng.uniform(*self.length, 2) / 2
             h, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
             frame = _free_place(self, float(np.hypot(x + t, y + t)), taken, rng)
-            if frame is None:
-                return None
             low = 0.0
             if rng.random() < self.raised_share:
                 low = rng.uniform(*self.block_height)
@@ -73,27 +72,23 @@ class Crate(Furniture):
         for _ in range(count(self.spots, rng)):
             half = rng.uniform(*self.spot_size) / 2
             frame = _free_place(self, float(np.sqrt(2) * half), taken, rng)
-            if frame is None:
-                return None
             regions.append(frame.region((-half, -half, 0.0), (half, half, 2 * half), DOWN))
         for _ in range(count(self.objects, rng)):
             thing = Thing(self, rng)
             frame = _free_place(self, thing.half, taken, rng)
-            if frame is None:
-                return None
             shapes.append(thing.placed(frame, 0.0, 0.0, 0.0))
         return shapes, regions
 
 
-def _free_place(crate: Crate, half: float, taken: list[Square], rng: Generator) -> Standing | None:
-    """A free place on the ground for something of this half width; it is taken from now on."""
+def _free_place(crate: Crate, half: float, taken: list[Square], rng: Generator) -> Standing:
+    """A free place on the ground for something of this half width, which is taken then; raises NoRoomError."""
     for _ in range(PLACE_TRIES):
         frame = Standing(crate, crate.distance, rng)
         square = (float(frame.xy[0]), float(frame.xy[1]), half, half)
         if is_free(square, taken):
             taken.append(square)
             return frame
-    return None
+    raise NoRoomError
 
 
 CRATE = Crate()

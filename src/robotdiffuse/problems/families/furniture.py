@@ -120,8 +120,8 @@ class Furniture(Ranges, ABC):
         """Of a scene, the floor left out."""
 
     @abstractmethod
-    def build(self, rng: Generator) -> "Built | None":
-        """Shapes and regions, in reach or not; None if there was no room for something."""
+    def build(self, rng: Generator) -> "Built":
+        """Shapes and regions, in reach or not; raises NoRoomError."""
 
     @property
     def floor(self) -> Box:
@@ -140,10 +140,10 @@ class Furniture(Ranges, ABC):
         immovable base. Raises InputError if the settings leave no scene with two regions in reach.
         """
         for _ in range(MAX_TRIES):
-            built = self.build(rng)
-            if built is None:
+            try:
+                shapes, regions = self.build(rng)
+            except NoRoomError:
                 continue
-            shapes, regions = built
             regions = [r for r in regions if np.linalg.norm(r.center - SHOULDER) <= self.reach]
             if len(regions) >= 2 and all(keeps_out(shape, keep_out) for shape in shapes):
                 return Furnished(Scene([self.floor, *shapes]), tuple(regions))
@@ -222,6 +222,48 @@ class Thing:
 
 Square = tuple[float, float, float, float]
 """A rectangle on a surface: x, y of the middle, half edges."""
+
+
+class NoRoomError(Exception):
+    """There is no free place for something: the scene is drawn anew."""
+
+
+class Surface:
+    """The upper side of a table or a counter, at a height [m], from 0 to `length` ahead and `side` to either
+    hand: finds free places for things and for the fingers."""
+
+    def __init__(self, frame: Standing, length: float, side: float, height: float) -> None:
+        self.frame, self.length, self.side, self.height = frame, length, side, height
+        self.taken: list[Square] = []
+
+    def place(self, half_x: float, half_y: float, rng: Generator) -> tuple[float, float]:
+        """The middle of a free rectangle, which is taken then; raises NoRoomError."""
+        fits = half_x < self.length / 2 and half_y < self.side
+        for _ in range(PLACE_TRIES if fits else 0):
+            x = float(rng.uniform(half_x, self.length - half_x))
+            y = float(rng.uniform(half_y - self.side, self.side - half_y))
+            if is_free((x, y, half_x, half_y), self.taken):
+                self.taken.append((x, y, half_x, half_y))
+                return x, y
+        raise NoRoomError
+
+    def spots(self, numbers: tuple[int, int], size: Range, rng: Generator) -> list[Region]:
+        """Regions that nothing stands on, as high as they are wide, where the hand points down."""
+        found: list[Region] = []
+        for _ in range(count(numbers, rng)):
+            half = rng.uniform(*size) / 2
+            (x, y), top = self.place(half, half, rng), self.height + 2 * half
+            low, high = (x - half, y - half, self.height), (x + half, y + half, top)
+            found.append(self.frame.region(low, high, DOWN))
+        return found
+
+    def things(self, settings: Furniture, rng: Generator) -> list[Box | Sphere]:
+        """The settings' number of loose things."""
+        found: list[Box | Sphere] = []
+        for _ in range(count(settings.objects, rng)):
+            thing = Thing(settings, rng)
+            found.append(thing.placed(self.frame, *self.place(thing.half, thing.half, rng), self.height))
+        return found
 
 
 def is_free(square: Square, taken: list[Square]) -> bool:

@@ -8,17 +8,13 @@ from numpy.random import Generator
 from robotdiffuse.problems.families.family import PositiveRange
 from robotdiffuse.problems.families.furniture import (
     AHEAD,
-    DOWN,
-    PLACE_TRIES,
     Built,
     Corner,
     Furniture,
     Region,
-    Square,
     Standing,
-    Thing,
+    Surface,
     count,
-    is_free,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.settings import Natural, Positive, Share
@@ -70,7 +66,7 @@ class Kitchen(Furniture):
         wall, hollow, cupboards = 1, 5, 3 + 2 * self.cupboards[1]
         return wall + hollow * (1 + self.ovens[1]) + self.solids[1] + cupboards + self.objects[1]
 
-    def build(self, rng: Generator) -> Built | None:
+    def build(self, rng: Generator) -> Built:
         frame = Standing(self, self.distance, rng)
         depth, side = rng.uniform(*self.depth), rng.uniform(*self.width) / 2
         height, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
@@ -94,44 +90,19 @@ class Kitchen(Furniture):
         hang = height + rng.uniform(*self.above)
         top = self._cupboards(frame, depth, hang, t, shapes, regions, rng)
         shapes.append(frame.box((depth, -side, 0.0), (depth + t, side, top), "wall"))
-        taken: list[Square] = []
-
-        def place(half_x: float, half_y: float) -> tuple[float, float] | None:
-            """A free place on the counter."""
-            for _ in range(PLACE_TRIES if 2 * half_x < depth and half_y < side else 0):
-                x = float(rng.uniform(half_x, depth - half_x))
-                y = float(rng.uniform(half_y - side, side - half_y))
-                if is_free((x, y, half_x, half_y), taken):
-                    taken.append((x, y, half_x, half_y))
-                    return x, y
-            return None
-
+        counter = Surface(frame, depth, side, height)
         ovens, solids = count(self.ovens, rng), count(self.solids, rng)
         for i in range(ovens + solids):
             a, b = rng.uniform(*self.appliance_depth) / 2, rng.uniform(*self.appliance_width) / 2
             b *= 1.0 if i < ovens else rng.uniform(0.5, 1.0)
-            spot = place(a, b)
-            if spot is None:
-                return None
-            (x, y), high = spot, height + rng.uniform(*self.appliance_height)
+            (x, y), high = counter.place(a, b, rng), height + rng.uniform(*self.appliance_height)
             low_corner, high_corner = (x - a, y - b, height), (x + a, y + b, high)
             if i < ovens:
                 hollow(low_corner, high_corner, "oven")
             else:
                 shapes.append(frame.box(low_corner, high_corner, "appliance"))
-        for _ in range(count(self.spots, rng)):
-            half = rng.uniform(*self.spot_size) / 2
-            spot = place(half, half)
-            if spot is None:
-                return None
-            (x, y), high = spot, height + 2 * half
-            regions.append(frame.region((x - half, y - half, height), (x + half, y + half, high), DOWN))
-        for _ in range(count(self.objects, rng)):
-            thing = Thing(self, rng)
-            spot = place(thing.half, thing.half)
-            if spot is None:
-                return None
-            shapes.append(thing.placed(frame, *spot, height))
+        regions += counter.spots(self.spots, self.spot_size, rng)
+        shapes += counter.things(self, rng)
         return shapes, regions
 
     def _cupboards(

@@ -50,7 +50,7 @@ class Shelf(Furniture):
     def most_obstacles(self) -> int:
         return self.boards[1] + self.columns[1] + 2 + self.objects[1]
 
-    def build(self, rng: Generator) -> Built | None:
+    def build(self, rng: Generator) -> Built:
         frame = Standing(self, self.distance, rng)
         depth, t = rng.uniform(*self.depth), rng.uniform(*self.thickness)
         rows = rng.uniform(*self.row_height, count(self.boards, rng) - 1)

@@ -8,16 +8,11 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.problems.families.family import PositiveRange
 from robotdiffuse.problems.families.furniture import (
     AHEAD,
-    DOWN,
-    PLACE_TRIES,
     Built,
     Furniture,
     Region,
-    Square,
     Standing,
-    Thing,
-    count,
-    is_free,
+    Surface,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
 from robotdiffuse.settings import Natural, Share
@@ -67,7 +62,7 @@ class Table(Furniture):
     def most_obstacles(self) -> int:
         return 6 + self.objects[1]
 
-    def build(self, rng: Generator) -> Built | None:
+    def build(self, rng: Generator) -> Built:
         frame = Standing(self, self.distance, rng)
         length, side = rng.uniform(*self.length), rng.uniform(*self.width) / 2
         height, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
@@ -83,41 +78,18 @@ class Table(Furniture):
             if under > BENEATH:
                 inner = side - w
                 regions.append(frame.region((0.0, -inner, 0.0), (length / 2, inner, under), AHEAD))
-        taken: list[Square] = []
-
-        def place(half: float) -> tuple[float, float] | None:
-            for _ in range(PLACE_TRIES if half < min(length / 2, side) else 0):
-                x, y = float(rng.uniform(half, length - half)), float(rng.uniform(half - side, side - half))
-                if is_free((x, y, half, half), taken):
-                    taken.append((x, y, half, half))
-                    return x, y
-            return None
-
+        surface = Surface(frame, length, side, height)
         kind, top = rng.random(), height + rng.uniform(*self.divider_height)
         if kind < self.wall_share:
             start, y = rng.uniform(0.0, length / 3), rng.uniform(-side / 3, side / 3)
             shapes.append(frame.box((start, y - t / 2, height), (length, y + t / 2, top), "wall"))
-            taken.append(((start + length) / 2, y, (length - start) / 2, t / 2))
+            surface.taken.append(((start + length) / 2, y, (length - start) / 2, t / 2))
         elif kind < self.wall_share + self.pillar_share:
             w = rng.uniform(*self.pillar_width) / 2
-            spot = place(w)
-            if spot is None:
-                return None
-            x, y = spot
+            x, y = surface.place(w, w, rng)
             shapes.append(frame.box((x - w, y - w, height), (x + w, y + w, top), "pillar"))
-        for _ in range(count(self.spots, rng)):
-            half = rng.uniform(*self.spot_size) / 2
-            spot = place(half)
-            if spot is None:
-                return None
-            (x, y), z = spot, height + 2 * half
-            regions.append(frame.region((x - half, y - half, height), (x + half, y + half, z), DOWN))
-        for _ in range(count(self.objects, rng)):
-            thing = Thing(self, rng)
-            spot = place(thing.half)
-            if spot is None:
-                return None
-            shapes.append(thing.placed(frame, *spot, height))
+        regions += surface.spots(self.spots, self.spot_size, rng)
+        shapes += surface.things(self, rng)
         return shapes, regions
 
 
