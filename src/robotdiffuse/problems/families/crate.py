@@ -81,7 +81,7 @@ class Crate(Furniture):
 
 
 def _free_place(crate: Crate, half: float, taken: list[Square], rng: Generator) -> Standing:
-    """A free place on the ground for something of this half width, which is taken then; raises NoRoomError."""
+    """A free place on the ground for a thing of this half width, which is taken then; raises NoRoomError."""
     for _ in range(PLACE_TRIES):
         frame = Standing(crate, crate.distance, rng)
         square = (float(frame.xy[0]), float(frame.xy[1]), half, half)
