@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from robotdiffuse.collision.kernels.frames import ball_to_box, placed, step
+
 MOST_STEPS = 32
 """Of GJK; mostly it takes three to eight."""
 CLOSE_ENOUGH = 0.02
@@ -85,16 +87,8 @@ def make_posture(hulls, solids, dof):
 def pose(offsets, slides, q, dq, posture):
     """The frames at q and their twists along dq; offsets[dof, 4, 4] as in `Robot.frame_offsets`."""
     for j in range(len(q)):
-        parent, child, offset = posture.frames[j], posture.frames[j + 1], offsets[j]
-        before, twist = posture.twists[j], posture.twists[j + 1]
-        c, s, slide = (1.0, 0.0, q[j]) if slides[j] else (np.cos(q[j]), np.sin(q[j]), 0.0)
-        for r in range(3):
-            x = parent[r, 0] * offset[0, 0] + parent[r, 1] * offset[1, 0] + parent[r, 2] * offset[2, 0]
-            y = parent[r, 0] * offset[0, 1] + parent[r, 1] * offset[1, 1] + parent[r, 2] * offset[2, 1]
-            z = parent[r, 0] * offset[0, 2] + parent[r, 1] * offset[1, 2] + parent[r, 2] * offset[2, 2]
-            t = parent[r, 0] * offset[0, 3] + parent[r, 1] * offset[1, 3] + parent[r, 2] * offset[2, 3]
-            child[r, 0], child[r, 1], child[r, 2] = x * c + y * s, y * c - x * s, z
-            child[r, 3] = t + parent[r, 3] + z * slide
+        child, before, twist = posture.frames[j + 1], posture.twists[j], posture.twists[j + 1]
+        step(posture.frames[j], offsets[j], slides[j], q[j], child)
         for r in range(3):
             a, b = (r + 1) % 3, (r + 2) % 3
             axis = child[r, 2] * dq[j]
@@ -104,18 +98,13 @@ def pose(offsets, slides, q, dq, posture):
 
 
 @njit(cache=True)
-def _placed(T, p, r):
-    return T[r, 0] * p[0] + T[r, 1] * p[1] + T[r, 2] * p[2] + T[r, 3]
-
-
-@njit(cache=True)
 def part_speed(hulls, p, base, posture):
     """No point of a part moves further than this from the middle to an end, seen from a frame [m]; but for
     the remainder."""
     frame, ball = hulls.frame[p], hulls.balls[p]
     twist, other, T = posture.twists[frame], posture.twists[base], posture.frames[frame]
     a, b, c = twist[0] - other[0], twist[1] - other[1], twist[2] - other[2]
-    x, y, z = _placed(T, ball, 0), _placed(T, ball, 1), _placed(T, ball, 2)
+    x, y, z = placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)
     u = b * z - c * y + twist[3] - other[3]
     v = c * x - a * z + twist[4] - other[4]
     w = a * y - b * x + twist[5] - other[5]
@@ -126,15 +115,8 @@ def part_speed(hulls, p, base, posture):
 def ball_to_solid(hulls, p, solids, o, posture):
     """A lower bound of the distance of a part to an obstacle in the middle, from ball and box."""
     T, ball = posture.frames[hulls.frame[p]], hulls.balls[p]
-    outside, deepest = 0.0, -np.inf
-    for r in range(3):
-        d = 0.0
-        for k in range(3):
-            d += solids.rotation[o, r, k] * (_placed(T, ball, k) - solids.middle[o, k])
-        d = abs(d) - solids.half[o, r] - (solids.disc[o] if r < 2 else 0.0)
-        outside += max(d, 0.0) ** 2
-        deepest = max(deepest, d)
-    return np.sqrt(outside) + min(deepest, 0.0) - solids.rounding[o] - ball[3]
+    gap = ball_to_box(T, ball, solids.rotation[o], solids.middle[o], solids.half[o], solids.disc[o])
+    return gap - solids.rounding[o] - ball[3]
 
 
 @njit(cache=True)
@@ -143,7 +125,7 @@ def ball_to_ball(hulls, p, q, posture):
     S, T, total = posture.frames[hulls.frame[p]], posture.frames[hulls.frame[q]], 0.0
     a, b = hulls.balls[p], hulls.balls[q]
     for r in range(3):
-        total += (_placed(S, a, r) - _placed(T, b, r)) ** 2
+        total += (placed(S, a, r) - placed(T, b, r)) ** 2
     return np.sqrt(total) - a[3] - b[3]
 
 
@@ -183,7 +165,7 @@ def _support_of_part(hulls, p, posture, sign, row):
         T[0, 2] * x + T[1, 2] * y + T[2, 2] * z,
     )
     for r in range(3):
-        points[row, r] = _placed(T, hulls.vertices[:, i], r)
+        points[row, r] = placed(T, hulls.vertices[:, i], r)
 
 
 @njit(cache=True)
@@ -353,11 +335,11 @@ def best_plane(hulls, p, solids, other, base, enough, plane, posture):
     else:
         T = posture.frames[hulls.frame[p]]
         for r in range(3):
-            n[r] = _placed(T, hulls.balls[p], r)
+            n[r] = placed(T, hulls.balls[p], r)
             if other >= 0:
                 n[r] -= solids.middle[other, r]
             else:
-                n[r] -= _placed(posture.frames[hulls.frame[-1 - other]], hulls.balls[-1 - other], r)
+                n[r] -= placed(posture.frames[hulls.frame[-1 - other]], hulls.balls[-1 - other], r)
         length = np.sqrt(_dot(n, n))
         for r in range(3):
             n[r] = n[r] / length if length > 0 else 1.0 / np.sqrt(3.0)

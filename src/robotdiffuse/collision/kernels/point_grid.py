@@ -2,9 +2,9 @@
 
 The grid holds, for the centre of each voxel, the distance to the nearest point (its centre) and which one it
 is, exact within a band around the points; beyond, a lower bound of the distance, and a point not far from the
-nearest. A query that lies e from
-its voxel's centre knows the distance to within e. Where that does not decide, the points in the cells around
-are looked at. `points.py` builds the arrays, which are fields of SceneArrays.
+nearest. A query that lies e from its voxel's centre knows the distance to within e. Where that does not
+decide, the points in the cells around are looked at. `points.py` builds the arrays, which are fields of
+SceneArrays.
 """
 
 import numpy as np
@@ -234,6 +234,33 @@ def touch_points(x, y, z, radius, scene):
     return False
 
 
+@allocation_free(forceinline=True)
+def _columns(frame, rx, ry, reach):
+    """The columns of cells that may hold points within `reach` of a place in the grid's frame."""
+    cell, mx, my = frame[4], int(frame[11]), int(frame[12])
+    i0, i1 = max(int((rx - reach) / cell), 0), min(int((rx + reach) / cell), mx - 1)
+    j0, j1 = max(int((ry - reach) / cell), 0), min(int((ry + reach) / cell), my - 1)
+    return i0, i1 + 1, j0, j1 + 1
+
+
+@allocation_free(forceinline=True)
+def _in_column(scene, i, j, rx, ry, rz, reach):
+    """First and last of the points of a column's cells within `reach`; the same where there are none."""
+    frame = scene.grid_frame
+    cell, my, mz = frame[4], int(frame[12]), int(frame[13])
+    gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), _ZERO)
+    gy = max(max(np.float32(j) * cell - ry, ry - np.float32(j + 1) * cell), _ZERO)
+    rest = reach * reach - gx * gx - gy * gy
+    if rest <= _ZERO:
+        return np.int32(0), np.int32(0)
+    half = np.sqrt(rest) + _SLACK
+    k0, k1 = max(int((rz - half) / cell), 0), min(int((rz + half) / cell), mz - 1)
+    if k0 > k1:
+        return np.int32(0), np.int32(0)
+    column = (i * my + j) * mz
+    return scene.cell_first[column + k0], scene.cell_first[column + k1 + 1]
+
+
 @allocation_free()
 def _touches(scene, x, y, z, radius):
     """Whether a sphere touches a point: the one that the grid knows, or another in the cells around."""
@@ -244,28 +271,16 @@ def _touches(scene, x, y, z, radius):
         dx, dy, dz, r = point[0] - x, point[1] - y, point[2] - z, radius + point[3]
         if dx * dx + dy * dy + dz * dz < r * r:
             return True
-    cell, reach = frame[4], radius + frame[5] + _SLACK
+    reach = radius + frame[5] + _SLACK
     if reach <= _ZERO:
         return False
-    mx, my, mz = int(frame[11]), int(frame[12]), int(frame[13])
     rx, ry, rz = x - frame[0], y - frame[1], z - frame[2]
-    i0, i1 = max(int((rx - reach) / cell), 0), min(int((rx + reach) / cell), mx - 1)
-    j0, j1 = max(int((ry - reach) / cell), 0), min(int((ry + reach) / cell), my - 1)
-    for i in range(i0, i1 + 1):
-        gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), _ZERO)
-        for j in range(j0, j1 + 1):
-            gy = max(max(np.float32(j) * cell - ry, ry - np.float32(j + 1) * cell), _ZERO)
-            rest = reach * reach - gx * gx - gy * gy
-            if rest <= _ZERO:
-                continue
-            half = np.sqrt(rest) + _SLACK
-            k0, k1 = max(int((rz - half) / cell), 0), min(int((rz + half) / cell), mz - 1)
-            if k0 > k1:
-                continue
-            column = (i * my + j) * mz
+    i0, i1, j0, j1 = _columns(frame, rx, ry, reach)
+    for i in range(i0, i1):
+        for j in range(j0, j1):
+            first, last = _in_column(scene, i, j, rx, ry, rz, reach)
             # sixteen points at once, and those beside them that are further away
-            first, last = scene.cell_first[column + k0], scene.cell_first[column + k1 + 1]
-            for row in range(first // W, (last + W - 1) // W):
+            for row in range(first // W, (last + W - 1) // W if last > first else 0):
                 dx, dy, dz = load(rows, row, 0) - x, load(rows, row, 1) - y, load(rows, row, 2) - z
                 r = load(rows, row, 3) + radius
                 if dx * dx + dy * dy + dz * dz < r * r:
@@ -294,29 +309,17 @@ def _look_up(scene, x, y, z):
 @allocation_free(fastmath=True)
 def _search(scene, x, y, z, limit):
     """Distance to the surface of the nearest point below `limit`, else `limit`."""
-    points, first, frame = scene.points, scene.cell_first, scene.grid_frame
-    cell = frame[4]
-    mx, my, mz = int(frame[11]), int(frame[12]), int(frame[13])
+    points, frame = scene.points, scene.grid_frame
     reach = limit + frame[5] + _SLACK
     best = limit
     if reach <= _ZERO:
         return best
     rx, ry, rz = x - frame[0], y - frame[1], z - frame[2]
-    i0, i1 = max(int((rx - reach) / cell), 0), min(int((rx + reach) / cell), mx - 1)
-    j0, j1 = max(int((ry - reach) / cell), 0), min(int((ry + reach) / cell), my - 1)
-    for i in range(i0, i1 + 1):
-        gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), _ZERO)
-        for j in range(j0, j1 + 1):
-            gy = max(max(np.float32(j) * cell - ry, ry - np.float32(j + 1) * cell), _ZERO)
-            rest = reach * reach - gx * gx - gy * gy
-            if rest <= _ZERO:
-                continue
-            half = np.sqrt(rest) + _SLACK
-            k0, k1 = max(int((rz - half) / cell), 0), min(int((rz + half) / cell), mz - 1)
-            if k0 > k1:
-                continue
-            row = (i * my + j) * mz
-            for p in range(first[row + k0], first[row + k1 + 1]):
+    i0, i1, j0, j1 = _columns(frame, rx, ry, reach)
+    for i in range(i0, i1):
+        for j in range(j0, j1):
+            first, last = _in_column(scene, i, j, rx, ry, rz, reach)
+            for p in range(first, last):
                 dx, dy, dz = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
                 r = best + points[p, 3]
                 square = dx * dx + dy * dy + dz * dz

@@ -1,0 +1,38 @@
+"""Compiled kinematics in float64: the next frame of a chain, places in a frame, and balls beside boxes."""
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True)
+def step(parent, offset, slides, q, child):
+    """The frame beyond a joint at q [rad or m]: T_base_child from T_base_parent and T_parent_joint[4, 4]."""
+    c, s, slide = (1.0, 0.0, q) if slides else (np.cos(q), np.sin(q), 0.0)
+    for r in range(3):
+        x = parent[r, 0] * offset[0, 0] + parent[r, 1] * offset[1, 0] + parent[r, 2] * offset[2, 0]
+        y = parent[r, 0] * offset[0, 1] + parent[r, 1] * offset[1, 1] + parent[r, 2] * offset[2, 1]
+        z = parent[r, 0] * offset[0, 2] + parent[r, 1] * offset[1, 2] + parent[r, 2] * offset[2, 2]
+        t = parent[r, 0] * offset[0, 3] + parent[r, 1] * offset[1, 3] + parent[r, 2] * offset[2, 3]
+        child[r, 0], child[r, 1], child[r, 2] = x * c + y * s, y * c - x * s, z
+        child[r, 3] = t + parent[r, 3] + z * slide
+
+
+@njit(cache=True)
+def placed(T, p, r):
+    """Coordinate r of the point p of a frame."""
+    return T[r, 0] * p[0] + T[r, 1] * p[1] + T[r, 2] * p[2] + T[r, 3]
+
+
+@njit(cache=True)
+def ball_to_box(T, ball, rotation, middle, half, disc):
+    """Lower bound of the distance [m] from a frame's point to a box, R_box_base[3, 3], whose half edges are
+    longer by the radius of a disc around its z axis; negative within."""
+    outside, deepest = 0.0, -np.inf
+    for r in range(3):
+        d = 0.0
+        for k in range(3):
+            d += rotation[r, k] * (placed(T, ball, k) - middle[k])
+        d = abs(d) - half[r] - (disc if r < 2 else 0.0)
+        outside += max(d, 0.0) ** 2
+        deepest = max(deepest, d)
+    return np.sqrt(outside) + min(deepest, 0.0)
