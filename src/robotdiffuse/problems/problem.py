@@ -4,8 +4,8 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, no_type_check
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, ClassVar, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import numbers, shown
+from robotdiffuse.transforms import inverse
 
 LIMIT_SLACK = 1e-5
 """Configurations that exceed a joint limit by no more than this are clamped, with a note [rad]."""
@@ -60,17 +61,7 @@ class PoseGoal:
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):
             raise InputError(f"goal.frame is {shown(self.frame)}; it must be the name of a link")
-        T = numbers(self.T_base_frame)
-        if T is None or T.shape != (4, 4) or not np.isfinite(T).all():
-            raise InputError(
-                f"goal.T_base_frame is {shown(self.T_base_frame)}; it must be 4 x 4 finite numbers"
-            )
-        rotation = T[:3, :3]
-        orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
-        if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():
-            raise InputError(
-                f"goal.T_base_frame is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1"
-            )
+        T = check_pose("goal.T_base_frame", self.T_base_frame)
         object.__setattr__(self, "T_base_frame", T)
 
     if TYPE_CHECKING:
@@ -104,6 +95,9 @@ class Problem:
     """Pictures that depth cameras took of the scene."""
     unseen: str = OPTIMISTIC
     """What space that no view saw is taken for, one of UNSEEN; of no account without views."""
+    T_world_base: Float[ndarray, "4 4"] | None = None
+    """Where the base stands in the world, for files and pictures: scene, goal and views are in the base's
+    frame all the same. `in_world` takes them in the world's. None: the base's frame is the world's."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
@@ -131,6 +125,9 @@ class Problem:
             )
         views = _views(self.robot, self.views)
         check_unseen("unseen", self.unseen)
+        T_world_base = self.T_world_base
+        if T_world_base is not None:
+            T_world_base = check_pose("T_world_base", T_world_base)
         scene = self.scene
         if views:
             from robotdiffuse.problems.seen import seen_shapes  # compiled code, which only views need
@@ -144,6 +141,7 @@ class Problem:
             "goal": goal,
             "notes": tuple(notes),
             "views": views,
+            "T_world_base": T_world_base,
         }.items():
             object.__setattr__(self, key, value)
 
@@ -159,7 +157,40 @@ class Problem:
             clearance: float | None = None,
             views: Sequence[DepthView] = (),
             unseen: str = OPTIMISTIC,
+            T_world_base: ArrayLike | None = None,
         ) -> None: ...
+
+    @classmethod
+    def in_world(
+        cls,
+        T_world_base: ArrayLike,
+        robot: Robot,
+        scene: Scene,
+        start: ArrayLike,
+        goal: "ArrayLike | JointGoal | PoseGoal",
+        notes: tuple[str, ...] = (),
+        clearance: float | None = None,
+        views: "Sequence[DepthView]" = (),
+        unseen: str = OPTIMISTIC,
+    ) -> "Problem":
+        """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views and
+        the pose of a goal are given.
+
+        They are moved into the base's frame, where planning is. Raises InputError as the constructor does.
+        """
+        T = check_pose("T_world_base", T_world_base)
+        T_base_world = inverse(T)
+        goal = moved_goal(goal, T_base_world)
+        if isinstance(scene, Scene):
+            scene = scene.moved(T_base_world)
+        views = tuple(view.moved(T_base_world) if isinstance(view, DepthView) else view for view in views)
+        return cls(robot, scene, start, goal, notes, clearance, views, unseen, T)
+
+    def standing(self) -> tuple[Robot, Scene]:
+        """Robot and scene as they stand in the world, for pictures and simulators: the robot's base is the
+        world then."""
+        T = self.T_world_base
+        return (self.robot, self.scene) if T is None else (self.robot.standing(T), self.scene.moved(T))
 
     @property
     def known_scene(self) -> Scene:
@@ -169,6 +200,23 @@ class Problem:
 
     load: ClassVar[Callable[..., "Problem"]]
     """`problems.files.load_problem`, put here by the package: files know problems, not the reverse."""
+
+
+def moved_goal(goal: Any, T: Float[ndarray, "4 4"]) -> Any:
+    """The goal after a rigid motion: poses move, configurations do not."""
+    return replace(goal, T_base_frame=T @ goal.T_base_frame) if isinstance(goal, PoseGoal) else goal
+
+
+def check_pose(field: str, value: object) -> Float[ndarray, "4 4"]:
+    """The value as a rigid transform; InputError for anything else."""
+    T = numbers(value)
+    if T is None or T.shape != (4, 4) or not np.isfinite(T).all():
+        raise InputError(f"{field} is {shown(value)}; it must be 4 x 4 finite numbers")
+    rotation = T[:3, :3]
+    orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
+    if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():
+        raise InputError(f"{field} is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1")
+    return T
 
 
 def check_clearance(field: str, value: object) -> float:
