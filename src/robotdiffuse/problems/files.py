@@ -16,6 +16,7 @@ from robotdiffuse.problems.equipment import (
     read_pose,
     rounded,
 )
+from robotdiffuse.problems.goal_files import goal_entry, read_goal, read_waypoints
 from robotdiffuse.problems.moveit import MoveItRequest, moveit_frames, moveit_request, moveit_scene
 from robotdiffuse.problems.problem import (
     OPTIMISTIC,
@@ -31,12 +32,10 @@ from robotdiffuse.scenes.depth_view import DepthView
 from robotdiffuse.scenes.depth_view_files import read_views, view_entry
 from robotdiffuse.scenes.files import check_fields, read_scene, read_text, read_yaml, scene_entries
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import numbers, shown, unit_quaternion, vector
-from robotdiffuse.transforms import rotation_from_quaternion, transform
+from robotdiffuse.scenes.shapes import numbers, shown
 
 FIELDS = ("robot", "scene", "start", "goal")
-OPTIONAL = ("locked", "base", "tool", "attached", "clearance", "views", "unseen")
-GOALS = ("joints", "joint_set", "pose")
+OPTIONAL = ("locked", "base", "tool", "attached", "waypoints", "clearance", "views", "unseen")
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +126,11 @@ def problem_record(
     record |= {
         "scene": as_given(scene_entries(scene, folder)),
         "start": problem.start.tolist(),
-        "goal": as_given(_goal_entry(goal)),
+        "goal": as_given(goal_entry(goal)),
     }
+    if problem.waypoints:
+        way = problem.waypoints if T is None else [moved_goal(goal, T) for goal in problem.waypoints]
+        record["waypoints"] = as_given([goal_entry(goal) for goal in way])
     if problem.clearance is not None:
         record["clearance"] = problem.clearance
     if views:
@@ -278,12 +280,17 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
             notes += more
         views, more = read_views(values.get("views", []), folder)
         unseen = values.get("unseen", OPTIMISTIC)
+        if requested and "waypoints" in values:
+            raise InputError("waypoints are for goals in the file itself, not beside a request")
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames)
             return _requested(robot, scene, request, clearance, views, unseen)
-        goal, notes = _goal(values["goal"]), (*notes, *more)
+        goal, notes = read_goal("goal", values["goal"], scene), (*notes, *more)
         asked = robot, scene, values["start"], goal, notes, clearance, views, unseen
-        return Problem(*asked) if base is None else Problem.in_world(base, *asked)
+        way = read_waypoints(values.get("waypoints", []), scene)
+        if base is None:
+            return Problem(*asked, waypoints=way)
+        return Problem.in_world(base, *asked, waypoints=way)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
@@ -304,29 +311,3 @@ def _robot(name: object, locked: object, folder: Path) -> Robot:
             raise InputError(f"locked: {shown(joint)} is {shown(value)}; it must be a number")
         values[joint] = float(array)
     return load_robot(name, locked=values)
-
-
-def _goal_entry(goal: JointGoal | PoseGoal) -> dict[str, object]:
-    """The goal as `_goal` takes it."""
-    if isinstance(goal, JointGoal):
-        rows = goal.positions.tolist()
-        return {"joints": rows[0]} if len(rows) == 1 else {"joint_set": rows}
-    return {"pose": {"frame": goal.frame, **pose_entry(goal.T_base_frame)}}
-
-
-def _goal(data: object) -> JointGoal | PoseGoal:
-    if not isinstance(data, dict) or len(data) != 1:
-        raise InputError(f"goal is {shown(data)}; it must be one of joints, joint_set and pose")
-    [(kind, value)] = data.items()
-    if kind not in GOALS:
-        raise unknown_name("field of goal:", kind, GOALS)
-    if kind == "pose":
-        pose = check_fields("goal.pose", value, ("frame", "xyz", "wxyz"))
-        xyz = vector("goal.pose", "xyz", pose["xyz"], 3)
-        rotation = rotation_from_quaternion(unit_quaternion("goal.pose", pose["wxyz"]))
-        return PoseGoal(pose["frame"], transform(xyz, rotation))  # type: ignore[arg-type]
-    array = numbers(value)
-    if array is None or array.ndim != (1 if kind == "joints" else 2):
-        form = "a list of numbers" if kind == "joints" else "a list of configurations of one length"
-        raise InputError(f"goal.{kind} is {shown(value)}; it must be {form}")
-    return JointGoal(array)

@@ -31,7 +31,7 @@ def moved(shape: Any, T: Float[ndarray, "4 4"]) -> Any:
             at = T @ pose(shape)
             return replace(shape, center=at[:3, 3], wxyz=quaternion_from_rotation(at[:3, :3]))
         case Mesh():
-            at = T @ transform(shape.xyz, rotation_from_quaternion(shape.wxyz))
+            at = T @ placed(shape)
             return replace(shape, xyz=at[:3, 3], wxyz=quaternion_from_rotation(at[:3, :3]))
         case PointCloud():
             return replace(shape, points=shape.points @ T[:3, :3].T + T[:3, 3], file=None)
@@ -39,27 +39,38 @@ def moved(shape: Any, T: Float[ndarray, "4 4"]) -> Any:
             raise InputError(f"a {shape.kind} cannot be moved; write it as a mesh")
 
 
+def placed(shape: Shape) -> Float[ndarray, "4 4"]:
+    """Where a shape stands; InputError for a cloud of points, which has no frame of its own."""
+    match shape:
+        case Sphere():
+            return transform(shape.center)
+        case Box() | Cylinder() | Capsule():
+            return pose(shape)
+        case Mesh():
+            return transform(shape.xyz, rotation_from_quaternion(shape.wxyz))
+        case _:
+            raise InputError(
+                f"{shape.name!r} is a {shape.kind}; it must be one of sphere, box, cylinder, capsule and mesh"
+            )
+
+
 def solid(shape: Shape) -> tuple[Float[ndarray, "4 4"], tuple[ConvexMesh, ...]]:
     """Where a shape stands, and convex meshes in its own frame that hold it: exactly a box, else polyhedra
     around it. InputError for a cloud of points."""
+    T = placed(shape)
     match shape:
         case Sphere():
-            return transform(shape.center), (_rounded(shape.radius, 0.0),)
+            return T, (_rounded(shape.radius, 0.0),)
         case Capsule():
-            return pose(shape), (_rounded(shape.radius, shape.height),)
+            return T, (_rounded(shape.radius, shape.height),)
         case Cylinder():
-            return pose(shape), (_prism(shape.radius, shape.height),)
+            return T, (_prism(shape.radius, shape.height),)
         case Box():
             corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-            return pose(shape), (convex_hull(corners * shape.size / 2),)
-        case Mesh():
-            T = transform(shape.xyz, rotation_from_quaternion(shape.wxyz))
-            return T, _parts(shape.vertices.tobytes(), shape.faces.tobytes())
+            return T, (convex_hull(corners * shape.size / 2),)
         case _:
-            raise InputError(
-                f"a robot cannot hold the {shape.kind} {shape.name!r}; it must be one of sphere, box, "
-                "cylinder, capsule and mesh"
-            )
+            assert isinstance(shape, Mesh)
+            return T, _parts(shape.vertices.tobytes(), shape.faces.tobytes())
 
 
 @lru_cache(maxsize=64)
