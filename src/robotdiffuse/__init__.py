@@ -14,8 +14,9 @@ if TYPE_CHECKING:
     from robotdiffuse.planners import plan as plan
     from robotdiffuse.planners.many import plan_many as plan_many
     from robotdiffuse.problems.files import load_problem as load_problem
-    from robotdiffuse.problems.problem import JointGoal as JointGoal
-    from robotdiffuse.problems.problem import PoseGoal as PoseGoal
+    from robotdiffuse.problems.goals import AnyGoal as AnyGoal
+    from robotdiffuse.problems.goals import JointGoal as JointGoal
+    from robotdiffuse.problems.goals import PoseGoal as PoseGoal
     from robotdiffuse.problems.problem import Problem as Problem
     from robotdiffuse.results import PlanResult as PlanResult
     from robotdiffuse.results import load_result as load_result
@@ -43,8 +44,9 @@ _HOME = {
     "load_planner": "robotdiffuse.planners",
     "plan": "robotdiffuse.planners",
     "plan_many": "robotdiffuse.planners.many",
-    "JointGoal": "robotdiffuse.problems.problem",
-    "PoseGoal": "robotdiffuse.problems.problem",
+    "AnyGoal": "robotdiffuse.problems.goals",
+    "JointGoal": "robotdiffuse.problems.goals",
+    "PoseGoal": "robotdiffuse.problems.goals",
     "Problem": "robotdiffuse.problems.problem",
     "load_problem": "robotdiffuse.problems.files",
     "load_robot": "robotdiffuse.robots",

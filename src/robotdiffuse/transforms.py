@@ -56,6 +56,16 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Float[ndarray, "
     )
 
 
+def rpy_from_rotation(rotation: Float[ndarray, "3 3"]) -> tuple[float, float, float]:
+    """URDF's roll, pitch, yaw of a rotation matrix, pitch within a quarter turn; in gimbal lock with roll
+    0."""
+    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
+    if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:
+        return 0.0, float(pitch), float(np.arctan2(-rotation[0, 1], rotation[1, 1]))
+    roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+    return float(roll), float(pitch), float(np.arctan2(rotation[1, 0], rotation[0, 0]))
+
+
 def rotation_about(axis: Float[ndarray, "3"], angle: float) -> Float[ndarray, "3 3"]:
     """Rotation by an angle [rad] about a unit axis (Rodrigues)."""
     x, y, z = axis

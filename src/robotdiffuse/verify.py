@@ -6,19 +6,22 @@ judge knows nothing of planners.
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from numba import njit
 from numpy import ndarray
 
 from robotdiffuse.collision.hulls import describe_contact
 from robotdiffuse.collision.motion import Contact, ContinuousCollision
 from robotdiffuse.errors import InputError
-from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Bound, Natural, NotNegative, Positive, Settings
-from robotdiffuse.transforms import rotation_angle
+from robotdiffuse.transforms import inverse, rotation_angle, rpy_from_rotation
 from robotdiffuse.types import Path, Trajectory
 
 
@@ -39,6 +42,10 @@ class VerifySettings(Settings, name="verify"):
     """Largest distance from the position of a goal pose [m] (the paper's 1 cm)."""
     goal_angle: NotNegative = float(np.radians(15))
     """Largest angle from the orientation of a goal pose [rad] (the paper's 15 degrees)."""
+    goal_slack: NotNegative = 1e-5
+    """Tolerances that a pose states may be exceeded by this [m] or [rad]."""
+    rest: NotNegative = 1e-6
+    """A motion stands still where no joint is faster than this [rad/s] or [m/s]."""
     rate_slack: NotNegative = 0.01
     """Share by which a trajectory may exceed velocity and acceleration limits."""
     jump: Positive = 1.5
@@ -61,8 +68,8 @@ class Violation:
     """The first thing along the motion that is wrong."""
 
     kind: str
-    """not_finite, start, limits, scene_collision, self_collision, twitch or goal; for trajectories also time,
-    velocity, acceleration and jump."""
+    """not_finite, start, limits, scene_collision, self_collision, twitch, waypoint or goal; for trajectories
+    also time, velocity, acceleration and jump."""
     time: float
     """Where: for a path, waypoint index plus fraction of the segment; for a trajectory, seconds."""
     message: str
@@ -135,7 +142,8 @@ class Verifier:
             at = float(trajectory.times[backwards[0] + 1])
             message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
             return Report(False, Violation("time", at, message), None, None)
-        return self._report(trajectory.positions, trajectory.times, self._rates(trajectory))
+        at_rest = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
+        return self._report(trajectory.positions, trajectory.times, self._rates(trajectory), at_rest)
 
     def collision_free(self, path: Path) -> bool:
         """Whether a path is certified free of collision; neither its ends nor limits are looked at."""
@@ -151,8 +159,13 @@ class Verifier:
                 f"path.positions has shape {positions.shape}; it must be n x {self.robot.dof} with n >= 1"
             )
 
-    def _report(self, q: ndarray, times: ndarray | None, found: list[Violation]) -> Report:
-        """The verdict on waypoints; `found` are violations known already. The earliest one is reported."""
+    def _report(
+        self, q: ndarray, times: ndarray | None, found: list[Violation], at_rest: ndarray | None = None
+    ) -> Report:
+        """The verdict on waypoints; `found` are violations known already. The earliest one is reported.
+
+        `at_rest`: at which rows a timed motion stands still.
+        """
         bad = np.flatnonzero(~np.isfinite(q).all(axis=1))
         if len(bad):
             at = float(bad[0] if times is None else times[bad[0]])
@@ -172,7 +185,8 @@ class Verifier:
             collision = _collision(
                 sweep.contact, float(np.interp(sweep.contact.at, np.arange(len(clock)), clock))
             )
-        every = [v for v in (first, collision, self._goal(q[-1], float(clock[-1]))) if v is not None]
+        ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
+        every = [v for v in (first, collision, *ends) if v is not None]
         violation = min(every, key=lambda v: v.time, default=None)
         valid = violation is None
         scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
@@ -238,30 +252,78 @@ class Verifier:
         return Violation("twitch", at, message, None, None, float(len(sharp) - settings.reversals))
 
     def _goal(self, end: ndarray, time: float) -> Violation | None:
-        goal, settings = self.problem.goal, self.settings
-        if isinstance(goal, JointGoal):
-            differences = goal.positions - end
-            differences -= self.robot.turns(differences)
-            off = float(np.abs(differences).max(axis=1).min(initial=np.inf))
-            if off <= settings.goal_tolerance:
-                return None
-            message = f"the motion ends {off:.3g} from the nearest goal configuration (largest joint error)"
-            return Violation("goal", time, message, None, None, off)
-        T_base_end = link_pose(self.robot, end, goal.frame)
-        distance = float(np.linalg.norm(T_base_end[:3, 3] - goal.T_base_frame[:3, 3]))
-        angle = rotation_angle(T_base_end[:3, :3].T @ goal.T_base_frame[:3, :3])
-        if distance <= settings.goal_distance and angle <= settings.goal_angle:
+        off = goal_error(self.robot, self.problem.goal, end, self.settings)
+        if off is None:
             return None
-        message = (
-            f"the motion ends with {goal.frame} {distance * 100:.2f} cm and {np.degrees(angle):.1f} degrees "
-            f"off the goal pose"
-        )
-        return Violation("goal", time, message, goal.frame, None, distance)
+        return Violation("goal", time, f"the motion ends {off.message}", off.subject, None, off.excess)
+
+    def _waypoints(self, q: ndarray, clock: ndarray, at_rest: ndarray | None) -> Violation | None:
+        """The first waypoint at which the motion does not stop after those before it."""
+        after = 0
+        for k, goal in enumerate(self.problem.waypoints):
+            rows = range(after, len(q)) if at_rest is None else after + np.flatnonzero(at_rest[after:])
+            stop = next((i for i in rows if goal_error(self.robot, goal, q[i], self.settings) is None), None)
+            if stop is None:
+                message = f"the motion does not stop at waypoints[{k}] after those before it"
+                return Violation("waypoint", float(clock[-1]), message, f"waypoints[{k}]", None, None)
+            after = int(stop)
+        return None
 
     @cached_property
     def _continuous(self) -> ContinuousCollision:
         settings = self.settings
         return ContinuousCollision(self.robot, self.problem.scene, settings.contact, settings.tightness)
+
+
+class GoalError(NamedTuple):
+    """How far a configuration is off a goal."""
+
+    message: str
+    subject: str | None
+    excess: float
+
+
+def goal_error(
+    robot: Robot, goal: Goal, q: Float[ndarray, "dof"], settings: VerifySettings = DEFAULT
+) -> GoalError | None:
+    """How far a configuration is off a goal, of several the nearest by its own measure; None at the goal."""
+    if isinstance(goal, AnyGoal):
+        errors = [goal_error(robot, one, q, settings) for one in goal.goals]
+        off = [error for error in errors if error is not None]
+        return min(off, key=lambda error: error.excess) if len(off) == len(errors) else None
+    if isinstance(goal, JointGoal):
+        differences = goal.positions - q
+        differences -= robot.turns(differences)
+        off = float(np.abs(differences).max(axis=1).min(initial=np.inf))
+        if off <= settings.goal_tolerance:
+            return None
+        return GoalError(f"{off:.3g} from the nearest goal configuration (largest joint error)", None, off)
+    T_goal_end = inverse(goal.T_base_frame) @ link_pose(robot, q, goal.frame)
+    distance, angle = float(np.linalg.norm(T_goal_end[:3, 3])), rotation_angle(T_goal_end[:3, :3])
+    xyz, rpy = goal.xyz_tolerance, goal.rpy_tolerance
+    slack = settings.goal_slack
+    there = distance <= settings.goal_distance if xyz is None else _within(T_goal_end[:3, 3], xyz, slack)
+    turned = angle <= settings.goal_angle if rpy is None else _turned(T_goal_end[:3, :3], rpy, slack)
+    if there and turned:
+        return None
+    beyond = "" if xyz is None and rpy is None else ", which is beyond its tolerances"
+    message = (
+        f"with {goal.frame} {distance * 100:.2f} cm and {np.degrees(angle):.1f} degrees off the goal "
+        f"pose{beyond}"
+    )
+    return GoalError(message, goal.frame, distance)
+
+
+def _within(values: ndarray, tolerance: ndarray, slack: float) -> bool:
+    return bool((np.abs(values) <= tolerance + slack).all())
+
+
+def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
+    """Whether roll, pitch and yaw are within the tolerance, by either of the two ways to give a rotation."""
+    roll, pitch, yaw = rpy_from_rotation(rotation)
+    other = np.array([roll + np.pi, np.pi - pitch, yaw + np.pi])
+    ways = np.array([roll, pitch, yaw]), (other + np.pi) % (2 * np.pi) - np.pi
+    return any(_within(way, tolerance, slack) for way in ways)
 
 
 @njit(cache=True)

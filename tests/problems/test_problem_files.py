@@ -178,7 +178,7 @@ WRONG: dict[str, tuple[object, str]] = {
     "empty": (None, "problem is None"),
     "unknown field": (
         GOOD | {"strat": []},
-        "unknown field of problem: 'strat'; known: clearance, goal, locked, robot, scene, start",
+        "unknown field of problem: 'strat'; known: attached, base, clearance, goal, locked, robot, scene",
     ),
     "field not a text": (GOOD | {1: 2}, "unknown field of problem: '?1'?"),
     "no start": (without("start"), "problem has no start"),
@@ -233,14 +233,14 @@ WRONG: dict[str, tuple[object, str]] = {
         GOOD | {"goal": {"joints": [9, *READY[1:]]}},
         "goal: panda_joint1 is 9 rad; its limits are -2.8",
     ),
-    "goal a list": (GOOD | {"goal": READY}, "goal is .* it must be one of joints, joint_set and pose"),
+    "goal a list": (GOOD | {"goal": READY}, "goal is .* it must be one of joints, joint_set, pose and any"),
     "unknown goal": (
         GOOD | {"goal": {"place": []}},
-        "unknown field of goal: 'place'; known: joint_set, joints",
+        "unknown field of goal: 'place'; known: any, joint_set, joints",
     ),
     "two goals": (
         GOOD | {"goal": {"joints": READY, "pose": {}}},
-        "it must be one of joints, joint_set and pose",
+        "it must be one of joints, joint_set, pose and any",
     ),
     "set as joints": (GOOD | {"goal": {"joints": [READY]}}, "goal.joints is .* it must be a list of numbers"),
     "joints as set": (GOOD | {"goal": {"joint_set": READY}}, "goal.joint_set is .* a list of configurations"),

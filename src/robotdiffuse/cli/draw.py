@@ -2,6 +2,7 @@
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,13 +22,14 @@ def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
         from robotdiffuse.viewer.html import write_replay as write
     else:
         from robotdiffuse.viewer.picture import write_picture as write
-    scene = problem.scene
     if problem.views and problem.unseen == "imagined":
         from robotdiffuse.planners.unseen import imagined_obstacles
         from robotdiffuse.scenes.scene import Scene
 
-        scene = Scene([*scene.shapes, imagined_obstacles(problem)])
-    write(problem.robot, scene, motion, file, result=result)
+        seen = Scene([*problem.scene.shapes, imagined_obstacles(problem)])
+        problem = replace(problem, scene=seen, views=())
+    robot, scene = problem.standing()
+    write(robot, scene, motion, file, result=result)
 
 
 def show(file: Path) -> None:

@@ -47,12 +47,13 @@ def run(arguments: argparse.Namespace) -> int:
     result, problem = read(arguments.result)
     if result.trajectory is None:
         raise InputError(f"{arguments.result} holds a path without times; a replay needs a trajectory")
-    done = replay(problem.robot, problem.scene, result.trajectory)
+    robot, scene = problem.standing()
+    done = replay(robot, scene, result.trajectory)
     print_replay(problem.robot.name, result.trajectory.duration, done)
     for file in outputs:
         write = write_gif if file.suffix.lower() == ".gif" else write_png
         with Console(stderr=True).status(f"drawing {file}"):
-            write(problem.robot, problem.scene, done, file)
+            write(robot, scene, done, file)
         print(f"wrote {file}")
     return 0 if done.free else 1
 

@@ -95,13 +95,8 @@ def robot_groups(robot: Robot) -> tuple[str, ...]:
 def compile_robot(robot: Robot) -> RobotArrays:
     """The arrays of a robot with its joints locked as they are."""
     groups = robot_groups(robot)
-    spheres, bounds = [], []
-    for link in groups:
-        T, local = robot.T_frame_link(link), np.asarray(robot.spheres[link], np.float64)
-        centres = local[:, :3] @ T[:3, :3].T + T[:3, 3]
-        spheres.append(np.column_stack([centres, local[:, 3]]))
-        bounds.append(_bounding_sphere(spheres[-1]))
-    clusters = [_clusters(of_group) for of_group in spheres]
+    placed = [_placed_groups(robot)[link] for link in groups]
+    spheres, clusters = [group.spheres for group in placed], [group.rows for group in placed]
     rows = [row for of_group in clusters for row in of_group]
     index = {link: i for i, link in enumerate(groups)}
     T = robot.frame_offsets
@@ -113,10 +108,10 @@ def compile_robot(robot: Robot) -> RobotArrays:
         spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
         rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [EMPTY, *rows]]),
-        row_bounds=np.array([_bounding_sphere(row) for row in rows], np.float32).reshape(-1, 4),
+        row_bounds=np.array([row for group in placed for row in group.row_bounds], np.float32).reshape(-1, 4),
         first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),
-        bounds=np.array(bounds, np.float32).reshape(-1, 4),
+        bounds=np.array([group.bounds for group in placed], np.float32).reshape(-1, 4),
         pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
         near=no_tables(),
     )
@@ -126,6 +121,30 @@ def compile_robot(robot: Robot) -> RobotArrays:
     levers = motion_radii(robot)[[rows.index(link) for link in groups]]
     found, near = tabulate(arrays, robot.lower, robot.upper, levers)
     return arrays._replace(pairs=found, near=near)
+
+
+class _Group(NamedTuple):
+    """The spheres of a link in its frame, whole and in rows, and spheres around them."""
+
+    spheres: ndarray
+    rows: list[ndarray]
+    bounds: ndarray
+    row_bounds: list[ndarray]
+
+
+@once_per_robot
+def _placed_groups(robot: Robot) -> dict[str, _Group]:
+    """By link; of a robot that holds something, the arm's own are those of the arm."""
+    placed = {} if robot.bare is None else dict(_placed_groups(robot.bare))
+    for link in robot_groups(robot):
+        if link not in placed:
+            T, local = robot.T_frame_link(link), np.asarray(robot.spheres[link], np.float64)
+            centres = local[:, :3] @ T[:3, :3].T + T[:3, 3]
+            spheres = np.column_stack([centres, local[:, 3]])
+            rows = _clusters(spheres)
+            bounds = [_bounding_sphere(row) for row in rows]
+            placed[link] = _Group(spheres, rows, _bounding_sphere(spheres), bounds)
+    return placed
 
 
 @once_per_robot

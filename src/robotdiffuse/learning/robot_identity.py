@@ -36,6 +36,8 @@ class RobotIdentity(Settings):
     @staticmethod
     @once_per_robot
     def of(robot: Robot) -> "RobotIdentity":
+        """Of the bare arm: what it holds changes nothing about its joints."""
+        robot = robot.arm
         return RobotIdentity(
             source=robot.source or robot.name,
             joint_names=robot.joint_names,

@@ -57,12 +57,17 @@ class Planner(ABC, Generic[Own]):
         velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses.
         jerk: most jerk of any joint of the timed motion [rad/s³]. None: no limit, the fastest motion.
 
-        Where cameras saw the scene, `problem.unseen` says what the rest is taken for: `planners/unseen.py`.
+        Where the problem has waypoints, the motion stops at each: `planners/legs.py`. Where cameras saw the
+        scene, `problem.unseen` says what the rest is taken for: `planners/unseen.py`.
 
         Raises InputError for arguments that are none of these, and where `prepare` does.
         """
         self.prepare(problem.robot)
         request = Request(until, clearance, velocity_scaling, acceleration_scaling, jerk)
+        if problem.waypoints:
+            from robotdiffuse.planners.legs import plan_by_waypoints
+
+            return plan_by_waypoints(self, problem, time_limit, seed, request)
         if problem.views:
             from robotdiffuse.planners.unseen import plan_beside_unseen
 
@@ -86,6 +91,7 @@ class Planner(ABC, Generic[Own]):
         first = goal.positions[:1] if isinstance(goal, JointGoal) else []
         ways = [start + share * (end - start) for end in first for share in (0.5, 0.35)]
         balls = [Sphere(link_pose(robot, q, robot.tip)[:3, 3], RADIUS) for q in ways]
+        problem = replace(problem, waypoints=())
         easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]
         calls = [*((easier, WARM_UP) for easier in easy), (problem, SLIGHT)]
         return [self.plan(task, seconds, until=until) for task, seconds in calls]

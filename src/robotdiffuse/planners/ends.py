@@ -1,5 +1,8 @@
 """Where a motion begins and may end: goals of a pose, ends that touch, and why there can be no plan."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
@@ -8,15 +11,19 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.planners.call import Call
-from robotdiffuse.problems.problem import JointGoal, PoseGoal
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
 from robotdiffuse.results import PlanResult
-from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
+from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.types import Status
 
 GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""
+POSES, OF_EACH = 60, 2
+"""Poses within the tolerances of a goal that are tried, and configurations that are looked for in each."""
+SOME_ROUNDS = InverseKinematicsSettings(max_rounds=2, patience=1)
+"""Of these: many may be out of reach."""
 END_MARGIN = 0.0005
 """What an end that is closer than the wanted clearance keeps less than it has [m]."""
 RETREAT_STEP = 0.01
@@ -170,7 +177,18 @@ def _usable_goals(call: Call, checker: CollisionChecker) -> Float[ndarray, "k do
         collision = _explained(robot, scene, start)
         if collision is not None:
             return call.fail(Status.INVALID_START, f"the start is in collision: {collision}")
-    goal = call.problem.goal
+    return _goals(call, call.problem.goal, checker)
+
+
+def _goals(call: Call, goal: Goal, checker: CollisionChecker) -> Float[ndarray, "k dof"] | PlanResult:
+    """Configurations of a goal that are free, of any of several goals; or why there are none."""
+    if isinstance(goal, AnyGoal):
+        each = [_goals(call, one, checker) for one in goal.goals]
+        found = [goals for goals in each if not isinstance(goals, PlanResult)]
+        if found:
+            return np.concatenate(found)
+        none = next(result for result in each if isinstance(result, PlanResult))
+        return replace(none, reason=f"none of {len(each)} goals can be reached, the first: {none.reason}")
     if isinstance(goal, PoseGoal):
         return _pose_goals(call, goal, checker)
     return _free_goals(call, goal, checker)
@@ -193,11 +211,11 @@ def _free_goals(
 def _pose_goals(
     call: Call, goal: PoseGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    robot, scene, rng = call.problem.robot, call.problem.scene, call.rng
-    found = inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=checker.free)
+    robot, scene = call.problem.robot, call.problem.scene
+    found = _reaching(call, goal, checker.free)
     if len(found):
         return found
-    reached = inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng)
+    reached = _reaching(call, goal, None)
     xyz = ", ".join(f"{value:.3f}" for value in goal.T_base_frame[:3, 3])
     if not len(reached):
         return call.fail(
@@ -213,6 +231,25 @@ def _pose_goals(
         f"all {len(reached)} configurations found for the pose of {goal.frame} at ({xyz}) m are in "
         f"collision, e.g. {collisions[0]}",
     )
+
+
+def _reaching(
+    call: Call, goal: PoseGoal, accept: Callable[[ndarray], ndarray] | None
+) -> Float[ndarray, "k dof"]:
+    """Configurations that bring the link to the pose; where it has tolerances, to poses within them too."""
+    robot, rng = call.problem.robot, call.rng
+    if not goal.tolerant:
+        return inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=accept)
+    found = np.zeros((0, robot.dof))
+    for i in range(POSES):
+        T_base_frame = goal.draw(rng) if i else goal.T_base_frame
+        few = inverse_kinematics(
+            robot, goal.frame, T_base_frame, OF_EACH, rng=rng, accept=accept, settings=SOME_ROUNDS
+        )
+        found = np.concatenate([found, few])
+        if len(found) >= GOAL_COUNT or call.remaining <= 0:
+            break
+    return found[:GOAL_COUNT]
 
 
 def _explained(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:

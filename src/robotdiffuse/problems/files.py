@@ -9,20 +9,33 @@ from pathlib import Path
 import yaml
 
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.problems.equipment import (
+    equipment_entries,
+    equipped,
+    pose_entry,
+    read_pose,
+    rounded,
+)
+from robotdiffuse.problems.goal_files import goal_entry, read_goal, read_waypoints
 from robotdiffuse.problems.moveit import MoveItRequest, moveit_frames, moveit_request, moveit_scene
-from robotdiffuse.problems.problem import OPTIMISTIC, JointGoal, PoseGoal, Problem, check_clearance
+from robotdiffuse.problems.problem import (
+    OPTIMISTIC,
+    JointGoal,
+    PoseGoal,
+    Problem,
+    check_clearance,
+    moved_goal,
+)
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.depth_view import DepthView
 from robotdiffuse.scenes.depth_view_files import read_views, view_entry
 from robotdiffuse.scenes.files import check_fields, read_scene, read_text, read_yaml, scene_entries
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import numbers, shown, unit_quaternion, vector
-from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.scenes.shapes import numbers, shown
 
 FIELDS = ("robot", "scene", "start", "goal")
-OPTIONAL = ("locked", "clearance", "views", "unseen")
-GOALS = ("joints", "joint_set", "pose")
+OPTIONAL = ("locked", "base", "tool", "attached", "waypoints", "clearance", "views", "unseen")
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,24 +116,25 @@ def problem_record(
                 f"robot {robot!r} is neither bundled nor read from a file; give the path of its URDF as robot"
             )
     folder = None if folder is None else Path(folder)
-    goal = problem.goal
-    if isinstance(goal, JointGoal):
-        rows = goal.positions.tolist()
-        asked: dict[str, object] = {"joints": rows[0]} if len(rows) == 1 else {"joint_set": rows}
-    else:
-        wxyz = quaternion_from_rotation(goal.T_base_frame[:3, :3]).tolist()
-        asked = {"pose": {"frame": goal.frame, "xyz": goal.T_base_frame[:3, 3].tolist(), "wxyz": wxyz}}
-    record: dict[str, object] = {
-        "robot": robot,
-        "locked": problem.robot.locked,
-        "scene": scene_entries(problem.known_scene, folder),
+    scene, goal, views, T = problem.known_scene, problem.goal, problem.views, problem.T_world_base
+    record: dict[str, object] = {"robot": robot, "locked": problem.robot.locked}
+    if T is not None:
+        scene, goal, views = scene.moved(T), moved_goal(goal, T), [view.moved(T) for view in views]
+        record["base"] = rounded(pose_entry(T))
+    as_given = rounded if T is not None else lambda data: data
+    record |= equipment_entries(problem.robot, folder)
+    record |= {
+        "scene": as_given(scene_entries(scene, folder)),
         "start": problem.start.tolist(),
-        "goal": asked,
+        "goal": as_given(goal_entry(goal)),
     }
+    if problem.waypoints:
+        way = problem.waypoints if T is None else [moved_goal(goal, T) for goal in problem.waypoints]
+        record["waypoints"] = as_given([goal_entry(goal) for goal in way])
     if problem.clearance is not None:
         record["clearance"] = problem.clearance
-    if problem.views:
-        record["views"] = [view_entry(view, folder) for view in problem.views]
+    if views:
+        record["views"] = as_given([view_entry(view, folder) for view in views])
     if problem.unseen != OPTIMISTIC:
         record["unseen"] = problem.unseen
     return record
@@ -248,22 +262,35 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
             "problem", data, ("robot", "scene", "request") if requested else FIELDS, OPTIONAL
         )
         robot = _robot(values["robot"], values.get("locked", {}), folder)
+        robot, notes = equipped(robot, values.get("tool"), values.get("attached"), folder)
+        base = read_pose("base", values["base"]) if "base" in values else None
+        if base is not None and (requested or isinstance(values["scene"], str)):
+            raise InputError(
+                "base is for scenes in the file itself: MoveIt scenes say where their robot stands"
+            )
         clearance = check_clearance("clearance", values["clearance"]) if "clearance" in values else None
-        frames, notes = moveit_frames({}, robot), ()
+        frames = moveit_frames({}, robot)
         if isinstance(values["scene"], str):
             file = folder / values["scene"]
             content = read_yaml(file)
             frames = moveit_frames(content, robot)
             scene = moveit_scene(content, frames, file.parent)
         else:
-            scene, notes = read_scene(values["scene"], folder)
+            scene, more = read_scene(values["scene"], folder)
+            notes += more
         views, more = read_views(values.get("views", []), folder)
         unseen = values.get("unseen", OPTIMISTIC)
+        if requested and "waypoints" in values:
+            raise InputError("waypoints are for goals in the file itself, not beside a request")
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames)
             return _requested(robot, scene, request, clearance, views, unseen)
-        goal, notes = _goal(values["goal"]), (*notes, *more)
-        return Problem(robot, scene, values["start"], goal, notes, clearance, views, unseen)
+        goal, notes = read_goal("goal", values["goal"], scene), (*notes, *more)
+        asked = robot, scene, values["start"], goal, notes, clearance, views, unseen
+        way = read_waypoints(values.get("waypoints", []), scene)
+        if base is None:
+            return Problem(*asked, waypoints=way)
+        return Problem.in_world(base, *asked, waypoints=way)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
@@ -284,21 +311,3 @@ def _robot(name: object, locked: object, folder: Path) -> Robot:
             raise InputError(f"locked: {shown(joint)} is {shown(value)}; it must be a number")
         values[joint] = float(array)
     return load_robot(name, locked=values)
-
-
-def _goal(data: object) -> JointGoal | PoseGoal:
-    if not isinstance(data, dict) or len(data) != 1:
-        raise InputError(f"goal is {shown(data)}; it must be one of joints, joint_set and pose")
-    [(kind, value)] = data.items()
-    if kind not in GOALS:
-        raise unknown_name("field of goal:", kind, GOALS)
-    if kind == "pose":
-        pose = check_fields("goal.pose", value, ("frame", "xyz", "wxyz"))
-        xyz = vector("goal.pose", "xyz", pose["xyz"], 3)
-        rotation = rotation_from_quaternion(unit_quaternion("goal.pose", pose["wxyz"]))
-        return PoseGoal(pose["frame"], transform(xyz, rotation))  # type: ignore[arg-type]
-    array = numbers(value)
-    if array is None or array.ndim != (1 if kind == "joints" else 2):
-        form = "a list of numbers" if kind == "joints" else "a list of configurations of one length"
-        raise InputError(f"goal.{kind} is {shown(value)}; it must be {form}")
-    return JointGoal(array)

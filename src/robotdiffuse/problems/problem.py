@@ -13,15 +13,18 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.problems.goals import AnyGoal as AnyGoal
+from robotdiffuse.problems.goals import Goal, check_pose, moved_goal
+from robotdiffuse.problems.goals import JointGoal as JointGoal
+from robotdiffuse.problems.goals import PoseGoal as PoseGoal
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import numbers, shown
+from robotdiffuse.transforms import inverse
 
 LIMIT_SLACK = 1e-5
 """Configurations that exceed a joint limit by no more than this are clamped, with a note [rad]."""
-RIGID_SLACK = 1e-4
-"""How far the rotation part of a pose may be from orthonormal, by entry."""
 OPTIMISTIC, PADDED, IMAGINED, OCCUPIED = "optimistic", "padded", "imagined", "occupied"
 UNSEEN = (OPTIMISTIC, PADDED, IMAGINED, OCCUPIED)
 """What space that no view saw is taken for: free; free but near what was seen; as the completing network
@@ -30,58 +33,9 @@ imagines it; occupied. See `planners/unseen.py`."""
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class JointGoal:
-    """Any of these configurations (one row each)."""
-
-    positions: Float[ndarray, "n dof"]
-
-    def __post_init__(self) -> None:
-        positions = numbers(self.positions)
-        if positions is None or positions.ndim not in (1, 2) or positions.size == 0:
-            raise InputError(
-                f"goal is {shown(self.positions)}; it must be a configuration or a list of them of one length"
-            )
-        object.__setattr__(self, "positions", np.atleast_2d(positions))
-
-    if TYPE_CHECKING:
-
-        def __init__(self, positions: ArrayLike) -> None: ...
-
-
-@no_type_check
-@dataclass(frozen=True, eq=False)
-class PoseGoal:
-    """A pose of a link; the path must end within 1 cm and 15 degrees of it (the paper's tolerances)."""
-
-    frame: str
-    """Name of the link."""
-    T_base_frame: Float[ndarray, "4 4"]
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.frame, str):
-            raise InputError(f"goal.frame is {shown(self.frame)}; it must be the name of a link")
-        T = numbers(self.T_base_frame)
-        if T is None or T.shape != (4, 4) or not np.isfinite(T).all():
-            raise InputError(
-                f"goal.T_base_frame is {shown(self.T_base_frame)}; it must be 4 x 4 finite numbers"
-            )
-        rotation = T[:3, :3]
-        orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
-        if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():
-            raise InputError(
-                f"goal.T_base_frame is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1"
-            )
-        object.__setattr__(self, "T_base_frame", T)
-
-    if TYPE_CHECKING:
-
-        def __init__(self, frame: str, T_base_frame: ArrayLike) -> None: ...
-
-
-@no_type_check
-@dataclass(frozen=True, eq=False)
 class Problem:
-    """`goal` may be given as a configuration, a list of them, a JointGoal or a PoseGoal.
+    """`goal` may be given as a configuration, a list of them, a JointGoal or a PoseGoal, or a list of those,
+    of which any is to be reached; so may each of the waypoints.
 
     Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note; those of continuous joints are
     kept as they are, and whole turns of a goal do not matter. Raises InputError for everything else that no
@@ -94,7 +48,7 @@ class Problem:
     robot: Robot
     scene: Scene
     start: Float[ndarray, "dof"]
-    goal: JointGoal | PoseGoal
+    goal: Goal
     notes: tuple[str, ...] = ()
     """What was changed in the input, e.g. a start clamped to a limit."""
     clearance: float | None = None
@@ -104,6 +58,11 @@ class Problem:
     """Pictures that depth cameras took of the scene."""
     unseen: str = OPTIMISTIC
     """What space that no view saw is taken for, one of UNSEEN; of no account without views."""
+    T_world_base: Float[ndarray, "4 4"] | None = None
+    """Where the base stands in the world, for files and pictures: scene, goal and views are in the base's
+    frame all the same. `in_world` takes them in the world's. None: the base's frame is the world's."""
+    waypoints: tuple[Goal, ...] = ()
+    """Where the motion stops on its way, in this order."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
@@ -114,23 +73,18 @@ class Problem:
             raise InputError(f"scene is {shown(self.scene)}; it must be a Scene, e.g. rd.Scene([shape, ...])")
         notes = list(self.notes)
         start = _configuration(self.robot, "start", self.start, notes)
-        goal = self.goal
-        if isinstance(goal, PoseGoal):
-            moved = [link for link in self.robot.link_names if self.robot.link_frame(link) > 0]
-            if goal.frame not in self.robot.link_names:
-                raise unknown_name("link in goal.frame:", goal.frame, moved)
-            if goal.frame not in moved:
-                raise InputError(
-                    f"goal.frame {goal.frame!r} is moved by no planned joint; these are: {', '.join(moved)}"
-                )
-        else:
-            rows = goal.positions if isinstance(goal, JointGoal) else JointGoal(goal).positions
-            fields = ["goal"] if len(rows) == 1 else [f"goal[{i}]" for i in range(len(rows))]
-            goal = JointGoal(
-                np.stack([_configuration(self.robot, *row, notes) for row in zip(fields, rows, strict=True)])
-            )
+        goal = _goal(self.robot, "goal", self.goal, notes)
+        if not isinstance(self.waypoints, list | tuple):
+            raise InputError(f"waypoints is {shown(self.waypoints)}; it must be a list of goals")
+        fields = (f"waypoints[{i}]" for i in range(len(self.waypoints)))
+        waypoints = tuple(_goal(self.robot, *of, notes) for of in zip(fields, self.waypoints, strict=True))
         views = _views(self.robot, self.views)
+        if views and waypoints:
+            raise InputError("waypoints cannot be had beside views: plan from one to the next")
         check_unseen("unseen", self.unseen)
+        T_world_base = self.T_world_base
+        if T_world_base is not None:
+            T_world_base = check_pose("T_world_base", T_world_base)
         scene = self.scene
         if views:
             from robotdiffuse.problems.seen import seen_shapes  # compiled code, which only views need
@@ -144,6 +98,8 @@ class Problem:
             "goal": goal,
             "notes": tuple(notes),
             "views": views,
+            "T_world_base": T_world_base,
+            "waypoints": waypoints,
         }.items():
             object.__setattr__(self, key, value)
 
@@ -154,12 +110,48 @@ class Problem:
             robot: Robot,
             scene: Scene,
             start: ArrayLike,
-            goal: ArrayLike | JointGoal | PoseGoal,
+            goal: ArrayLike | Goal | Sequence[JointGoal | PoseGoal],
             notes: tuple[str, ...] = (),
             clearance: float | None = None,
             views: Sequence[DepthView] = (),
             unseen: str = OPTIMISTIC,
+            T_world_base: ArrayLike | None = None,
+            waypoints: Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]] = (),
         ) -> None: ...
+
+    @classmethod
+    def in_world(
+        cls,
+        T_world_base: ArrayLike,
+        robot: Robot,
+        scene: Scene,
+        start: ArrayLike,
+        goal: "ArrayLike | Goal | Sequence[JointGoal | PoseGoal]",
+        notes: tuple[str, ...] = (),
+        clearance: float | None = None,
+        views: "Sequence[DepthView]" = (),
+        unseen: str = OPTIMISTIC,
+        waypoints: "Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]]" = (),
+    ) -> "Problem":
+        """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views and
+        the poses of goals are given.
+
+        They are moved into the base's frame, where planning is. Raises InputError as the constructor does.
+        """
+        T = check_pose("T_world_base", T_world_base)
+        T_base_world = inverse(T)
+        goal = moved_goal(goal, T_base_world)
+        waypoints = [moved_goal(waypoint, T_base_world) for waypoint in waypoints]
+        if isinstance(scene, Scene):
+            scene = scene.moved(T_base_world)
+        views = tuple(view.moved(T_base_world) if isinstance(view, DepthView) else view for view in views)
+        return cls(robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints)
+
+    def standing(self) -> tuple[Robot, Scene]:
+        """Robot and scene as they stand in the world, for pictures and simulators: the robot's base is the
+        world then."""
+        T = self.T_world_base
+        return (self.robot, self.scene) if T is None else (self.robot.standing(T), self.scene.moved(T))
 
     @property
     def known_scene(self) -> Scene:
@@ -196,6 +188,28 @@ def _views(robot: Robot, views: object) -> tuple[DepthView, ...]:
                 f"{robot.dof} planned joints: {', '.join(robot.joint_names)}"
             )
     return tuple(views)
+
+
+def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
+    """The goal as one of its classes, its configurations within limits."""
+    if isinstance(goal, list | tuple) and any(isinstance(one, JointGoal | PoseGoal) for one in goal):
+        goal = AnyGoal(tuple(goal))
+    if isinstance(goal, AnyGoal):
+        fields = (f"{field}.goals[{i}]" for i in range(len(goal.goals)))
+        each = [_goal(robot, *of, notes) for of in zip(fields, goal.goals, strict=True)]
+        return AnyGoal(tuple(each))  # type: ignore[arg-type]
+    if isinstance(goal, PoseGoal):
+        moved = [link for link in robot.link_names if robot.link_frame(link) > 0]
+        if goal.frame not in robot.link_names:
+            raise unknown_name(f"link in {field}.frame:", goal.frame, moved)
+        if goal.frame not in moved:
+            raise InputError(
+                f"{field}.frame {goal.frame!r} is moved by no planned joint; these are: {', '.join(moved)}"
+            )
+        return goal
+    rows = goal.positions if isinstance(goal, JointGoal) else JointGoal(goal).positions  # type: ignore[arg-type]
+    fields = [field] if len(rows) == 1 else [f"{field}[{i}]" for i in range(len(rows))]
+    return JointGoal(np.stack([_configuration(robot, *row, notes) for row in zip(fields, rows, strict=True)]))
 
 
 def _configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:

@@ -33,6 +33,8 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     axis is convex, hence the support function, that of the convex hull, loses nothing.
     """
     links = [link for link in robot.link_names if link in robot.spheres]
+    known = motion_radii(robot.bare) if robot.bare is not None else np.zeros((0, robot.dof))
+    links = links[len(known) :]  # what is attached comes last
     frames = np.array([robot.link_frame(link) for link in links], dtype=int)
     radii = np.zeros((len(links), robot.dof))
     directions = _directions()
@@ -60,11 +62,12 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
             sagitta = ARC_SAGITTA * np.linalg.norm(directions[..., :2], axis=-1)
             h = _turned(h, lower, upper) + sagitta * r[:, None, None]
         offset = robot.frame_offsets[j]
-        corners, weights, residual = _interpolation(directions @ offset[:3, :3])
+        corners, weights, residual = _carried(robot.arm)[j] if robot.attached else _carry(robot, j)
         values = h.reshape(len(moved), -1)
         h = (values[:, corners] * weights).sum(1) + residual * r[:, None]
         support[moved] = h.reshape(-1, ROWS, COLUMNS) + directions @ offset[:3, 3]
         farthest[moved] = r + np.linalg.norm(offset[:3, 3])
+    radii = np.concatenate([known, radii])
     radii.setflags(write=False)
     return radii
 
@@ -83,6 +86,20 @@ def _directions() -> Float[ndarray, "rows columns 3"]:
     )
 
 
+_Carry = tuple[Int[ndarray, "4 n"], Float[ndarray, "4 n"], Float[ndarray, "n"]]
+
+
+def _carry(robot: Robot, j: int) -> _Carry:
+    """How support functions are carried inwards over the offset of joint j."""
+    return _interpolation(_directions() @ robot.frame_offsets[j][:3, :3])
+
+
+@once_per_robot
+def _carried(robot: Robot) -> tuple[_Carry, ...]:
+    """Of all joints; kept only of arms that hold something, for each new object asks for them (1 MB each)."""
+    return tuple(_carry(robot, j) for j in range(robot.dof))
+
+
 def _turned(
     support: Float[ndarray, "n rows columns"], lower: float, upper: float
 ) -> Float[ndarray, "n rows columns"]:
@@ -98,9 +115,7 @@ def _turned(
     return out
 
 
-def _interpolation(
-    directions: Float[ndarray, "rows columns 3"],
-) -> tuple[Int[ndarray, "4 n"], Float[ndarray, "4 n"], Float[ndarray, "n"]]:
+def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Carry:
     """Grid corners around each direction, weights that sum to one, and the length of what they leave over."""
     u = directions.reshape(-1, 3)
     row = (np.arcsin(np.clip(u[:, 2], -1, 1)) + np.pi / 2) / STEP

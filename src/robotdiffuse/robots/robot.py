@@ -1,15 +1,16 @@
 """Robot: a serial arm as plain data, in the form that kinematics and collision checking share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache, wraps
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
 from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
@@ -63,14 +64,6 @@ class Joint:
         return transform(np.zeros(3), rotation_about(self.axis, q))
 
 
-@dataclass(frozen=True, eq=False)
-class ConvexMesh:
-    """A convex polyhedron in the frame of its link [m]."""
-
-    vertices: Float[ndarray, "v 3"]
-    faces: Int[ndarray, "f 3"]
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot:
     """A serial arm: the joints between base and tip that are not locked are planned.
@@ -104,6 +97,10 @@ class Robot:
     """Named poses of an SRDF, values by joint [rad] or [m]."""
     source: str | None = None
     """The file or the name that `load_robot` got, unless bundled: how problem files name the robot."""
+    attached: tuple[Attached, ...] = ()
+    """A tool and objects that are held; each is a link too."""
+    bare: "Robot | None" = None
+    """The robot without these; None if there are none. See `arm`."""
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
@@ -242,7 +239,62 @@ class Robot:
                     f"locked: {name} is {value:g}; it follows {mimic.joint}, which puts it at "
                     f"{held[name]:g}; lock {mimic.joint}"
                 )
-        return _variant(self.unlocked, tuple(sorted(held.items()))) if held != self.locked else self
+        if held == self.locked:
+            return self
+        if self.attached:
+            from robotdiffuse.robots.attached import attached_again
+
+            return attached_again(self.arm.with_locked(locked), self.attached)
+        return _variant(self.unlocked, tuple(sorted(held.items())))
+
+    @property
+    def arm(self) -> "Robot":
+        """The robot without tool and held objects."""
+        return self.bare or self
+
+    def attach(self, shape: Rigid, link: str, touch_links: Sequence[str] = ()) -> "Robot":
+        """The robot holding a shape, whose pose is given in the frame of the link.
+
+        It becomes a link of the shape's name, so that goals may name it: with the arm it is kept clear of
+        obstacles and of all links, but for those that move with it and `touch_links`. A curved shape is taken
+        as a polyhedron around it, at most 2 % of its radius larger. Raises InputError for unknown links, a
+        link that no planned joint moves, a name that is taken, and a cloud of points.
+        """
+        from robotdiffuse.robots.attached import holding
+
+        return holding(self, shape, link, touch_links)
+
+    def detach(self, name: str) -> "Robot":
+        """The robot without a held object or tool; InputError if it has none of that name."""
+        from robotdiffuse.robots.attached import detach
+
+        return detach(self, name)
+
+    def with_tool(
+        self,
+        link: str,
+        T_link_tool: Float[ndarray, "4 4"],
+        shapes: Sequence[Rigid] = (),
+        touch_links: Sequence[str] = (),
+        name: str = TOOL,
+    ) -> "Robot":
+        """The robot with a tool on a link: a frame that goals may name, and shapes in the frame of the link.
+
+        The tool is the new tip if it is behind all planned joints. Shapes are as in `attach`.
+        """
+        from robotdiffuse.robots.attached import with_tool
+
+        return with_tool(self, link, T_link_tool, shapes, touch_links, name)
+
+    def standing(self, T_world_base: Float[ndarray, "4 4"]) -> "Robot":
+        """The robot as it stands in the world, which is its base then: for pictures and simulators."""
+        name = "world"
+        while name in self.link_names:
+            name += "_"
+        axis = np.array([0.0, 0.0, 1.0])
+        ground = Joint(f"{name}_to_{self.base}", "fixed", name, self.base, T_world_base, axis)
+        bare = None if self.bare is None else self.bare.standing(T_world_base)
+        return replace(self, base=name, joints=(ground, *self.joints), root="", above={}, bare=bare)
 
     @property
     def unlocked(self) -> "Robot":
@@ -265,6 +317,7 @@ class Robot:
             f"  locked  {held}{more}" if held else "",
             f"  {spheres} spheres on {len(self.spheres)} of {len(self.link_names)} links, "
             f"{len(self.checked_pairs())} checked pairs of links",
+            f"  holds   {', '.join(body.name for body in self.attached)}" if self.attached else "",
             f"  {len(self.notes)} notes: robot.notes" if self.notes else "",
         ]
         return "\n".join(line for line in lines if line)

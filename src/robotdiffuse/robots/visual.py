@@ -14,6 +14,8 @@ UNIT = 5e-5
 AGREEMENT = 0.03
 """A visual mesh is used only if its bounding box is this close to that of the collision geometry [m]."""
 PLAIN = (236, 238, 240)
+HELD, TOOL = (0xD9, 0x7B, 0x5C), (176, 182, 190)
+"""What a robot holds is drawn in the colour of an obstacle, a tool like metal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +35,9 @@ def load_visual(robot: Robot) -> dict[str, tuple[VisualMesh, ...]]:
     """
     bundled = _read_bundled(robot.name)
     drawn: dict[str, tuple[VisualMesh, ...]] = {}
+    colors = {body.name: TOOL if body.tool else HELD for body in robot.attached}
     for link in robot.link_names:
-        collision = _collision_geometry(robot, link)
+        collision = _collision_geometry(robot, link, colors.get(link, PLAIN))
         visual = bundled.get(link)
         if visual is not None and (not collision or _agree(visual, collision)):
             drawn[link] = (visual,)
@@ -43,19 +46,19 @@ def load_visual(robot: Robot) -> dict[str, tuple[VisualMesh, ...]]:
     return drawn
 
 
-def _collision_geometry(robot: Robot, link: str) -> tuple[VisualMesh, ...]:
+def _collision_geometry(robot: Robot, link: str, color: tuple[int, int, int]) -> tuple[VisualMesh, ...]:
     if robot.meshes.get(link):
-        return tuple(_plain(mesh.vertices, mesh.faces) for mesh in robot.meshes[link])
+        return tuple(_plain(mesh.vertices, mesh.faces, color) for mesh in robot.meshes[link])
     if len(robot.spheres.get(link, ())) == 0:
         return ()
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions=3)
-    return tuple(_plain(s[:3] + s[3] * ball.vertices, ball.faces) for s in robot.spheres[link])
+    return tuple(_plain(s[:3] + s[3] * ball.vertices, ball.faces, color) for s in robot.spheres[link])
 
 
-def _plain(vertices: ndarray, faces: ndarray) -> VisualMesh:
-    colors = np.tile(np.array(PLAIN, np.uint8), (len(faces), 1))
+def _plain(vertices: ndarray, faces: ndarray, color: tuple[int, int, int]) -> VisualMesh:
+    colors = np.tile(np.array(color, np.uint8), (len(faces), 1))
     return VisualMesh(np.asarray(vertices, np.float64), np.asarray(faces, np.int64), colors)
 
 

@@ -3,7 +3,7 @@
 As with shapes, the constructor checks its arguments itself: see `no_type_check` in shapes.py.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, no_type_check
 
 import numpy as np
@@ -95,6 +95,11 @@ class DepthView:
         fx, fy, cx, cy = self.intrinsics
         in_camera = np.stack([(columns - cx) / fx * z, (rows - cy) / fy * z, z], axis=1)
         return in_camera @ self.T_base_camera[:3, :3].T + self.T_base_camera[:3, 3]
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "DepthView":
+        """The view with camera and points after a rigid motion."""
+        cloud = None if self.cloud is None else self.cloud @ T[:3, :3].T + T[:3, 3]
+        return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud)
 
     @classmethod
     def from_cloud(

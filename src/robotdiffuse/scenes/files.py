@@ -81,7 +81,7 @@ def check_fields(
     return data
 
 
-def read_scene(entries: object, folder: Path) -> tuple[Scene, tuple[str, ...]]:
+def read_scene(entries: object, folder: Path, field: str = "scene") -> tuple[Scene, tuple[str, ...]]:
     """A scene from the list in a problem file, and notes on what was changed in it.
 
     Files are looked up from `folder`. Raises InputError for an unknown shape or field, for values of the
@@ -89,12 +89,13 @@ def read_scene(entries: object, folder: Path) -> tuple[Scene, tuple[str, ...]]:
     """
     if not isinstance(entries, list):
         raise InputError(
-            f"scene is {shown(entries)}; it must be a list of shapes or the name of a MoveIt scene file"
+            f"{field} is {shown(entries)}; it must be a list of shapes"
+            + (" or the name of a MoveIt scene file" if field == "scene" else "")
         )
     shapes: list[Shape] = []
     notes: list[str] = []
     for i, entry in enumerate(entries):
-        where = f"scene[{i}]"
+        where = f"{field}[{i}]"
         if not isinstance(entry, dict) or len(entry) != 1:
             raise InputError(
                 f"{where} is {shown(entry)}; it must be one shape, e.g. {{sphere: {{...}}}}; "

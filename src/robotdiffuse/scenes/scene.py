@@ -1,12 +1,19 @@
 """Scene: the obstacles around a robot."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
 from typing import no_type_check
 
-from robotdiffuse.errors import InputError
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Shape
+from robotdiffuse.transforms import inverse
 
 
 @no_type_check
@@ -30,3 +37,36 @@ class Scene:
             taken.add(name)
             named.append(shape if name == shape.name else dataclass_replace(shape, name=name))  # type: ignore[type-var]
         object.__setattr__(self, "shapes", tuple(named))
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "Scene":
+        """The scene after a rigid motion."""
+        return Scene([shape.moved(T) for shape in self.shapes])
+
+    def attach(
+        self,
+        name: str,
+        robot: Robot,
+        q: Float[ndarray, "dof"],
+        link: str | None = None,
+        touch_links: Sequence[str] = (),
+    ) -> tuple["Scene", Robot]:
+        """The scene without an obstacle that the robot takes up at a configuration, and the robot holding it.
+
+        `link` is what it is fixed to, by default the robot's tip; `touch_links` as of `Robot.attach`. Raises
+        InputError for an unknown obstacle, and where `Robot.attach` does.
+        """
+        names = [shape.name for shape in self.shapes]
+        if name not in names:
+            raise unknown_name("obstacle to attach:", name, names)
+        link = robot.tip if link is None else link
+        robot.link_frame(link)  # an unknown one is an error that lists those that there are
+        held = self.shapes[names.index(name)].moved(inverse(link_pose(robot, np.asarray(q, float), link)))
+        return Scene([s for s in self.shapes if s.name != name]), robot.attach(held, link, touch_links)
+
+    def detach(self, name: str, robot: Robot, q: Float[ndarray, "dof"]) -> tuple["Scene", Robot]:
+        """The scene with an object that the robot lets go of at a configuration, and the robot without it."""
+        freed = robot.detach(name)
+        [body] = [body for body in robot.attached if body.name == name]
+        T_base_link = link_pose(robot, np.asarray(q, float), body.link)
+        left = [shape.moved(T_base_link) for shape in body.shapes if isinstance(shape, Shape)]
+        return Scene([*self.shapes, *left]), freed

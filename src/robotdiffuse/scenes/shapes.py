@@ -15,6 +15,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.point_cloud import voxel_thin
 from robotdiffuse.transforms import rotation_from_quaternion, transform
 
@@ -83,6 +84,18 @@ class Shape(ABC):
     @abstractmethod
     def bounds(self) -> Float[ndarray, "2 3"]:
         """Least and greatest corner of an axis-aligned box that holds the shape [m]."""
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+        """The shape after a rigid motion."""
+        from robotdiffuse.scenes.solids import moved
+
+        return moved(self, T)
+
+    def solid(self) -> tuple[Float[ndarray, "4 4"], tuple[ConvexMesh, ...]]:
+        """Where it stands, and convex meshes in its own frame that hold it, for a robot that holds it."""
+        from robotdiffuse.scenes.solids import solid
+
+        return solid(self)
 
 
 class Triangulated(Shape):

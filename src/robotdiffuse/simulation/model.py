@@ -9,6 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.robots.visual import VisualMesh, load_visual
+from robotdiffuse.transforms import rpy_from_rotation
 
 LEAST_MASS, LEAST_INERTIA = 0.01, 1e-4
 """Of links without geometry, or next to none [kg], [kg m^2]: PyBullet cannot move a link without mass."""
@@ -152,22 +153,13 @@ def _add_joint(root: Xml.Element, joint: Joint, planned: bool) -> None:
     Xml.SubElement(element, "parent", link=joint.parent)
     Xml.SubElement(element, "child", link=joint.child)
     T = joint.T_parent_joint
-    Xml.SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(_rpy(T[:3, :3])))
+    Xml.SubElement(element, "origin", xyz=_numbers(T[:3, 3]), rpy=_numbers(rpy_from_rotation(T[:3, :3])))
     if joint.kind in MOVING_KINDS:
         Xml.SubElement(element, "axis", xyz=_numbers(joint.axis))
         # to Bullet, a lower limit above the upper one means none
         lower, upper = (joint.lower, joint.upper) if planned else (1.0, -1.0)
         limits = {"lower": lower, "upper": upper, "velocity": 1.0, "effort": 1.0}
         Xml.SubElement(element, "limit", {key: _numbers([value]) for key, value in limits.items()})
-
-
-def _rpy(rotation: Float[ndarray, "3 3"]) -> tuple[float, float, float]:
-    """URDF's roll, pitch, yaw of a rotation matrix; in gimbal lock with roll 0."""
-    pitch = np.arctan2(-rotation[2, 0], np.hypot(rotation[0, 0], rotation[1, 0]))
-    if np.hypot(rotation[0, 0], rotation[1, 0]) < 1e-9:
-        return 0.0, float(pitch), float(np.arctan2(-rotation[0, 1], rotation[1, 1]))
-    roll = np.arctan2(rotation[2, 1], rotation[2, 2])
-    return float(roll), float(pitch), float(np.arctan2(rotation[1, 0], rotation[0, 0]))
 
 
 def _numbers(values: object) -> str:

@@ -1,0 +1,86 @@
+"""Goals in problem files.
+
+{joints: [...]}
+{joint_set: [[...], [...]]}
+{pose: {frame: panda_hand, xyz: [...], wxyz: [...]}}
+{pose: {..., relative_to: shelf, xyz_tolerance: [0.1, 0.1, 0], rpy_tolerance: [0, 0, 3.1416]}}
+{any: [{pose: {...}}, {joints: [...]}]}
+"""
+
+from typing import Any
+
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.problems.equipment import pose_entry
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
+from robotdiffuse.scenes.files import check_fields
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import numbers, shown, unit_quaternion, vector
+from robotdiffuse.transforms import rotation_from_quaternion, transform
+
+GOALS = ("joints", "joint_set", "pose", "any")
+TOLERANCES = ("xyz_tolerance", "rpy_tolerance")
+
+
+def read_goal(field: str, data: object, scene: Scene) -> Goal:
+    """A goal of a problem file; InputError that names its field. Poses are in the frame of the scene, or of
+    one of its objects."""
+    if not isinstance(data, dict) or len(data) != 1:
+        raise InputError(f"{field} is {shown(data)}; it must be one of joints, joint_set, pose and any")
+    [(kind, value)] = data.items()
+    if kind not in GOALS:
+        raise unknown_name(f"field of {field}:", kind, GOALS)
+    if kind == "any":
+        if not isinstance(value, list) or not value:
+            raise InputError(f"{field}.any is {shown(value)}; it must be a list of goals, not empty")
+        goals = [read_goal(f"{field}.any[{i}]", one, scene) for i, one in enumerate(value)]
+        return AnyGoal(tuple(goals))  # type: ignore[arg-type]
+    if kind == "pose":
+        return _pose_goal(f"{field}.pose", value, scene)
+    array = numbers(value)
+    if array is None or array.ndim != (1 if kind == "joints" else 2):
+        form = "a list of numbers" if kind == "joints" else "a list of configurations of one length"
+        raise InputError(f"{field}.{kind} is {shown(value)}; it must be {form}")
+    return JointGoal(array)
+
+
+def read_waypoints(data: object, scene: Scene) -> tuple[Goal, ...]:
+    """The waypoints of a problem file."""
+    if not isinstance(data, list):
+        raise InputError(f"waypoints is {shown(data)}; it must be a list of goals")
+    return tuple(read_goal(f"waypoints[{i}]", one, scene) for i, one in enumerate(data))
+
+
+def goal_entry(goal: Goal) -> dict[str, Any]:
+    """The goal as `read_goal` takes it."""
+    if isinstance(goal, AnyGoal):
+        return {"any": [goal_entry(one) for one in goal.goals]}
+    if isinstance(goal, JointGoal):
+        rows = goal.positions.tolist()
+        return {"joints": rows[0]} if len(rows) == 1 else {"joint_set": rows}
+    tolerances = {name: getattr(goal, name) for name in TOLERANCES}
+    given = {name: value.tolist() for name, value in tolerances.items() if value is not None}
+    return {"pose": {"frame": goal.frame, **pose_entry(goal.T_base_frame), **given}}
+
+
+def _pose_goal(field: str, value: object, scene: Scene) -> PoseGoal:
+    pose = check_fields(field, value, ("frame", "xyz", "wxyz"), ("relative_to", *TOLERANCES))
+    xyz = vector(field, "xyz", pose["xyz"], 3)
+    T = transform(xyz, rotation_from_quaternion(unit_quaternion(field, pose["wxyz"])))
+    if "relative_to" in pose:
+        T = _object_pose(field, pose["relative_to"], scene) @ T
+    return PoseGoal(pose["frame"], T, *(pose.get(name) for name in TOLERANCES))  # type: ignore[arg-type]
+
+
+def _object_pose(field: str, name: object, scene: Scene) -> Float[ndarray, "4 4"]:
+    shapes = {shape.name: shape for shape in scene.shapes}
+    if name not in shapes:
+        raise unknown_name(f"object in {field}.relative_to:", str(name), shapes)
+    from robotdiffuse.scenes.solids import placed  # compiled code, which most problems do not need
+
+    try:
+        return placed(shapes[str(name)])
+    except InputError as error:
+        raise InputError(f"{field}.relative_to: {error}") from None

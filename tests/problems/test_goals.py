@@ -1,0 +1,220 @@
+"""Goals with tolerances, of several, relative to objects; waypoints."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+import robotdiffuse as rd
+from robotdiffuse.errors import InputError
+from robotdiffuse.planners import PLANNERS
+from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
+from robotdiffuse.problems.goals import AnyGoal, JointGoal, PoseGoal
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.transforms import inverse, rotation_from_rpy, rpy_from_rotation, transform
+from robotdiffuse.types import Path as JointPath
+from robotdiffuse.types import Status, Trajectory
+from robotdiffuse.verify import goal_error, verify, verify_trajectory
+
+ROBOT = rd.load_robot("panda")
+START, MIDDLE, END = (
+    [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2],
+    [0, -0.9, 0, -2.6, 0, 1.8, 0.2],
+    [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2],
+)
+POST = rd.Cylinder([0.5, 0.0, 0.3], 0.04, 0.6, name="post")
+TABLE = {
+    "box": {"center": [0.55, 0, 0.1], "size": [0.5, 1.0, 0.2], "wxyz": [0.9, 0, 0, 0.2], "name": "table"}
+}
+DOWN = transform(np.array([0.45, 0.3, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
+
+
+def test_rpy_of_a_rotation_is_scipys() -> None:
+    for rotation in Rotation.random(50, np.random.default_rng(0)):
+        matrix = rotation.as_matrix()
+        assert np.allclose(rpy_from_rotation(matrix), rotation.as_euler("xyz"), atol=1e-9)
+        assert np.allclose(rotation_from_rpy(*rpy_from_rotation(matrix)), matrix)
+
+
+def off(goal: PoseGoal, xyz: Any, rpy: Any) -> bool:
+    """Whether a pose that far from the goal's is off, told by a goal that is as far the other way."""
+    q = np.array(START)
+    T = link_pose(ROBOT, q, goal.frame) @ inverse(
+        transform(np.array(xyz, float), rotation_from_rpy(*map(float, rpy)))
+    )
+    moved = PoseGoal(goal.frame, T, goal.xyz_tolerance, goal.rpy_tolerance)
+    return goal_error(ROBOT, moved, q) is not None
+
+
+@pytest.mark.parametrize(
+    ("xyz", "rpy", "within", "beyond"),
+    [
+        ([0.1, 0.02, 0], [0, 0, np.pi], ([0.09, -0.019, 0], [0, 0, 3.0]), ([0.09, -0.021, 0], [0, 0, 3.0])),
+        ([0.1, 0.02, 0], [0, 0, np.pi], ([-0.09, 0, 0], [0, 0, -2.0]), ([0, 0, 0], [0, 0.01, -2.0])),
+        ([0, 0, 0], [0.1, 0.2, 0.3], ([0, 0, 0], [0.09, -0.19, 0.29]), ([0, 0, 0], [0.11, 0, 0])),
+        ([0, 0, 0], [0, np.pi, 0], ([0, 0, 0], [0, 2.5, 0]), ([0, 0, 0], [0.1, 2.5, 0])),
+        (None, [np.pi] * 3, ([0.005, 0, 0], [1, 2, 3]), ([0.011, 0, 0], [1, 2, 3])),
+        ([1.0, 1, 1], None, ([0.5, 0.5, 0.5], [0.2, 0, 0]), ([0.5, 0, 0], [0.3, 0, 0])),
+    ],
+)
+def test_tolerances_are_along_the_axes_of_the_goal(xyz: Any, rpy: Any, within: Any, beyond: Any) -> None:
+    goal = PoseGoal("panda_hand", np.eye(4), xyz, rpy)
+    assert not off(goal, *within)
+    assert off(goal, *beyond)
+
+
+def test_drawn_poses_are_within() -> None:
+    rng, base = np.random.default_rng(0), link_pose(ROBOT, np.array(START), "panda_hand")
+    goal = PoseGoal("panda_hand", base, [0.1, 0.02, 0], [0.3, 0.5, np.pi])
+    drawn = [inverse(base) @ goal.draw(rng) for _ in range(300)]
+    assert not any(off(goal, T[:3, 3], rpy_from_rotation(T[:3, :3])) for T in drawn)
+    assert np.ptp([T[0, 3] for T in drawn]) > 0.19, "all of the box"
+    assert np.ptp([rpy_from_rotation(T[:3, :3])[2] for T in drawn]) > 6.0
+
+
+def test_a_box_of_positions_is_reached_where_its_middle_is_blocked() -> None:
+    middle = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
+    blocked = rd.Problem(ROBOT, rd.Scene([POST]), START, PoseGoal("panda_hand", middle))
+    assert rd.plan(blocked).status is Status.INVALID_GOAL
+    wide = PoseGoal("panda_hand", middle, [0.0, 0.35, 0.0], [0.0, 0.0, np.pi])
+    problem = rd.Problem(ROBOT, rd.Scene([POST]), START, wide)
+    result = rd.plan(problem, time_limit=10.0)
+    assert result.path is not None, result.reason
+    T = inverse(middle) @ link_pose(ROBOT, result.path.positions[-1], "panda_hand")
+    assert np.abs(T[[0, 2], 3]).max() < 1e-5 and abs(T[1, 3]) < 0.35
+    assert abs(T[2, 2] - 1) < 1e-9, "upside down as asked"
+
+
+def test_the_nearest_of_several_goals_is_taken() -> None:
+    far = PoseGoal("panda_hand", transform(np.array([3.0, 0, 0])))
+    problem = rd.Problem(ROBOT, rd.Scene([]), START, [far, PoseGoal("panda_hand", DOWN), JointGoal(MIDDLE)])
+    result = rd.plan(problem, time_limit=5.0)
+    assert result.path is not None and verify(problem, result.path).valid
+    none = rd.plan(rd.Problem(ROBOT, rd.Scene([]), START, [far, far]))
+    assert none.status is Status.UNREACHABLE_GOAL and "none of 2 goals" in none.reason
+    elsewhere = JointPath(ROBOT.joint_names, np.array([START, END]))
+    found = verify(problem, elsewhere).violation
+    assert found is not None and found.kind == "goal"
+
+
+def stops(trajectory: Trajectory, goal: ndarray) -> bool:
+    there = np.abs(trajectory.positions - goal).max(axis=1) < 1e-6
+    return bool((np.abs(trajectory.velocities[there]).max(axis=1) < 1e-9).any())
+
+
+def test_one_motion_stops_at_waypoints_in_their_order() -> None:
+    way = [MIDDLE, PoseGoal("panda_hand", DOWN), START]
+    problem = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=way)
+    result = rd.plan(problem, time_limit=10.0)
+    assert result.path is not None and result.trajectory is not None, result.reason
+    assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    assert stops(result.trajectory, np.array(MIDDLE)) and stops(result.trajectory, np.array(END))
+    assert (np.diff(result.trajectory.times) > 0).all()
+    assert "4 legs" in result.reason
+    other = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[way[1], way[0], END, START])
+    found = verify(other, result.path).violation
+    assert found is not None and found.kind == "waypoint" and "waypoints[1]" in found.message
+
+
+def test_a_motion_that_only_passes_a_waypoint_does_not_stop_there() -> None:
+    problem = rd.Problem(ROBOT, rd.Scene([]), START, END, waypoints=[MIDDLE])
+    result = rd.plan(problem, time_limit=10.0)
+    assert result.trajectory is not None
+    rushed = np.full_like(result.trajectory.velocities, 1e-3)
+    moving = Trajectory(
+        ROBOT.joint_names, result.trajectory.times, result.trajectory.positions, rushed, 0 * rushed
+    )
+    found = verify_trajectory(problem, moving).violation
+    assert found is not None and found.kind == "waypoint"
+
+
+def test_the_leg_that_fails_is_named() -> None:
+    blocked = PoseGoal(
+        "panda_hand", transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
+    )
+    problem = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, blocked])
+    result = rd.plan(problem, time_limit=1.0)
+    assert result.status is Status.INVALID_GOAL and result.reason.startswith("leg 2 of 3: all")
+
+
+def test_files_keep_goals_and_waypoints(tmp_path: Path) -> None:
+    pose = {"frame": "panda_hand", "xyz": [0.0, 0.1, 0.3], "wxyz": [0.0, 1.0, 0.0, 0.0]}
+    record = {
+        "robot": "panda",
+        "scene": [TABLE],
+        "start": START,
+        "goal": {
+            "any": [{"pose": pose | {"relative_to": "table", "rpy_tolerance": [0, 0, 3.1]}}, {"joints": END}]
+        },
+        "waypoints": [{"joints": MIDDLE}, {"pose": pose | {"xyz_tolerance": [0.1, 0.1, 0.0]}}],
+    }
+    file = tmp_path / "problem.yaml"
+    for base in ({}, {"base": {"xyz": [0.1, 0.2, 0.3], "wxyz": [0.6, 0.0, 0.0, 0.8]}}):
+        file.write_text(yaml.safe_dump(record | base))
+        problem = load_problem(file)
+        kept = problem_record(problem)
+        assert problem_record(problem_from_record(kept)) == kept
+        assert isinstance(problem.goal, AnyGoal) and isinstance(problem.goal.goals[0], PoseGoal)
+        T = problem.known_scene.shapes[0].solid()[0]
+        seen = inverse(T) @ problem.goal.goals[0].T_base_frame
+        assert np.allclose(seen[:3, 3], pose["xyz"])
+        assert len(problem.waypoints) == 2
+
+
+POSE = {"frame": "panda_hand", "xyz": [0.4, 0, 0.4], "wxyz": [0, 1, 0, 0]}
+
+
+def pose(**more: Any) -> dict[str, Any]:
+    return {"goal": {"pose": POSE | more}}
+
+
+WRONG = {
+    "object": (pose(relative_to="shelf"), "unknown object in goal.pose.relative_to: 'shelf'; known: table"),
+    "tolerance": (pose(xyz_tolerance=[0.1]), "goal.xyz_tolerance is .*; it must be 3 finite numbers"),
+    "negative": (pose(rpy_tolerance=[0, 0, -1]), "goal.rpy_tolerance is .* of at least 0"),
+    "empty": ({"goal": {"any": []}}, r"goal.any is \[\]; it must be a list of goals, not empty"),
+    "any": ({"goal": {"any": [{"pose": POSE}, {"joint": END}]}}, r"unknown field of goal.any\[1\]: 'joint'"),
+    "waypoint": ({"waypoints": [{"joints": END[1:]}]}, r"waypoints\[0\] has 6 values"),
+    "waypoints": ({"waypoints": {"joints": END}}, "waypoints is .*; it must be a list of goals"),
+    "frame": (
+        {"waypoints": [{"pose": POSE | {"frame": "hand"}}]},
+        r"unknown link in waypoints\[0\].frame: 'hand'",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_wrong_goals_are_one_line(case: str, tmp_path: Path) -> None:
+    extra, message = WRONG[case]
+    file = tmp_path / "problem.yaml"
+    good = {"robot": "panda", "scene": [TABLE], "start": START, "goal": {"joints": END}}
+    file.write_text(yaml.safe_dump(good | extra))
+    with pytest.raises(InputError, match=message) as raised:
+        load_problem(file)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_every_planner_answers_every_request(name: str) -> None:
+    """A base, a tool, a held object, tolerances, several goals and a waypoint, all in one problem."""
+    robot = ROBOT.with_tool(
+        "panda_hand", transform(np.array([0, 0, 0.14])), [rd.Cylinder([0, 0, 0.09], 0.012, 0.1)]
+    )
+    robot = robot.attach(rd.Box([0, 0, 0.05], [0.06, 0.06, 0.08], name="parcel"), "tool")
+    T_world_base = transform(np.array([1.0, 0.5, 0.7]), rotation_from_rpy(0.0, 0.0, 1.0))
+    low = rd.Box([0.5, 0.0, 0.05], [0.3, 0.1, 0.1], name="low")
+    T_base_parcel = link_pose(robot, np.array(END), "parcel")
+    goals = [PoseGoal("parcel", T_world_base @ T_base_parcel, [0.02, 0.02, 0.02], [0, 0, 0.5])]
+    problem = rd.Problem.in_world(
+        T_world_base, robot, rd.Scene([low]).moved(T_world_base), START, goals, waypoints=[MIDDLE]
+    )
+    result = rd.load_planner(name).plan(problem, time_limit=4.0)
+    assert result.solved or result.status in (Status.TIMEOUT, Status.NO_PATH), result.reason
+    if result.path is not None and result.trajectory is not None:
+        assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    if name in ("robotdiffuse", "aorrtc", "rrt_connect", "diffusion", "guided_prior", "ompl_rrt_connect"):
+        assert result.solved, result.reason
