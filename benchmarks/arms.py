@@ -28,7 +28,7 @@ from robotdiffuse.robots.add import AddReport, add_robot
 from robotdiffuse.robots.refusals import Refusals, measure_refusals
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.sphere_kernels import gaps
-from robotdiffuse.robots.urdf import collision_surfaces
+from robotdiffuse.robots.urdf import UrdfTree
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 
@@ -87,7 +87,8 @@ def found(arm: Arm, samples: int, problems: int) -> Findings | str:
             report = add_robot(file, name="arm", tip=arm.tip, out=folder)
         except InputError as error:
             return str(error)
-        robot, surfaces = report.robot, collision_surfaces(file, report.robot.meshes)
+        robot, tree = report.robot, UrdfTree(file, {})
+        surfaces = {link: tree.surfaces(link) for link in robot.meshes}
         outside = 0
         for link, parts in surfaces.items():
             mesh = trimesh.util.concatenate([trimesh.Trimesh(s.vertices, s.faces) for s in parts])

@@ -85,6 +85,13 @@ def test_tool_that_collides_in_the_default_pose_is_checked() -> None:
     assert reasons(with_middle(overlapping(0.0, own=False)))["a", "c"] == "checked"
 
 
+def test_what_a_link_carries_is_the_arms_own() -> None:
+    """Fetch's bellows: fixed to the lift, within the base while that is down."""
+    robot = with_middle(overlapping(0.0, own=False))
+    turn = Joint("4", "revolute", "m", "hand", np.eye(4), np.array([0, 0, 1.0]), -1.0, 1.0)
+    assert reasons(replace(robot, tip="hand", joints=(*robot.joints, turn)))["a", "c"] == "default"
+
+
 def test_always_colliding() -> None:
     robot = with_middle(overlapping(0.01))
     robot = replace(

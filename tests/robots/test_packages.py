@@ -8,7 +8,7 @@ import trimesh
 
 from helpers.made_arms import BALL, chain, joint, link, row, written
 from robotdiffuse.errors import InputError
-from robotdiffuse.robots.urdf import content_hash, read_urdf
+from robotdiffuse.robots.urdf import UrdfTree, read_urdf
 
 NAME = "package://some_arm/meshes/box.stl"
 MESH = f'<collision><geometry><mesh filename="{NAME}"/></geometry></collision>'
@@ -29,7 +29,7 @@ def test_packages_by_option_environment_and_upwards(tmp_path: Path, monkeypatch:
         read_urdf(file)
     assert NAME in str(error.value) and "\n" not in str(error.value)
     assert "end" in read_urdf(file, packages={"some_arm": far}).meshes
-    assert content_hash(file, {"some_arm": far})
+    assert UrdfTree(file, {"some_arm": far}).digest
     for variable, folder in (
         ("ROS_PACKAGE_PATH", far.parent),
         ("ROS_PACKAGE_PATH", far),
@@ -62,9 +62,9 @@ def test_xacro_is_compiled_with_what_it_includes(tmp_path: Path) -> None:
     file = xacro(tmp_path / "top", content)
     robot = read_urdf(file)
     assert robot.joint_names == ("j1", "j2", "j3", "j4") and "end" in robot.meshes
-    digest = content_hash(file)
+    digest = UrdfTree(file, {}).digest
     xacro(part / "urdf", macro.replace("0.04", "0.05"), "solid.xacro")
-    assert content_hash(file) != digest  # of what it stands for, not of the file
+    assert UrdfTree(file, {}).digest != digest  # of what it stands for, not of the file
 
 
 def test_xacro_includes_files_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

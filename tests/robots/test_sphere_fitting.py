@@ -90,6 +90,15 @@ def test_what_is_finer_than_the_grid_is_covered_too(size: tuple[float, float, fl
     assert covered(meshes, spheres) and len(spheres) <= 210
 
 
+def test_what_neighbours_hide_wholly_is_covered_too() -> None:
+    """Baxter's sonar ring is within its torso: room without end was no number."""
+    solid = Solid.of((box((0.01, 0.01, 0.01)),), TOLERANCE)
+    hidden = Bounds(TOLERANCE, lambda points: np.ones(len(points), dtype=bool))
+    assert np.isfinite(solid.room(hidden).grid).all()
+    spheres = fit_spheres(solid, hidden, np.random.default_rng(0), QUICK)
+    assert covered(solid.meshes, spheres) and len(spheres) == 1
+
+
 def test_tight_places_are_kept_free() -> None:
     solid = Solid.of(SHAPES["box"], TOLERANCE)
     side = np.array([[0.05, 0.0, 0.0]])

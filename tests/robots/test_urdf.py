@@ -20,7 +20,7 @@ from robotdiffuse.robots.limits import read_limits, with_limits
 from robotdiffuse.robots.preparation import PreparationSettings
 from robotdiffuse.robots.robot import TURNS, Robot
 from robotdiffuse.robots.sphere_fitting import covered
-from robotdiffuse.robots.urdf import content_hash, read_urdf
+from robotdiffuse.robots.urdf import UrdfTree, read_urdf
 from robotdiffuse.transforms import rotation_from_rpy
 
 ARM = """<robot name="tiny">
@@ -298,7 +298,7 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     changed = load_robot(larger)
     assert any("spheres were fitted" in note for note in changed.notes)
     assert np.ptp(changed.meshes["upper"][0].vertices[:, 2]) == pytest.approx(0.32, rel=0.05)
-    kept = tmp_path / "robots" / f"tiny-{content_hash(larger)[:8]}"
+    kept = tmp_path / "robots" / f"tiny-{UrdfTree(larger, {}).digest[:8]}"
     stamp = (kept / "robot.json").stat().st_mtime_ns
     assert load_robot(larger) is load_robot(larger)
     assert (kept / "robot.json").stat().st_mtime_ns == stamp

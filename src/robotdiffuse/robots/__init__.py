@@ -80,9 +80,10 @@ def _added() -> dict[str, Path]:
 
 def _from_urdf(urdf: Path) -> Robot:
     from robotdiffuse.robots.add import add_robot, user_robots
-    from robotdiffuse.robots.urdf import content_hash, robot_name
+    from robotdiffuse.robots.urdf import UrdfTree
 
-    digest, source = content_hash(urdf), str(urdf.resolve())
+    tree, source = UrdfTree(urdf, {}), str(urdf.resolve())
+    digest = tree.digest
     made: dict[str, Robot] = {}
     for name, folder in _added().items():
         try:
@@ -96,6 +97,6 @@ def _from_urdf(urdf: Path) -> Robot:
         )
     if made:
         return next(iter(made.values()))
-    report = add_robot(urdf, out=user_robots() / f"{robot_name(urdf)}-{digest[:8]}")
+    report = add_robot(urdf, out=user_robots() / f"{tree.name}-{digest[:8]}")
     note = f"spheres were fitted to {urdf.name} ({report.sphere_count}) and kept in {report.folder}"
     return replace(report.robot, notes=(*report.robot.notes, note), source=source)

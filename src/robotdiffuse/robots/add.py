@@ -15,8 +15,8 @@ from robotdiffuse.robots.limits import read_limits, with_limits
 from robotdiffuse.robots.preparation import LinkReport, PreparationSettings, Progress, prepare
 from robotdiffuse.robots.refusals import Refusals
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.srdf import Srdf, read_srdf, srdf_beside
-from robotdiffuse.robots.urdf import collision_surfaces, content_hash, read_urdf, robot_name
+from robotdiffuse.robots.srdf import read_srdf, srdf_beside
+from robotdiffuse.robots.urdf import UrdfTree
 
 LITTLE, REFUSED = 0.2, 0.08
 """Shares of free configurations, and of those that spheres refuse, from which on there is a warning."""
@@ -116,8 +116,10 @@ def add_robot(
     too, one that was found does not. `allow` are further pairs.
     """
     begin = time.process_time()
-    semantics, found = _semantics(urdf, srdf, packages)
-    robot = read_urdf(urdf, base, tip, locked, group, semantics, packages)
+    tree = UrdfTree(Path(urdf), packages or {})
+    found = srdf_beside(urdf, tree.name) if srdf is None else Path(srdf)
+    semantics = None if found is None else read_srdf(found)
+    robot = tree.robot(base, tip, locked, group, semantics)
     for link in {link for pair in allow for link in pair} - {*robot.link_names}:
         raise unknown_name("link in allow", link, robot.link_names)
     name = name or robot.name
@@ -134,7 +136,7 @@ def add_robot(
     known = {} if semantics is None else semantics.allowed
     allowed = {pair: BY_SRDF for pair in known} if srdf is not None else {}
     allowed |= {frozenset(pair): NAMED for pair in allow}
-    surfaces = collision_surfaces(urdf, robot.meshes, packages)
+    surfaces = {link: tree.surfaces(link) for link in robot.meshes}
     made = prepare(robot, surfaces, settings or PreparationSettings(), seed, progress, allowed)
     differences = tuple(
         PairDifference(pair.links, pair.reason, pair.colliding, known.get(frozenset(pair.links), CHECKED))
@@ -142,7 +144,7 @@ def add_robot(
         if semantics is not None and (pair.reason == CHECKED) == (frozenset(pair.links) in known)
     )
     folder = user_robots() / name if out is None else Path(out)
-    source = {"urdf": Path(urdf).name, "sha256": content_hash(urdf, packages), "licence": licence}
+    source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": licence}
     note = (
         f"{made.refusals.free:.1%} of the configurations are free of self-collision; convex parts refuse "
         f"{made.refusals.by_parts:.1%} of these, spheres {made.refusals.by_spheres:.1%}"
@@ -151,13 +153,3 @@ def add_robot(
     seconds, memory = time.process_time() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KILO
     shown = (made.links, made.pairs, made.refusals, seconds, memory, found, differences)
     return AddReport(read_bundle(folder), folder, *shown)
-
-
-def _semantics(
-    urdf: str | Path, srdf: str | Path | None, packages: dict[str, str | Path] | None
-) -> tuple[Srdf | None, Path | None]:
-    """What the given SRDF says, or the one beside the URDF, and which one it is."""
-    if srdf is not None:
-        return read_srdf(srdf), Path(srdf)
-    found = srdf_beside(urdf, robot_name(urdf, packages))
-    return (None, None) if found is None else (read_srdf(found), found)

@@ -121,10 +121,16 @@ def _default_counts(robot: Robot, a: str, b: str) -> bool:
     def joints_above(link: str) -> list[Joint]:
         return [by_child[link], *joints_above(by_child[link].parent)] if link in by_child else []
 
+    def own(link: str) -> bool:
+        """What its links carry is the arm's own too, as the bellows of a lift; but for the last one's."""
+        moving = [joint for joint in above[link] if joint.kind in MOVING_KINDS][:1]
+        tool = robot.link_frame(link) == robot.dof and above[link][:1] != moving
+        return not tool and all(joint in robot.planned_joints for joint in moving)
+
     above = {link: joints_above(link) for link in (a, b)}
-    own = all(not joints or joints[0] in robot.planned_joints for joints in above.values())
     between = {j.name: j for j in (*above[a], *above[b]) if (j in above[a]) != (j in above[b])}.values()
-    return own and all(joint.lower <= 0 <= joint.upper for joint in between if joint.kind in MOVING_KINDS)
+    zero = all(joint.lower <= 0 <= joint.upper for joint in between if joint.kind in MOVING_KINDS)
+    return zero and own(a) and own(b)
 
 
 def _moving_pairs(robot: Robot) -> list[tuple[str, str]]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
-from robotdiffuse.robots.sphere_kernels import plane_depths
+from robotdiffuse.robots.sphere_kernels import within
 from robotdiffuse.robots.sphere_room import stacked_planes
 from robotdiffuse.transforms import inverse
 
@@ -58,7 +58,7 @@ def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Float[ndarray, "n
             left = np.flatnonzero(~found)
             for T in other.T_link_neighbour:
                 local = (points[left] - T[:3, 3]) @ T[:3, :3]
-                left = left[plane_depths(local, *planes) > -NEARLY]
+                left = left[within(local, *planes, -NEARLY)]
             found[left] = True
         return found
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
@@ -36,7 +37,8 @@ LEFT = 0.6
 FASTER = 0.6
 """From round to round, a factor of that share."""
 GAP_SHARE = 1.2
-"""Of the gap between two links that spheres bridge in vain, what those of each may stick out into it."""
+"""Of the gap between two links that spheres bridge in vain, what those of each may stick out into it, on
+average."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +48,13 @@ class PreparationSettings:
     parts: PartSettings = field(default_factory=PartSettings)
     spheres: SphereSettings = field(default_factory=SphereSettings)
     sampling: SamplingSettings = field(default_factory=SamplingSettings)
-    refused: float = 0.06
+    refused: float = 0.075
     """Share of the free configurations that spheres may refuse before they are made finer."""
     samples: int = 4000
     """Configurations on which that is measured."""
-    rounds: int = 3
+    rounds: int = 2
     """Times that links are made finer, at most."""
-    finest: float = 0.003
+    finest: float = 0.002
     """Spheres need not stick out by less anywhere [m]."""
 
     def __post_init__(self) -> None:
@@ -97,7 +99,6 @@ class _Link:
     parts: PartSettings
     bounds: Bounds = field(default_factory=lambda: Bounds(0.0))
     solid: Solid | None = None
-    spheres: ndarray | None = None
 
     def decompose(self, robot: Robot) -> Robot:
         """The robot with this link's convex parts."""
@@ -114,14 +115,8 @@ class _Link:
             hidden = hidden_by_neighbours(robot, self.name)
             self.bounds = Bounds(tolerance, hidden, self.bounds.tight, _floor(robot, self.name))
         fit = fit_spheres(self.solid, self.bounds, np.random.default_rng(seed), settings)
-        self.spheres = np.round(fit, 6)  # as the file holds them: these are judged
-        return replace(robot, spheres=robot.spheres | {self.name: self.spheres})
-
-    def report(self) -> LinkReport:
-        assert self.solid is not None and self.spheres is not None
-        out = float(stick_out(self.solid, self.spheres).max())
-        whole = covered(self.solid.meshes, self.spheres)
-        return LinkReport(self.name, len(self.solid.meshes), len(self.spheres), out, whole)
+        fit = np.round(fit, 6)  # as the file holds them: these are judged
+        return replace(robot, spheres=robot.spheres | {self.name: fit})
 
 
 def prepare(
@@ -155,14 +150,23 @@ def prepare(
         for pair in sampled
     )
     robot = replace(robot, allowed_collisions=allowed_pairs(pairs))
+    tried = []
     for k in range(settings.rounds + 1):
         progress("configurations refused", 2 * len(links) + 1 + k, steps)
         refusals = measure_refusals(robot, surfaces, settings.samples, np.random.default_rng(seed))
+        tried.append((refusals.by_spheres, k, robot, refusals))
         if refusals.by_spheres <= settings.refused or k == settings.rounds:
             break
         robot = _refined(robot, links, refusals, k, settings, seed)
     progress("done", steps, steps)
-    return Prepared(robot, tuple(link.report() for link in links.values()), pairs, sampled, refusals)
+    _, _, robot, refusals = min(tried, key=lambda one: one[:2])  # finer is not always better
+    return Prepared(robot, tuple(_report(robot, name) for name in links), pairs, sampled, refusals)
+
+
+def _report(robot: Robot, link: str) -> LinkReport:
+    meshes, spheres = robot.meshes[link], robot.spheres[link]
+    out = float(stick_out(Solid.of(meshes, 0.0), spheres).max())
+    return LinkReport(link, len(meshes), len(spheres), out, covered(meshes, spheres))
 
 
 def _refined(
@@ -182,12 +186,22 @@ def _refined(
         robot = link.decompose(robot)
     for name in sorted({name for pair in worst for name in pair.links}):
         link = links[name]
-        places = np.concatenate([pair.places[name] for pair in worst if name in pair.links])
+        places = np.concatenate([_shared(pair, name) for pair in worst if name in pair.links])
         places[:, 3] = np.clip(GAP_SHARE * FASTER**k * places[:, 3], settings.finest, link.bounds.tolerance)
         known = link.bounds.tight
         link.bounds = replace(link.bounds, tight=places if known is None else np.concatenate([known, places]))
         robot = link.fit(robot, settings.spheres, seed)
     return robot
+
+
+def _shared(pair: PairRefusals, link: str) -> Float[ndarray, "n 4"]:
+    """Places on one of two links, and what of the gap its spheres may fill [m].
+
+    Spheres that stick out by t over an area A are about A / t in number: of both links together they are
+    fewest if the link with the larger area has more of the gap, as the roots of the areas are.
+    """
+    areas = np.sqrt([len(pair.places[link]), *(len(places) for places in pair.places.values())])
+    return pair.places[link] * (1, 1, 1, 2 * areas[0] / max(areas[1:].sum(), 1))
 
 
 def _worst(refusals: Refusals, refused: float) -> list[PairRefusals]:

@@ -19,7 +19,7 @@ from robotdiffuse.robots.sphere_kernels import deepest_touches
 CUBE = 0.01
 """Of the places where spheres touch one is kept of each cube with this edge [m]."""
 
-MOST_PLACES = 500
+MOST_PLACES = 2000
 """Configurations from which places are taken, of each pair."""
 FORGIVEN = 0.003
 """Share of the configurations with the narrowest gaps that a pair may go on to refuse."""

@@ -11,7 +11,7 @@ to its best centre. It starts from a greedy set cover and drops spheres as long 
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -20,11 +20,21 @@ from numpy import ndarray
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.convex_parts import split
 from robotdiffuse.robots.robot import ConvexMesh, Robot
-from robotdiffuse.robots.sphere_kernels import DIRECTIONS, assign, gaps, held_by_one, plane_depths, relax
+from robotdiffuse.robots.sphere_kernels import (
+    DIRECTIONS,
+    assign,
+    gaps,
+    greedy_cover,
+    held_by_one,
+    relax,
+    within,
+)
 from robotdiffuse.robots.sphere_room import Bounds, Room, Solid, stacked_planes
 
 MARGIN = 1e-5
 """Added to the radii [m]: covers rounding in files and in single-precision kernels."""
+BURIED = 1e-9
+"""What lies deeper in another part is no surface of the union [m]."""
 SLACK = 0.1
 """Of the spacing of the grid, what room a sphere may lack."""
 APART = 0.02
@@ -45,12 +55,12 @@ class SphereSettings:
     """Never more than this times the radius of the largest sphere inside the link."""
     finest: float = 0.004
     """Nor less than this [m]."""
-    candidates: int = 400
+    candidates: int = 1000
     """Places inside the mesh that the greedy cover chooses from."""
-    rounds: int = 8
+    rounds: int = 5
     """Rounds of the alternation for each number of spheres."""
     tries: int = 3
-    """Spheres of which each is dropped for a try, before their number is final."""
+    """Spheres that turn out to be needed before the others of a round are no longer asked."""
     starts: int = 1
     """Fits from different starts, of which the one with the fewest spheres is kept."""
     most: int = 200
@@ -111,7 +121,7 @@ def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], fine
         held, bare = held_by_one(triangles, spheres)
         is_open = ~held
         for planes in single:
-            hidden = plane_depths(corners, *planes) > 1e-9
+            hidden = within(corners, *planes, BURIED)
             is_open &= ~hidden.reshape(-1, 3).all(1)
             bare &= ~hidden
         if bare.any():
@@ -148,8 +158,7 @@ class _Cells:
             triangles = split(triangles, size)
             hidden = np.zeros(len(triangles), dtype=bool)
             for other in planes[:k] + planes[k + 1 :]:
-                inside = plane_depths(triangles.reshape(-1, 3), *other) > 1e-9
-                hidden |= inside.reshape(-1, 3).all(1)
+                hidden |= within(triangles.reshape(-1, 3), *other, BURIED).reshape(-1, 3).all(1)
             triangles = triangles[~hidden]
             if bounds.varies:
                 tolerances = bounds.tolerances(triangles.mean(1))
@@ -169,20 +178,32 @@ class _Cells:
         sharp |= left_out
         return _Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
 
-    def farthest(self, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "c n"]:
-        """Radius that each centre needs to hold each cell [m]."""
-        distance = _distances(self.points, centers)
-        a, b, c = self.corners.T
-        return np.maximum(np.maximum(distance[a], distance[b]), distance[c])
+    def assigned(self, room: Room, centers: Float[ndarray, "n 3"]) -> "_Assignment":
+        count = len(self.corners)
+        owner, heir = np.empty(count, np.int64), np.empty(count, np.int64)
+        least, second = np.empty(count), np.empty(count)
+        assign(self.points, self.corners, centers, room.at(centers), owner, least, heir, second)
+        return _Assignment(owner, least, heir, second)
 
-    def assigned(
-        self, room: Room, centers: Float[ndarray, "n 3"]
-    ) -> tuple[Int[ndarray, "c"], Float[ndarray, "c"], Float[ndarray, "c"]]:
-        """For each cell the sphere that holds it with most room to spare, what it lacks, and the next one."""
-        owner = np.empty(len(self.corners), np.int64)
-        least, second = np.empty(len(owner)), np.empty(len(owner))
-        assign(self.points, self.corners, centers, room.at(centers), owner, least, second)
-        return owner, least, second
+    def part(self, mine: Bool[ndarray, "c"]) -> "_Cells":
+        """Some of the cells; points on their border count as vertices, for what is beyond holds them."""
+        outside = np.zeros(len(self.points), dtype=bool)
+        outside[self.corners[~mine]] = True
+        used, index = np.unique(self.corners[mine], return_inverse=True)
+        return _Cells(self.points[used], index.reshape(-1, 3), (self.sharp | outside)[used])
+
+
+class _Assignment(NamedTuple):
+    """Which sphere each cell is given to."""
+
+    owner: Int[ndarray, "c"]
+    """The one that holds it with most room to spare."""
+    least: Float[ndarray, "c"]
+    """What that one lacks [m]."""
+    heir: Int[ndarray, "c"]
+    """The next best one; -1 if there is none."""
+    second: Float[ndarray, "c"]
+    """What that one lacks [m]."""
 
 
 def _relax(
@@ -196,12 +217,7 @@ def _first_cover(
     room: Room, cells: _Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "k 3"]:
     """Centres from a greedy set cover."""
-    needed = cells.farthest(places) - room.at(places)
-    open_cells = needed <= np.maximum(0.0, needed.min(1, keepdims=True))
-    chosen: list[int] = []
-    while len(open_cells):
-        chosen.append(int(open_cells.sum(0).argmax()))
-        open_cells = open_cells[~open_cells[:, chosen[-1]]]
+    chosen = greedy_cover(cells.points, cells.corners, places, room.at(places))
     return _with_enough(room, cells, places[chosen], settings)
 
 
@@ -212,7 +228,7 @@ def _with_enough(
     enough = room.spacing * SLACK
     centers, worst = _relax(room, cells, centers, settings.rounds, enough)
     while worst > enough and len(centers) < settings.most:
-        lacking = cells.assigned(room, centers)[1]
+        lacking = cells.assigned(room, centers).least
         extra = _apart(cells.points[cells.corners].mean(1), lacking, len(centers) // 20 + 1)
         centers, worst = _relax(room, cells, np.concatenate([centers, extra]), settings.rounds, enough)
     return centers
@@ -231,24 +247,45 @@ def _apart(points: Float[ndarray, "c 3"], lacking: Float[ndarray, "c"], count: i
 def _thin_out(
     room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
 ) -> Float[ndarray, "m 3"]:
-    """Drop spheres, those first whose cells the others take over best, as long as there is room."""
-    failures, enough = 0, room.spacing * SLACK
-    while failures < min(settings.tries, len(centers) - 1):
-        owner, _, second = cells.assigned(room, centers)
-        loss = np.zeros(len(centers))
-        np.maximum.at(loss, owner, second)
-        fewer = np.delete(centers, np.argsort(loss)[failures], axis=0)
-        fewer, worst = _relax(room, cells, fewer, settings.rounds, enough)
-        if worst > enough:
-            failures += 1
-        else:
-            centers, failures = fewer, 0
+    """Drop spheres, those first whose cells the others take over best, as long as there is room.
+
+    Only those that take over cells are moved for it.
+    """
+    enough = room.spacing * SLACK
+    centers, kept = centers.copy(), np.zeros(len(centers), dtype=bool)
+    while len(centers) > 1:
+        given = cells.assigned(room, centers)
+        loss = np.full(len(centers), -np.inf)
+        np.maximum.at(loss, given.owner, given.second)
+        dropped, moved, failures = np.zeros_like(kept), np.zeros_like(kept), 0
+        for i in np.argsort(loss):
+            heirs = np.unique(given.heir[given.owner == i])
+            if kept[i] or moved[i] or moved[heirs].any():
+                continue
+            if not len(heirs):
+                dropped[i] = True
+                continue
+            among = np.zeros(len(centers), dtype=bool)
+            among[i] = among[heirs] = True
+            part = cells.part(among[given.owner])
+            rest, worst = _relax(room, part, centers[heirs], settings.rounds, enough)
+            if worst > enough:
+                kept[i], failures = True, failures + 1
+                if failures == settings.tries:
+                    break
+                continue
+            centers[heirs], dropped[i] = rest, True
+            moved |= among
+        if not dropped.any():
+            break
+        kept &= ~moved
+        centers, kept = centers[~dropped], kept[~dropped]
     return centers
 
 
 def _with_radii(room: Room, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "m 4"]:
     """Least radii with which each sphere holds its own cells; spheres without any are dropped."""
-    owner = cells.assigned(room, centers)[0]
+    owner = cells.assigned(room, centers).owner
     radii = np.zeros(len(centers))
     far = np.linalg.norm(cells.points[cells.corners] - centers[owner][:, None], axis=2).max(1)
     np.maximum.at(radii, owner, far + MARGIN)
@@ -277,9 +314,3 @@ def _without_holes(
 def _disc(tolerance: Any, depth: float) -> Any:
     """Radius of what a sphere covers of a face [m] that sticks out by a tolerance, from a depth."""
     return np.sqrt(2 * tolerance * depth + tolerance**2)
-
-
-def _distances(a: ndarray, b: ndarray) -> ndarray:
-    """Distances [n, m] of points [n, 3] and [m, 3]."""
-    squares = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
-    return np.sqrt(np.maximum(squares, 0.0))

@@ -39,6 +39,23 @@ def plane_depths(points, normals, offsets, starts):
     return depths
 
 
+@njit(cache=True)
+def within(points, normals, offsets, starts, depth):
+    """Whether each point is deeper in a part than `depth`."""
+    found = np.zeros(len(points), np.bool_)
+    for i in range(len(points)):
+        x, y, z = points[i]
+        for part in range(len(starts) - 1):
+            found[i] = True
+            for f in range(starts[part], starts[part + 1]):
+                if offsets[f] - normals[f, 0] * x - normals[f, 1] * y - normals[f, 2] * z <= depth:
+                    found[i] = False
+                    break
+            if found[i]:
+                break
+    return found
+
+
 @njit(cache=True, fastmath=True)
 def room_at(x, y, z, grid, origin, spacing):
     """Value of a grid between its points; outside the grid a low one, the lower the further."""
@@ -72,10 +89,10 @@ def squared_distance(a, i, b, j):
 
 
 @njit(cache=True, fastmath=True)
-def assign(points, corners, centers, depths, owner, least, second):
+def assign(points, corners, centers, depths, owner, least, heir, second):
     """For each cell the sphere that holds it with the least stick-out, that stick-out, and the next best."""
     for c in range(len(corners)):
-        best, runner, mine = 1e9, 1e9, -1
+        best, runner, mine, next_best = 1e9, 1e9, -1, -1
         for i in range(len(centers)):
             # a first corner that is too far settles it: most spheres are
             reach = runner + depths[i]
@@ -86,10 +103,43 @@ def assign(points, corners, centers, depths, owner, least, second):
             far = max(far, squared_distance(points, corners[c, 2], centers, i))
             needed = math.sqrt(far) - depths[i]
             if needed < best:
-                runner, best, mine = best, needed, i
+                runner, best, next_best, mine = best, needed, mine, i
             elif needed < runner:
-                runner = needed
-        owner[c], least[c], second[c] = mine, best, runner
+                runner, next_best = needed, i
+        owner[c], least[c], heir[c], second[c] = mine, best, next_best, runner
+
+
+@njit(cache=True, fastmath=True)
+def greedy_cover(points, corners, places, depths):
+    """Places such that spheres about some hold all cells, as few as greedy choice finds; a cell that none can
+    hold within its room is left to those that lack least."""
+    holds = np.zeros((len(corners), len(places)), np.bool_)
+    counts = np.zeros(len(places), np.int64)
+    for c in range(len(corners)):
+        least = 1e9
+        for i in range(len(places)):
+            if depths[i] + max(least, 0.0) <= 0.0:
+                continue
+            far = squared_distance(points, corners[c, 0], places, i)
+            far = max(far, squared_distance(points, corners[c, 1], places, i))
+            far = max(far, squared_distance(points, corners[c, 2], places, i))
+            lacks = math.sqrt(far) - depths[i]
+            if least > 0.0 and lacks < least:
+                least = max(lacks, 0.0)
+                holds[c, :i] = False
+            holds[c, i] = lacks <= least
+        for i in range(len(places)):
+            counts[i] += holds[c, i]
+    is_open, chosen = np.ones(len(corners), np.bool_), []
+    while counts.max() > 0:
+        best = counts.argmax()
+        chosen.append(best)
+        for c in range(len(corners)):
+            if is_open[c] and holds[c, best]:
+                is_open[c] = False
+                for i in range(len(places)):
+                    counts[i] -= holds[c, i]
+    return np.array(chosen)
 
 
 @njit(cache=True)
@@ -190,7 +240,7 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
     """
     cells, count = len(corners), len(centers)
     owner = np.empty(cells, np.int64)
-    least, second = np.empty(cells), np.empty(cells)
+    least, heir, second = np.empty(cells), np.empty(cells, np.int64), np.empty(cells)
     first, stamp = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
     rim = np.empty(len(points), np.bool_)
     own = np.empty((len(points), 3))
@@ -199,7 +249,7 @@ def relax(points, corners, sharp, centers, rounds, enough, grid, origin, spacing
     best, best_value = centers.copy(), 1e9
     step = FIRST_STEP
     for r in range(rounds + 1):
-        assign(points, corners, centers, rooms_at(centers, grid, origin, spacing), owner, least, second)
+        assign(points, corners, centers, rooms_at(centers, grid, origin, spacing), owner, least, heir, second)
         value = least.max()
         if value < best_value:
             best, best_value = centers.copy(), value

@@ -160,7 +160,7 @@ def _carried(
     """On a mask, the distance from its surface: to the nearest point off the mask, less that one's `value`,
     its own distance from the surface."""
     if not mask.any() or mask.all():
-        return np.where(mask, np.inf, 0.0)
+        return np.where(mask, spacing * sum(mask.shape), 0.0)
     found: Any = ndimage.distance_transform_edt(mask, return_indices=True)
     far, at = found
     return np.maximum(far * spacing - value[tuple(at)], 0.0)

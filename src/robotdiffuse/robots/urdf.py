@@ -2,7 +2,6 @@
 
 import hashlib
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -37,95 +36,20 @@ def read_urdf(
     srdf: Srdf | None = None,
     packages: dict[str, str | Path] | None = None,
 ) -> Robot:
-    """A robot from a URDF or xacro file, with convex collision meshes and without spheres.
-
-    `base` is the root of the tree by default; where it stands in the root's frame is kept, for scenes that
-    are given there, while links above it are left out. `group` names a group of the SRDF, or an arm by what
-    the names of its joints begin with; `tip` a link. Without both, the robot must have one arm: from the base
-    as far as the link where a gripper or a hand begins (`robots.groups` tells how these are known), else to
-    the deepest link. So it is panda_hand for a Panda with fingers.
-
-    Planned are the movable joints of the group, or all from base to tip; less passive ones and those that
-    mimic others. All other joints are locked: at what `locked` says, in a pose of the SRDF, or at zero
-    clipped into their limits; mimic joints where the joint that they follow puts them.
-
-    Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity and 10 / s times the
-    acceleration (see limits.py to set them). Collision elements become convex hulls in the link's frame;
-    cylinders, capsules and spheres become polyhedra around them. If no link has any, visual ones are taken,
-    with a note. `packages` are folders of packages by name, see `robots.packages`.
-
-    Raises InputError, one line that names the file, for anything missing or contradictory in it.
-    """
-    tree = _Tree(Path(path), packages or {})
-    base = base or tree.root
-    if base not in tree.links:
-        raise unknown_name(f"base link in {tree.path.name}", base, tree.links)
-    joints = tree.below(base)
-    names = [base, *(joint.child for joint in joints)]
-    planned, end = planned_joints(tree.path, base, joints, tip, group, srdf)
-    meshes = tree.geometry(names)
-    robot = Robot(
-        name=tree.name,
-        base=base,
-        tip=end,
-        joints=tuple(joints),
-        meshes={link: parts for link, parts in meshes.items() if parts},
-        notes=(*tree.notes, *passive_notes(srdf, joints)),
-        root=tree.root,
-        above=tree.above(base),
-        poses={} if srdf is None else dict(srdf.poses),
-    )
-    resting = {} if srdf is None else srdf.resting()
-    rest = {
-        joint.name: float(np.clip(resting.get(joint.name, 0.0), joint.lower, joint.upper))
-        for joint in joints
-        if joint.kind in MOVING_KINDS and (joint.name not in planned or joint.lower == joint.upper)
-    }
-    robot = replace(robot, locked=following(robot.joints, rest)).with_locked(locked or {})
-    if robot.dof == 0:
-        raise InputError(
-            f"{tree.path}: no movable joint between {base} and {end}; choose another --base or --tip"
-        )
-    refuse_linkages(tree.path, robot)
-    return robot
-
-
-def collision_surfaces(
-    path: str | Path, links: Iterable[str], packages: dict[str, str | Path] | None = None
-) -> dict[str, tuple[Surface, ...]]:
-    """The collision meshes of links as the URDF has them, in the links' frames, for those that have any.
-
-    Raises InputError as read_urdf does.
-    """
-    tree = _Tree(Path(path), packages or {})
-    surfaces = {link: tree.surfaces(link) for link in links}
-    return {link: parts for link, parts in surfaces.items() if parts}
-
-
-def robot_name(path: str | Path, packages: dict[str, str | Path] | None = None) -> str:
-    """What a URDF or xacro file calls its robot."""
-    return _Tree(Path(path), packages or {}).name
-
-
-def content_hash(path: str | Path, packages: dict[str, str | Path] | None = None) -> str:
-    """SHA-256 of a URDF, compiled if it is a xacro file, and of the collision meshes it names: equal if the
-    robot is."""
-    tree = _Tree(Path(path), packages or {})
-    digest = hashlib.sha256(tree.text)
-    for element in tree.links.values():
-        for mesh in element.findall(f"{tree.kind}/geometry/mesh"):
-            digest.update(tree.packages.file(mesh.get("filename", "")).read_bytes())
-    return digest.hexdigest()
+    """A robot from a URDF or xacro file, see `UrdfTree.robot`; `packages` are folders by name, see
+    `robots.packages`."""
+    return UrdfTree(Path(path), packages or {}).robot(base, tip, locked, group, srdf)
 
 
 @dataclass
-class _Tree:
+class UrdfTree:
     """The links and joints of one URDF file, checked as they are read."""
 
     path: Path
     folders: dict[str, str | Path]
     """Of packages by name."""
     notes: list[str] = field(default_factory=list)
+    _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.packages = Packages(self.path, self.folders)
@@ -164,6 +88,75 @@ class _Tree:
                 + (f" ({', '.join(roots[:5])}); connect them with fixed joints" if roots else ": a loop")
             )
         self.root = roots[0]
+
+    def robot(
+        self,
+        base: str | None = None,
+        tip: str | None = None,
+        locked: dict[str, float] | None = None,
+        group: str | None = None,
+        srdf: Srdf | None = None,
+    ) -> Robot:
+        """A robot from a URDF or xacro file, with convex collision meshes and without spheres.
+
+        `base` is the root of the tree by default; where it stands in the root's frame is kept, for scenes
+        that are given there, while links above it are left out. `group` names a group of the SRDF, or an arm
+        by what the names of its joints begin with; `tip` a link. Without both, the robot must have one arm:
+        from the base as far as the link where a gripper or a hand begins (`robots.groups` tells how these are
+        known), else to the deepest link. So it is panda_hand for a Panda with fingers.
+
+        Planned are the movable joints of the group, or all from base to tip; less passive ones and those that
+        mimic others. All other joints are locked: at what `locked` says, in a pose of the SRDF, or at zero
+        clipped into their limits; mimic joints where the joint that they follow puts them.
+
+        Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity and 10 / s times the
+        acceleration (see limits.py to set them). Collision elements become convex hulls in the link's frame;
+        cylinders, capsules and spheres become polyhedra around them. If no link has any, visual ones are
+        taken, with a note.
+
+        Raises InputError, one line that names the file, for anything missing or contradictory in it.
+        """
+        base = base or self.root
+        if base not in self.links:
+            raise unknown_name(f"base link in {self.path.name}", base, self.links)
+        joints = self.below(base)
+        names = [base, *(joint.child for joint in joints)]
+        planned, end = planned_joints(self.path, base, joints, tip, group, srdf)
+        meshes = self.geometry(names)
+        robot = Robot(
+            name=self.name,
+            base=base,
+            tip=end,
+            joints=tuple(joints),
+            meshes={link: parts for link, parts in meshes.items() if parts},
+            notes=(*self.notes, *passive_notes(srdf, joints)),
+            root=self.root,
+            above=self.above(base),
+            poses={} if srdf is None else dict(srdf.poses),
+        )
+        resting = {} if srdf is None else srdf.resting()
+        rest = {
+            joint.name: float(np.clip(resting.get(joint.name, 0.0), joint.lower, joint.upper))
+            for joint in joints
+            if joint.kind in MOVING_KINDS and (joint.name not in planned or joint.lower == joint.upper)
+        }
+        robot = replace(robot, locked=following(robot.joints, rest)).with_locked(locked or {})
+        if robot.dof == 0:
+            raise InputError(
+                f"{self.path}: no movable joint between {base} and {end}; choose another --base or --tip"
+            )
+        refuse_linkages(self.path, robot)
+        return robot
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the URDF, compiled if it is a xacro file, and of the collision meshes it names: equal if
+        the robot is."""
+        digest = hashlib.sha256(self.text)
+        for element in self.links.values():
+            for mesh in element.findall(f"{self.kind}/geometry/mesh"):
+                digest.update(self.packages.file(mesh.get("filename", "")).read_bytes())
+        return digest.hexdigest()
 
     def _name(self, element: ET.Element, what: str) -> str:
         name = element.get("name")
@@ -308,7 +301,12 @@ class _Tree:
         return parts
 
     def surfaces(self, link: str) -> tuple[Surface, ...]:
-        """The link's collision elements, in its frame."""
+        """The link's collision elements as the file has them, in the link's frame."""
+        if link not in self._surfaces:
+            self._surfaces[link] = self._read_surfaces(link)
+        return self._surfaces[link]
+
+    def _read_surfaces(self, link: str) -> tuple[Surface, ...]:
         parts = []
         for element in self.links[link].findall(self.kind):
             geometry = element.find("geometry")
