@@ -25,6 +25,7 @@ CHAIN = (
     "scenes",
     "collision",
     "problems",
+    "rates",
     "verify",
     "paths",
 )
