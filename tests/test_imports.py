@@ -14,6 +14,8 @@ MODULES = sorted(SOURCE.rglob("*.py"))
 CHAIN = (
     "compile_cache",
     "errors",
+    "reading",
+    "checks",
     "registry",
     "settings",
     "files",

@@ -12,11 +12,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.checks import LARGEST, numbers, within
+from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import numbers, shown
 
 LIMIT_SLACK = 1e-5
 """Configurations that exceed a joint limit by no more than this are clamped, with a note [rad]."""
@@ -61,9 +61,10 @@ class PoseGoal:
         if not isinstance(self.frame, str):
             raise InputError(f"goal.frame is {shown(self.frame)}; it must be the name of a link")
         T = numbers(self.T_base_frame)
-        if T is None or T.shape != (4, 4) or not np.isfinite(T).all():
+        if T is None or T.shape != (4, 4) or not within(T):
             raise InputError(
-                f"goal.T_base_frame is {shown(self.T_base_frame)}; it must be 4 x 4 finite numbers"
+                f"goal.T_base_frame is {shown(self.T_base_frame)}; it must be 4 x 4 finite numbers within "
+                f"±{LARGEST:g}"
             )
         rotation = T[:3, :3]
         orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
@@ -121,7 +122,8 @@ class Problem:
                 raise unknown_name("link in goal.frame:", goal.frame, moved)
             if goal.frame not in moved:
                 raise InputError(
-                    f"goal.frame {goal.frame!r} is moved by no planned joint; these are: {', '.join(moved)}"
+                    f"goal.frame {shown(goal.frame)} is moved by no planned joint; these are: "
+                    f"{', '.join(moved)}"
                 )
         else:
             rows = goal.positions if isinstance(goal, JointGoal) else JointGoal(goal).positions
@@ -174,8 +176,8 @@ class Problem:
 def check_clearance(field: str, value: object) -> float:
     """The value as a distance [m]; InputError unless it is a finite number from 0 on."""
     clearance = numbers(value)
-    if clearance is None or clearance.ndim != 0 or not 0 <= clearance < np.inf:
-        raise InputError(f"{field} is {shown(value)}; it must be a distance of at least 0 m")
+    if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= LARGEST:
+        raise InputError(f"{field} is {shown(value)}; it must be a distance from 0 to {LARGEST:g} m")
     return float(clearance)
 
 
@@ -211,8 +213,10 @@ def _configuration(robot: Robot, field: str, value: object, notes: list[str]) ->
 
 def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float:
     unit = "m" if joint.kind == "prismatic" else "rad"
-    if not np.isfinite(value):
-        raise InputError(f"{field}: {joint.name} is {value}; it must be a finite number [{unit}]")
+    if not abs(value) <= LARGEST:
+        raise InputError(
+            f"{field}: {joint.name} is {value}; it must be a finite number within ±{LARGEST:g} [{unit}]"
+        )
     if joint.kind == "continuous":
         return float(value)
     within = float(np.clip(value, joint.lower, joint.upper))
