@@ -14,6 +14,8 @@ MODULES = sorted(SOURCE.rglob("*.py"))
 CHAIN = (
     "compile_cache",
     "errors",
+    "reading",
+    "checks",
     "registry",
     "settings",
     "files",
@@ -25,6 +27,7 @@ CHAIN = (
     "scenes",
     "collision",
     "problems",
+    "rates",
     "verify",
     "paths",
 )

@@ -191,7 +191,7 @@ def test_damaged_result_is_refused(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("{", "is not a JSON result file"),
+        ("{", "is not valid JSON"),
         ("[]", "must hold one JSON object"),
         ("{}", "status, reason, planner"),
     ],
@@ -204,7 +204,7 @@ def test_not_a_result_file(text: str, message: str, tmp_path: FilePath) -> None:
 
 
 def test_missing_result_file(tmp_path: FilePath) -> None:
-    with pytest.raises(InputError, match="cannot be read: No such file"):
+    with pytest.raises(InputError, match="does not exist"):
         load_result(tmp_path / "missing.json")
 
 

@@ -14,6 +14,7 @@ from robotdiffuse.collision import exact as exact_collision
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -30,6 +31,7 @@ from robotdiffuse.verify import (
 )
 
 Z = np.array([0.0, 0.0, 1.0])
+RATES = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
 
 
 def vector(*values: float) -> np.ndarray:
@@ -330,11 +332,10 @@ def test_trajectories() -> None:
     assert verify_trajectory(problem, trajectory(2.0)).valid
     # The peak speed is 1.5 * 1.2 / duration, the peak acceleration 6 * 1.2 / duration^2.
     assert refused(verify_trajectory(problem, trajectory(0.94)), "acceleration").time == 0
-    slow = replace(trajectory(2.0), accelerations=np.zeros((101, 3)))
-    quick = replace(slow, times=slow.times * 0.4, velocities=slow.velocities / 0.4)
-    found = refused(verify_trajectory(problem, quick), "velocity")
+    strong = replace(box_arm(), joints=tuple(replace(j, acceleration=20.0) for j in box_arm().joints))
+    found = refused(verify_trajectory(replace(problem, robot=strong), trajectory(0.8)), "velocity")
     assert found.subject == "j0"
-    assert found.excess == pytest.approx(0.05, abs=0.05)
+    assert found.excess == pytest.approx(1.5 * 1.2 / 0.8 - 2.0, abs=0.25)
     late = Scene([Sphere(1.1 * vector(np.cos(0.8), np.sin(0.8), 0), 0.05)])
     found = refused(verify_trajectory(replace(problem, scene=late), trajectory(2.0)), "scene_collision")
     assert 1.0 < found.time < 2.0
@@ -359,6 +360,101 @@ def test_trajectories_that_jump_or_run_backwards() -> None:
     object.__setattr__(good, "velocities", good.velocities[1:])
     with pytest.raises(InputError, match=r"trajectory\.velocities has 100 rows; positions has 101"):
         verify_trajectory(problem, good)
+
+
+def at_the_limit() -> Trajectory:
+    """The swing as fast as the velocity limit of 2 rad/s allows."""
+    return trajectory(1.5 * 1.2 / 2.0 * 1.0001)
+
+
+@pytest.mark.parametrize(
+    ("factor", "kind"), [(1.0, ""), (1.02, "velocity"), (1.49, "velocity"), (1.6, "jump")]
+)
+def test_times_compressed_under_rates_of_zero(factor: float, kind: str) -> None:
+    """Rates that a trajectory does not own up to are recomputed."""
+    robot = replace(box_arm(), joints=tuple(replace(joint, acceleration=1e3) for joint in box_arm().joints))
+    problem = Problem(robot, Scene(), SWING[0], JointGoal(SWING[1:]))
+    good = at_the_limit()
+    assert verify_trajectory(problem, good).valid
+    still = np.zeros_like(good.velocities)
+    quick = replace(good, times=good.times / factor, velocities=still, accelerations=still)
+    kinds = {wrong.kind for wrong in wrong_rates(robot, quick, RATES)}
+    assert kinds == ({kind, "velocity", "rates"} if kind else {"rates"})
+    assert not verify_trajectory(problem, quick).valid
+
+
+@pytest.mark.parametrize(
+    ("what", "factor"), [("velocities", -1), ("velocities", 0), ("accelerations", -1), ("accelerations", 0)]
+)
+def test_rates_that_are_not_those_of_the_positions(what: str, factor: float) -> None:
+    problem, _ = problem_and_path(SWING)
+    good = trajectory(1.0)
+    bad = replace(good, **{what: factor * getattr(good, what)})
+    found = {wrong.kind: wrong for wrong in wrong_rates(problem.robot, bad, RATES)}
+    assert set(found) == {"rates"}
+    assert refused(verify_trajectory(problem, bad), "rates").subject == "j0"
+    assert what[:5] in found["rates"].message
+
+
+@pytest.mark.parametrize("end", [0, -1])
+def test_motions_begin_and_end_at_rest(end: int) -> None:
+    """By what they say, and by their positions where they say that they rest."""
+    problem, _ = problem_and_path(SWING)
+    good = trajectory(2.0)
+    moving = good.velocities.copy()
+    moving[end, 0] = 0.5
+    kinds = {w.kind for w in wrong_rates(problem.robot, replace(good, velocities=moving), RATES)}
+    assert "rest" in kinds
+    assert not verify_trajectory(problem, replace(good, velocities=moving)).valid
+    times = np.linspace(0, 1.2, 121)
+    steady = SWING[0] + (times / 1.2)[:, None] * (SWING[1] - SWING[0])
+    rates = np.tile((SWING[1] - SWING[0]) / 1.2, (121, 1))
+    rates[[0, -1]] = 0
+    at_once = Trajectory(good.joint_names, times, steady, rates, np.zeros((121, 3)))
+    refused(verify_trajectory(problem, at_once), "acceleration")
+
+
+@given(st.integers(0, 2**31), st.sampled_from([0.01, 0.05, 0.3]))
+def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
+    """Full acceleration, coasting and braking in random turns, from rest to rest, at random rows."""
+    rng, robot = np.random.default_rng(seed), box_arm()
+    limit = robot.acceleration[0]
+    fine = np.repeat(rng.choice([-1.0, 0.0, 1.0], (12, 3)), 40, axis=0) * limit
+    step = 0.5 * robot.velocity[0] / np.abs(np.cumsum(fine, axis=0)).max()
+    fine = np.concatenate([fine, -fine])  # back to rest
+    speed = np.concatenate([np.zeros((1, 3)), np.cumsum(fine, axis=0)]) * step
+    place = np.concatenate([np.zeros((1, 3)), np.cumsum((speed[1:] + speed[:-1]) / 2, axis=0)]) * step
+    every = max(int(most / step), 1)
+    rows = np.unique([0, *np.sort(rng.choice(len(place), len(place) // every + 1)), len(place) - 1])
+    accelerations = np.concatenate([fine, fine[-1:]])[rows]
+    motion = Trajectory(robot.joint_names, rows * step, place[rows], speed[rows], accelerations)
+    wrong = {w.message for w in wrong_rates(robot, motion, replace(RATES, agreement=2.0))}
+    assert not wrong
+
+
+def test_rows_far_apart_are_judged_as_controllers_move_between_them() -> None:
+    """Out and back within one step: the rows stand in one place, the arm does not."""
+    robot = box_arm()
+    rows = np.zeros((4, 3))
+    speed = np.zeros((4, 3))
+    speed[1:3, 0] = 1.0, -1.0
+    rows[1:3, 0] = 0.5
+    rates = np.zeros((4, 3))
+    rates[:, 0] = 1.0, 0.0, -2.0, 2.0
+    out = Trajectory(robot.joint_names, np.array([0.0, 1.0, 2.0, 3.0]), rows, speed, rates)
+    problem = Problem(robot, Scene(), rows[0], JointGoal(rows[:1]))
+    assert verify_trajectory(problem, out).valid
+    ball = Sphere(1.1 * vector(np.cos(0.73), np.sin(0.73), 0), 0.02)
+    found = refused(verify_trajectory(replace(problem, scene=Scene([ball])), out), "scene_collision")
+    assert 1.0 < found.time < 1.5
+    times, positions = between_rows(out, 1e-3)
+    assert np.isin(out.times, times).all()
+    assert np.abs(positions[:, 0]).max() == pytest.approx(0.75, abs=1e-3)
+
+
+def test_a_motion_of_a_century_is_refused() -> None:
+    problem, _ = problem_and_path(SWING)
+    refused(verify_trajectory(problem, trajectory(3e9)), "time")
 
 
 def test_collision_alone_can_be_asked_for() -> None:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shown
 
 
 def write_atomically(file: Path, content: str | bytes, make_folder: bool = False) -> None:
@@ -37,7 +37,7 @@ def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:
     """
     path = Path(file)
     if path.suffix.lower() not in endings:
-        raise InputError(f"{path}: unknown ending {path.suffix!r}; known: {', '.join(endings)}")
+        raise InputError(f"{path}: unknown ending {shown(path.suffix)}; known: {', '.join(endings)}")
     if path.is_dir():
         raise InputError(f"{path} is a folder; name a file")
     if not path.parent.is_dir():

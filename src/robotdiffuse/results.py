@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shown
 from robotdiffuse.files import check_output, write_atomically
+from robotdiffuse.reading import read_json
 from robotdiffuse.types import ROWS, Path, Status, Trajectory
 
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
@@ -93,12 +94,7 @@ def load_result(file: str | FilePath) -> ResultFile:
 
     Raises InputError for a file that cannot be read and for fields that are missing, misshapen or not finite.
     """
-    try:
-        record = json.loads(FilePath(file).read_text())
-    except OSError as error:
-        raise InputError(f"{file} cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise InputError(f"{file} is not a JSON result file: {error}") from None
+    record = read_json(file)
     if not isinstance(record, dict):
         raise InputError(f"{file} is not a result file: it must hold one JSON object")
     missing = [name for name in REQUIRED if name not in record]
@@ -148,12 +144,12 @@ def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any
 def _result(record: dict[str, Any]) -> PlanResult:
     known = {status.value: status for status in Status}
     if record["status"] not in known:
-        raise InputError(f"status is {record['status']!r}; known: {', '.join(known)}")
+        raise InputError(f"status is {shown(record['status'])}; known: {', '.join(known)}")
     status = known[record["status"]]
     names = _names(record, "joint_names")
     solved = status is Status.SOLVED
     if record["verified"] is not solved:
-        raise InputError(f"verified is {record['verified']!r}, but status is {status.value!r}")
+        raise InputError(f"verified is {shown(record['verified'])}, but status is {shown(status.value)}")
     path = Path(names, _rows(record, "waypoints", None, len(names))) if solved else None
     trajectory = _trajectory(record, names) if solved and record.get("times") else None
     return PlanResult(
@@ -208,21 +204,21 @@ def _optional(record: dict[str, Any], name: str, kind: type) -> Any:
 
 def _text(record: dict[str, Any], name: str) -> str:
     if not isinstance(record[name], str):
-        raise InputError(f"{name} is {record[name]!r}; it must be text")
+        raise InputError(f"{name} is {shown(record[name])}; it must be text")
     return record[name]
 
 
 def _names(record: dict[str, Any], name: str) -> tuple[str, ...]:
     value = record[name]
     if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
-        raise InputError(f"{name} is {value!r}; it must be a list of texts")
+        raise InputError(f"{name} is {shown(value)}; it must be a list of texts")
     return tuple(value)
 
 
 def _number(record: dict[str, Any], name: str) -> float:
     value = record[name]
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise InputError(f"{name} is {value!r}; it must be a finite number")
+        raise InputError(f"{name} is {shown(value)}; it must be a finite number")
     return float(value)
 
 

@@ -22,9 +22,8 @@ from itertools import pairwise
 from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import yaml
-
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.reading import parse_yaml
 from robotdiffuse.registry import Registry
 
 Given = TypeVar("Given", bound="Settings")
@@ -149,7 +148,7 @@ class Settings:
         or out of bounds.
         """
         if not isinstance(values, dict):
-            raise InputError(f"{where} is {values!r}; it must be a table of settings")
+            raise InputError(f"{where} is {shown(values)}; it must be a table of settings")
         hints, fields = _hints(cls), {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
         for name in values:
             if name not in fields:
@@ -180,12 +179,12 @@ class Settings:
             name, equals, value = text.partition("=")
             known = {setting.name: setting.assignment for setting in self.describe()}
             if not equals or not name:
-                raise InputError(f"{text!r} is not NAME=VALUE; {where} has {', '.join(known.values())}")
+                raise InputError(f"{shown(text)} is not NAME=VALUE; {where} has {', '.join(known.values())}")
             if name not in known:
-                raise InputError(f"{where} has no setting {name!r}; it has {', '.join(known.values())}")
+                raise InputError(f"{where} has no setting {shown(name)}; it has {', '.join(known.values())}")
             try:
-                parsed = yaml.safe_load(value)
-            except yaml.YAMLError:
+                parsed = parse_yaml(value, name)
+            except InputError:
                 parsed = value
             if isinstance(parsed, str):
                 # YAML 1.1 takes 1e-3 for text, and knows none as null
@@ -301,7 +300,7 @@ def _typed(hint: Any, value: Any, where: str) -> Any:
     if float in plain and type(value) is int:
         return float(value)
     wanted = " or ".join("none" if kind is type(None) else kind.__name__ for kind in plain)
-    raise InputError(f"{where} is {value!r}; it must be of type {wanted}")
+    raise InputError(f"{where} is {shown(value)}; it must be of type {wanted}")
 
 
 def _number(text: str) -> float | str:

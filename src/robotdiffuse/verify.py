@@ -1,7 +1,8 @@
 """The judge: is a motion free of collision, within limits, and from the start to the goal?
 
-Collision between waypoints is settled by a certificate, not by sampling: see collision/motion.py. The
-judge knows nothing of planners.
+Collision between waypoints is settled by a certificate, not by sampling: see collision/motion.py. The rates
+of a trajectory are those of its positions over its times, whatever it says of itself: see rates.py. The judge
+knows nothing of planners.
 """
 
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from robotdiffuse.collision.motion import Contact, ContinuousCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Bound, Natural, NotNegative, Positive, Settings
@@ -47,9 +49,16 @@ class VerifySettings(Settings, name="verify"):
     rest: NotNegative = 1e-6
     """A motion stands still where no joint is faster than this [rad/s] or [m/s]."""
     rate_slack: NotNegative = 0.01
-    """Share by which a trajectory may exceed velocity and acceleration limits."""
+    """Share by which a trajectory may exceed velocity and acceleration limits; also the share of a velocity
+    limit by which the velocities that it says may be off, and at which it is at rest."""
+    rate_agreement: NotNegative = 0.5
+    """Share of the greatest acceleration of the joint by which one that a trajectory says may lie outside of
+    the mean ones before and after its row."""
     jump: Positive = 1.5
     """A step of a trajectory longer than this times what the velocity limit allows in its time is a jump."""
+    chord: Positive = 1e-3
+    """Between rows a trajectory is judged on straight lines, unless the cubic through their positions and
+    velocities, as controllers follow it, leaves them by more than this [rad] or [m]: then along the cubic."""
     reversal_angle: NotNegative = float(np.radians(150))
     """A turn in joint space by more than this [rad] is a sharp reversal ..."""
     reversal_step: NotNegative = 0.05
@@ -61,6 +70,8 @@ class VerifySettings(Settings, name="verify"):
 
 
 DEFAULT = VerifySettings()
+LONGEST = 1e5
+"""Motion that is judged [s], about a day."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +80,7 @@ class Violation:
 
     kind: str
     """not_finite, start, limits, scene_collision, self_collision, twitch, waypoint or goal; for trajectories
-    also time, velocity, acceleration and jump."""
+    also time, rest, velocity, acceleration, jump and rates."""
     time: float
     """Where: for a path, waypoint index plus fraction of the segment; for a trajectory, seconds."""
     message: str
@@ -110,7 +121,8 @@ def verify(problem: Problem, path: Path, settings: VerifySettings = DEFAULT) -> 
 
 
 def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
-    """Judge a trajectory, taken as straight in joint space between its rows, with its rates and times."""
+    """Judge a trajectory with its rates and times. Its velocities and accelerations must be those of its
+    positions, from rest to rest; for what is between the rows see `VerifySettings.chord`."""
     return verifier(problem, settings).trajectory(trajectory)
 
 
@@ -142,8 +154,19 @@ class Verifier:
             at = float(trajectory.times[backwards[0] + 1])
             message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
             return Report(False, Violation("time", at, message), None, None)
-        at_rest = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
-        return self._report(trajectory.positions, trajectory.times, self._rates(trajectory), at_rest)
+        if trajectory.duration - trajectory.times[0] > LONGEST:
+            message = f"the motion takes {trajectory.duration:.6g} s; at most {LONGEST:g} s can be judged"
+            return Report(False, Violation("time", float(trajectory.times[0]), message), None, None)
+        if not np.isfinite(trajectory.positions).all():
+            return self._report(trajectory.positions, trajectory.times, [])
+        found = [
+            Violation(wrong.kind, wrong.time, wrong.message, wrong.joint, None, wrong.excess)
+            for wrong in wrong_rates(self.robot, trajectory, self._rate_tolerances)
+        ]
+        rows = trajectory.times, trajectory.positions
+        times, positions = rows if found else between_rows(trajectory, self.settings.chord)
+        still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
+        return self._report(positions, times, found, np.isin(times, trajectory.times[still]))
 
     def collision_free(self, path: Path) -> bool:
         """Whether a path is certified free of collision; neither its ends nor limits are looked at."""
@@ -172,11 +195,9 @@ class Verifier:
             message = f"waypoint {bad[0]} holds values that are not finite"
             return Report(False, Violation("not_finite", at, message), None, None)
         clock = np.arange(len(q), dtype=float) if times is None else times
-        found = [
-            v
-            for v in (self._start(q), self._limits(q, clock), *found, self._twitch(q, clock))
-            if v is not None
-        ]
+        limits = self._limits(q, clock, "waypoint {:g}" if times is None else "{:.3f} s")
+        every = (self._start(q), limits, *found, self._twitch(q, clock))
+        found = [violation for violation in every if violation is not None]
         first = min(found, key=lambda violation: violation.time, default=None)
         last = len(q) - 1 if first is None else int(np.searchsorted(clock, first.time))
         sweep = self._continuous.sweep(q[: last + 1])
@@ -203,7 +224,7 @@ class Verifier:
         )
         return Violation("start", 0.0, message, name, None, excess)
 
-    def _limits(self, q: ndarray, clock: ndarray) -> Violation | None:
+    def _limits(self, q: ndarray, clock: ndarray, place: str) -> Violation | None:
         excess = np.maximum(self.robot.lower - q, q - self.robot.upper)
         excess[:, self.robot.continuous] = 0.0
         bad = np.flatnonzero((excess > self.settings.limit_slack).any(axis=1))
@@ -211,27 +232,9 @@ class Verifier:
             return None
         i, j = int(bad[0]), int(excess[bad[0]].argmax())
         name, low, high = self.robot.joint_names[j], self.robot.lower[j], self.robot.upper[j]
-        message = f"{name} is {q[i, j]:.6g} at waypoint {i}; its limits are {low:.6g} to {high:.6g}"
+        at = place.format(clock[i])
+        message = f"{name} is {q[i, j]:.6g} at {at}; its limits are {low:.6g} to {high:.6g}"
         return Violation("limits", float(clock[i]), message, name, None, float(excess[i, j]))
-
-    def _rates(self, trajectory: Trajectory) -> list[Violation]:
-        """Velocity and acceleration limits (0: the robot gives none), and steps too long for their time."""
-        share, robot, found = 1 + self.settings.rate_slack, self.robot, []
-        steps = np.abs(np.diff(trajectory.positions, axis=0)) / np.diff(trajectory.times)[:, None]
-        for kind, rates, limit, factor, what in (
-            ("velocity", trajectory.velocities, robot.velocity, share, "velocity"),
-            ("acceleration", trajectory.accelerations, robot.acceleration, share, "acceleration"),
-            ("jump", steps, robot.velocity, self.settings.jump, "mean velocity from here to the next row"),
-        ):
-            most = np.where(limit > 0, limit, np.inf)
-            bad = np.flatnonzero((np.abs(rates) > most * factor).any(axis=1))
-            if len(bad):
-                i = int(bad[0])
-                j = int((np.abs(rates[i]) / most).argmax())
-                name, rate, time = robot.joint_names[j], abs(float(rates[i, j])), float(trajectory.times[i])
-                message = f"{name} at {time:.3f} s: its {what} is {rate:.6g}, its limit {limit[j]:.6g}"
-                found.append(Violation(kind, time, message, name, None, rate - float(limit[j])))
-        return found
 
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
         """More sharp reversals than allowed, counted on waypoints at least `reversal_step` apart."""
@@ -268,6 +271,13 @@ class Verifier:
                 return Violation("waypoint", float(clock[-1]), message, f"waypoints[{k}]", None, None)
             after = int(stop)
         return None
+
+    @property
+    def _rate_tolerances(self) -> RateTolerances:
+        settings = self.settings
+        return RateTolerances(
+            settings.rate_slack, settings.rate_agreement, settings.jump, settings.limit_slack
+        )
 
     @cached_property
     def _continuous(self) -> ContinuousCollision:

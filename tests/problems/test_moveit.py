@@ -20,10 +20,10 @@ from robotdiffuse.problems.moveit import (
     read_moveit_scene,
 )
 from robotdiffuse.problems.problem import JointGoal, PoseGoal
+from robotdiffuse.reading import read_yaml
 from robotdiffuse.robots import Robot, load_robot
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
 from robotdiffuse.robots.urdf import read_urdf
-from robotdiffuse.scenes.files import read_yaml
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
 from robotdiffuse.transforms import rotation_about, rotation_from_quaternion
 

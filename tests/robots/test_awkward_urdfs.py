@@ -169,7 +169,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "loose links": (arm(ARM, link("loose")), r"2 \(base, loose\); connect them with fixed joints"),
     "an empty file": (text(""), "not well-formed XML"),
     "an MJCF file": (text("<mujoco/>"), "root element is <mujoco>.*convert"),
-    "a folder": (lambda folder: folder, "cannot read the URDF"),
+    "a folder": (lambda folder: folder, "cannot be read: it is a folder"),
     "an axis of zero length": (arm(chain("base", row("j", 3), axis="0 0 0")), "its axis is zero"),
     "limits that are no numbers": (arm(chain("base", ["j"], limits='lower="nan" upper="1"')), "is 'nan'"),
     "a triangle": (
@@ -181,7 +181,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
         solid(b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n", "part.obj"),
         "holds no triangle mesh",
     ),
-    "a damaged mesh": (solid(b"this is no mesh", "part.dae"), "cannot read"),
+    "a damaged mesh": (solid(b"this is no mesh", "part.dae"), "cannot be read"),
     "a name that is a path": (arm(ARM, name="../made"), "give --name NAME"),
     "a shape nobody knows": (
         text(robot(ARM).replace("<sphere radius", "<torus radius")),

@@ -259,7 +259,7 @@ def test_limits_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(robot.jerk, [80, 35])
     np.testing.assert_allclose(robot.lower, [-2, -1])
     for text, message in (
-        ("joint_limits: [", "not YAML"),
+        ("joint_limits: [", "not valid YAML"),
         ("limits: {}", "no joint_limits"),
         ("joint_limits: {turn: {max_speed: 1}}", "'max_speed'"),
         ("joint_limits: {turn: {max_velocity: -1}}", "max_velocity of turn is -1"),

@@ -12,8 +12,9 @@ from numpy import ndarray
 from trimesh.triangles import closest_point
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.reading import read_triangles, read_yaml
 from robotdiffuse.scenes.files import SHAPES as KINDS
-from robotdiffuse.scenes.files import read_mesh, read_scene, read_yaml, scene_entries
+from robotdiffuse.scenes.files import read_scene, scene_entries
 from robotdiffuse.scenes.point_cloud import crop, read_points, voxel_thin
 from robotdiffuse.scenes.sampling import DRAWS, VisibleRegion, sample_surface
 from robotdiffuse.scenes.scene import Scene
@@ -159,7 +160,10 @@ def test_region_refuses_a_floor_above_the_reach() -> None:
         (lambda: Mesh([[0, 0, 0]], [[0, 0, 1]]), "indices of the 1 vertices"),
         (lambda: Mesh([[0, 0, 0]], []), "mesh.faces"),
         (lambda: PointCloud([[0, 0]]), "an array of 1 x 2; it must be n x 3"),
-        (lambda: PointCloud([[0, 0, np.inf]]), "1 points that are not finite"),
+        (
+            lambda: PointCloud([[0, 0, np.inf]]),
+            r"points\[0\] is \[0.0, 0.0, inf\]; it must be finite numbers",
+        ),
         (lambda: PointCloud([[0, 0, 0], [1]]), "not numbers"),
         (lambda: PointCloud([], point_radius=0), "point_cloud.point_radius is 0"),
         (lambda: Scene(["ball"]), r"scene\[0\] is a str"),  # type: ignore[list-item]
@@ -324,7 +328,7 @@ def test_wrong_point_files(name: str, content: bytes | None, message: str, tmp_p
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply", "off", "glb"])
 def test_mesh_files(ending: str, tmp_path: Path) -> None:
     trimesh.creation.box([1, 2, 3]).export(tmp_path / f"box.{ending}")
-    vertices, faces = read_mesh(tmp_path / f"box.{ending}")
+    vertices, faces = read_triangles(tmp_path / f"box.{ending}")
     assert len(faces) == 12
     assert np.abs(vertices).max(axis=0) == pytest.approx([0.5, 1, 1.5])
 
@@ -343,7 +347,7 @@ def test_wrong_mesh_files(name: str, content: bytes | None, message: str, tmp_pa
     if content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises(InputError, match=message) as raised:
-        read_mesh(tmp_path / name)
+        read_triangles(tmp_path / name)
     assert "\n" not in str(raised.value)
 
 

@@ -5,7 +5,7 @@ import os
 from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import count, positive
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shown
 from robotdiffuse.problems.families import FAMILIES
 
 if TYPE_CHECKING:
@@ -180,7 +180,7 @@ def _limits(text: str) -> list[float]:
     try:
         return [positive(part) for part in text.split(",")]
     except (argparse.ArgumentTypeError, ValueError):
-        raise InputError(f"limits are {text!r}; they must be positive times [s], as 0.1,1,10") from None
+        raise InputError(f"limits are {shown(text)}; they must be positive times [s], as 0.1,1,10") from None
 
 
 def print_bench(bench: "Bench", parts: "list[Section]") -> None:

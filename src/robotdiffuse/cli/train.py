@@ -5,7 +5,7 @@ import os
 from contextlib import nullcontext
 
 from robotdiffuse.cli.arguments import count, names, natural, positive, share
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shown
 
 SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
 PARTS = (
@@ -161,8 +161,8 @@ def run_planner(arguments: argparse.Namespace) -> int:
     from robotdiffuse.learning.training.planner import train_planner
 
     if arguments.config not in CONFIGS:
-        known = "".join(f"\n  {name}: {config.description}" for name, config in CONFIGS.items())
-        raise InputError(f"unknown config {arguments.config!r}; known:{known}")
+        known = [f"{name}: {config.description}" for name, config in CONFIGS.items()]
+        raise InputError(f"unknown config {shown(arguments.config)}; known:", known)
     given = _given(arguments, ("data", "encoder", "robot", "device", *SHARED, *PARTS))
     if "denoiser" in given and CONFIGS[arguments.config].changes.get("denoiser_settings") is not None:
         # the config's are of its own denoiser; those of another of the same size

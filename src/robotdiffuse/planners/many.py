@@ -8,7 +8,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shown
 from robotdiffuse.planners import DEFAULT_PLANNER, load_planner
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call, Request
@@ -45,7 +45,7 @@ def plan_many(
         raise InputError(f"workers is {workers}; it must be at least 1")
     unknown = set(request) - ARGUMENTS
     if unknown:
-        raise InputError(f"unknown argument {min(unknown)!r}; known: {', '.join(sorted(ARGUMENTS))}")
+        raise InputError(f"unknown argument {shown(min(unknown))}; known: {', '.join(sorted(ARGUMENTS))}")
     load_planner(planner, settings, weights)
     asked = dict(request)
     if problems:

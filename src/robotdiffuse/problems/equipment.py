@@ -12,12 +12,13 @@ from typing import Any
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.checks import unit_quaternion, vector
+from robotdiffuse.errors import InputError, shown
 from robotdiffuse.robots.bodies import TOOL
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import IDENTITY, Shape, shown, unit_quaternion, vector
+from robotdiffuse.scenes.shapes import IDENTITY, Shape
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
 ORIGIN = (0.0, 0.0, 0.0)

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import yaml
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.checks import numbers
+from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.equipment import (
     equipment_entries,
     equipped,
@@ -26,13 +27,13 @@ from robotdiffuse.problems.problem import (
     check_clearance,
     moved_goal,
 )
+from robotdiffuse.reading import parse_json, parse_yaml, read_text, read_yaml
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.depth_view import DepthView
 from robotdiffuse.scenes.depth_view_files import read_views, view_entry
-from robotdiffuse.scenes.files import check_fields, read_scene, read_text, read_yaml, scene_entries
+from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import numbers, shown
 
 FIELDS = ("robot", "scene", "start", "goal")
 OPTIONAL = ("locked", "base", "tool", "attached", "waypoints", "clearance", "views", "unseen")
@@ -69,10 +70,10 @@ def load_problem(file: str | Path, index: int = 0) -> Problem:
         if not 0 <= index < len(lines):
             raise InputError(f"index is {index}; {file} holds {len(lines)} problems, counted from 0")
         number, line = lines[index]
-        return _problem(f"{file}, line {number}", _json(f"{file}, line {number}", line), file.parent)
+        return _problem(f"{file}, line {number}", parse_json(line, f"{file}, line {number}"), file.parent)
     if index != 0:
         raise InputError(f"index is {index}; {file} holds one problem, and only .jsonl files hold more")
-    data = _json(str(file), text) if file.suffix.lower() == ".json" else read_yaml(file)
+    data = parse_json(text, str(file)) if file.suffix.lower() == ".json" else parse_yaml(text, str(file))
     return _problem(str(file), data, file.parent)
 
 
@@ -90,7 +91,7 @@ def load_problems(file: str | Path) -> list[ProblemEntry]:
     entries = []
     for number, line in _lines(read_text(file)):
         where = f"{file}, line {number}"
-        problem = _problem(where, _json(where, line), file.parent)
+        problem = _problem(where, parse_json(line, where), file.parent)
         entries.append(ProblemEntry(f"{file.stem}:{number}", problem))
     return entries
 
@@ -113,7 +114,8 @@ def problem_record(
         robot = problem.robot.source or problem.robot.name
         if problem.robot.source is None and robot not in ROBOTS:
             raise InputError(
-                f"robot {robot!r} is neither bundled nor read from a file; give the path of its URDF as robot"
+                f"robot {shown(robot)} is neither bundled nor read from a file; give the path of its URDF as "
+                f"robot"
             )
     folder = None if folder is None else Path(folder)
     scene, goal, views, T = problem.known_scene, problem.goal, problem.views, problem.T_world_base
@@ -245,14 +247,6 @@ def _requested(
         return Problem(robot, scene, start, PoseGoal(*request.pose_goal), (), clearance, views, unseen)
     goals = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
     return Problem(robot, scene, start, JointGoal(goals), (), clearance, views, unseen)
-
-
-def _json(where: str, text: str) -> object:
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
-        at = f"line {error.lineno}, column {error.colno}"
-        raise InputError(f"{where} is not valid JSON: {error.msg} at {at}") from None
 
 
 def _problem(where: str, data: object, folder: Path) -> Problem:

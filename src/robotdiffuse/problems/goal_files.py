@@ -12,12 +12,12 @@ from typing import Any
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.checks import numbers, unit_quaternion, vector
+from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.equipment import pose_entry
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import numbers, shown, unit_quaternion, vector
 from robotdiffuse.transforms import rotation_from_quaternion, transform
 
 GOALS = ("joints", "joint_set", "pose", "any")

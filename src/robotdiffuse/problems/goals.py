@@ -11,8 +11,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.scenes.shapes import numbers, shown
+from robotdiffuse.checks import LARGEST, numbers, within
+from robotdiffuse.errors import InputError, shown
 from robotdiffuse.transforms import rotation_from_rpy, transform
 
 RIGID_SLACK = 1e-4
@@ -129,8 +129,8 @@ def moved_goal(goal: Any, T: Float[ndarray, "4 4"]) -> Any:
 def check_pose(field: str, value: object) -> Float[ndarray, "4 4"]:
     """The value as a rigid transform; InputError for anything else."""
     T = numbers(value)
-    if T is None or T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError(f"{field} is {shown(value)}; it must be 4 x 4 finite numbers")
+    if T is None or T.shape != (4, 4) or not within(T):
+        raise InputError(f"{field} is {shown(value)}; it must be 4 x 4 finite numbers within ±{LARGEST:g}")
     rotation = T[:3, :3]
     orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
     if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():

@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.checks import unit_quaternion, vector
+from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.reading import read_triangles, read_yaml
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.files import read_mesh, read_yaml
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Shape, Sphere, shown, unit_quaternion, vector
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Shape, Sphere
 from robotdiffuse.transforms import inverse, quaternion_from_rotation, rotation_from_quaternion, transform
 
 PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shape]]] = {
@@ -91,7 +92,7 @@ class MoveItFrames(dict[str, ndarray]):
         known = [frame for frame in self if frame]
         if self.lost:
             raise InputError(
-                f"frame_id of {where} is {name!r}, and where the robot's base is in it cannot be known: "
+                f"frame_id of {where} is {shown(name)}, and where the robot's base is in it cannot be known: "
                 f"{self.lost}; known frames: {', '.join(known)}"
             )
         raise unknown_name(f"frame_id of {where}:", name, known)
@@ -185,7 +186,7 @@ def _mesh(where: str, part: dict[str, Any], xyz: ndarray, wxyz: ndarray, name: s
         file = str(part["resource"]).removeprefix("file://")
         if "://" in file:
             raise InputError(f"{where}.resource is {file}; it must be a file, or the vertices be given")
-        vertices, faces = read_mesh(folder / file)
+        vertices, faces = read_triangles(folder / file)
         vertices = vertices * vector(where, "dimensions", part.get("dimensions", [1, 1, 1]), 3)
     else:
         rows = _list(f"{where}.vertices", part.get("vertices"))

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.checks import LARGEST, numbers
+from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
 from robotdiffuse.problems.goals import Goal, check_pose, moved_goal
 from robotdiffuse.problems.goals import JointGoal as JointGoal
@@ -20,7 +21,6 @@ from robotdiffuse.problems.goals import PoseGoal as PoseGoal
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import numbers, shown
 from robotdiffuse.transforms import inverse
 
 LIMIT_SLACK = 1e-5
@@ -166,8 +166,8 @@ class Problem:
 def check_clearance(field: str, value: object) -> float:
     """The value as a distance [m]; InputError unless it is a finite number from 0 on."""
     clearance = numbers(value)
-    if clearance is None or clearance.ndim != 0 or not 0 <= clearance < np.inf:
-        raise InputError(f"{field} is {shown(value)}; it must be a distance of at least 0 m")
+    if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= LARGEST:
+        raise InputError(f"{field} is {shown(value)}; it must be a distance from 0 to {LARGEST:g} m")
     return float(clearance)
 
 
@@ -225,8 +225,10 @@ def _configuration(robot: Robot, field: str, value: object, notes: list[str]) ->
 
 def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float:
     unit = "m" if joint.kind == "prismatic" else "rad"
-    if not np.isfinite(value):
-        raise InputError(f"{field}: {joint.name} is {value}; it must be a finite number [{unit}]")
+    if not abs(value) <= LARGEST:
+        raise InputError(
+            f"{field}: {joint.name} is {value}; it must be a finite number within ±{LARGEST:g} [{unit}]"
+        )
     if joint.kind == "continuous":
         return float(value)
     within = float(np.clip(value, joint.lower, joint.upper))

@@ -5,6 +5,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.reading import is_file
 from robotdiffuse.robots.bundle import MESH_FILE, ROBOT_FILE, read_bundle, read_source
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 
@@ -24,7 +25,7 @@ def load_robot(name: str | Path, locked: dict[str, float] | None = None) -> Robo
     InputError for an unknown name or bad input.
     """
     text = str(name)
-    if (Path(name) / ROBOT_FILE).is_file():
+    if is_file(Path(name) / ROBOT_FILE):
         robot = _read(Path(name), str(Path(name).resolve()))
     elif isinstance(name, Path) or text.endswith((".urdf", ".xacro", ".xml")) or "/" in text or "\\" in text:
         robot = _from_urdf(Path(name))
@@ -51,7 +52,7 @@ def _state(file: Path) -> tuple[int, int, int] | None:
     """What changes when a file is written; None if there is none."""
     try:
         found = file.stat()
-    except OSError:
+    except (OSError, ValueError):
         return None
     return found.st_mtime_ns, found.st_size, found.st_ino
 

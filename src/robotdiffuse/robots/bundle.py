@@ -10,12 +10,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.checks import LARGEST, unit_quaternion, within
+from robotdiffuse.errors import InputError, shortened, shown
+from robotdiffuse.reading import read_arrays, read_json
 from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
 FORMAT = 2
 """2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""
+AXIS_SLACK = 1e-3
+"""Of a joint axis's length."""
 WHOLE_TURN = 6.283
 """A continuous joint whose limits are narrower than this is revolute [rad]: older files may hold some."""
 ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
@@ -55,12 +59,36 @@ def read_bundle(folder: str | Path) -> Robot:
     meshes = _unpack(Path(folder) / MESH_FILE)
     try:
         robot = _from_json(data, meshes)
+        _check_tree(robot)
         robot.frame_offsets  # noqa: B018  (walks the tree: fails if a joint has no parent)
         if robot.dof == 0 or not set(robot.spheres) <= set(robot.link_names):
             raise ValueError("no planned joints, or spheres of an unknown link")
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-        raise InputError(f"{Path(folder) / ROBOT_FILE} is damaged: {type(error).__name__}: {error}") from None
+        raise InputError(
+            f"{Path(folder) / ROBOT_FILE} is damaged: {type(error).__name__}: {shortened(str(error))}"
+        ) from None
     return robot
+
+
+def _check_tree(robot: Robot) -> None:
+    """Raises ValueError unless each joint hangs from the base or from a link of a joint before it."""
+    links = {robot.base}
+    for joint in robot.joints:
+        if joint.parent not in links or joint.child in links:
+            raise ValueError(f"joint {joint.name} is not part of a tree, parents before children")
+        links.add(joint.child)
+    leaders = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
+    for name in leaders:
+        seen = set[str]()
+        while name in leaders:
+            if name in seen:
+                raise ValueError(f"joint {name} mimics itself")
+            seen.add(name)
+            name = leaders[name]
+    if robot.tip not in links or not {*robot.meshes} <= links:
+        raise ValueError("the tip or meshes of an unknown link")
+    if any((rows[:, 3] <= 0).any() for rows in robot.spheres.values() if len(rows)):
+        raise ValueError("spheres without a size")
 
 
 def read_source(folder: str | Path) -> dict[str, str]:
@@ -130,12 +158,7 @@ def _dump(data: dict) -> str:
 
 
 def _read_json(file: Path) -> dict:
-    try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror}") from None
-    except ValueError as error:
-        raise InputError(f"{file} is damaged: {error}") from None
+    data = read_json(file)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise InputError(
             f"{file} is not a robot of format {FORMAT}; make it again with: robotdiffuse robot add"
@@ -169,11 +192,14 @@ def _joint_from_json(data: dict) -> Joint:
     if kind == "fixed":
         return Joint(name, kind, str(data["parent"]), str(data["child"]), T, np.array([0.0, 0.0, 1.0]))
     if kind not in MOVING_KINDS:
-        raise ValueError(f"joint {name} is of kind {kind!r}")
+        raise ValueError(f"joint {name} is of kind {shown(kind)}")
     axis = _array([data["axis"]], 3, f"joint {name}: axis")[0]
     lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
-    if not lower <= upper or not min(velocity, acceleration, jerk) > 0:
+    rates = (velocity, acceleration, jerk)
+    if not -LARGEST <= lower <= upper <= LARGEST or not min(rates) > 0 or not max(rates) < np.inf:
         raise ValueError(f"joint {name}: limits")
+    if not abs(np.linalg.norm(axis) - 1) < AXIS_SLACK:
+        raise ValueError(f"joint {name}: an axis of length 1 expected")
     if kind == "continuous" and upper - lower < WHOLE_TURN:
         kind = "revolute"
     elif kind == "continuous":
@@ -188,14 +214,14 @@ def _joint_from_json(data: dict) -> Joint:
 
 def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:
     xyz = _array([data["xyz"]], 3, f"{what}: xyz")[0]
-    wxyz = _array([data["wxyz"]], 4, f"{what}: wxyz")[0]
+    wxyz = unit_quaternion(what, data["wxyz"])
     return transform(xyz, rotation_from_quaternion(wxyz))
 
 
 def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
     array = np.asarray(rows, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != width or not np.isfinite(array).all():
-        raise ValueError(f"{what}: {width} finite numbers in each row expected")
+    if array.ndim != 2 or array.shape[1] != width or not within(array):
+        raise ValueError(f"{what}: {width} finite numbers within ±{LARGEST:g} in each row expected")
     return array
 
 
@@ -212,17 +238,17 @@ def _pack(robot: Robot) -> dict[str, ndarray]:
 
 def _unpack(file: Path) -> dict[str, tuple[ConvexMesh, ...]]:
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            links, sizes, vertices, faces = (archive[key] for key in ("links", "sizes", "vertices", "faces"))
+        arrays = read_arrays(file)
+        links, sizes, vertices, faces = (arrays[key] for key in ("links", "sizes", "vertices", "faces"))
         ends = np.cumsum(sizes, axis=0)
         if len(links) and (ends[-1] != (len(vertices), len(faces))).any():
             raise ValueError("sizes do not add up")
         meshes: dict[str, tuple[ConvexMesh, ...]] = {}
         for link, (v, f), (v_end, f_end) in zip(links, sizes, ends, strict=True):
-            mesh = ConvexMesh(
-                np.asarray(vertices[v_end - v : v_end], np.float64),
-                np.asarray(faces[f_end - f : f_end], np.int64),
-            )
+            corners = _array(vertices[v_end - v : v_end], 3, f"vertices of {link}")
+            mesh = ConvexMesh(corners, np.asarray(faces[f_end - f : f_end], np.int64))
+            if not ((mesh.faces >= 0) & (mesh.faces < len(corners))).all():
+                raise ValueError(f"faces of {link}: indices of its {len(corners)} vertices expected")
             meshes[str(link)] = (*meshes.get(str(link), ()), mesh)
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from None

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shown
 from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, solve_seeds
 from robotdiffuse.robots.robot import Robot
 
@@ -77,7 +77,7 @@ def inverse_kinematics(
     settings = settings or InverseKinematicsSettings()
     last = robot.link_frame(frame)
     if last == 0:
-        raise InputError(f"inverse kinematics: no planned joint moves the link {frame!r}")
+        raise InputError(f"inverse kinematics: no planned joint moves the link {shown(frame)}")
     if count < 1:
         raise InputError(f"inverse kinematics: count is {count}; it must be at least 1")
     _check_pose(T_base_frame)

@@ -4,9 +4,9 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-import yaml
-
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.checks import FASTEST, LARGEST
+from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.reading import read_yaml
 from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
 from robotdiffuse.robots.urdf import ACCELERATION_PER_VELOCITY, JERK_PER_ACCELERATION
 
@@ -32,12 +32,7 @@ def read_limits(file: str | Path) -> dict[str, dict[str, float]]:
     max_velocity, max_acceleration, max_jerk; MoveIt's has_..._limits are accepted, and a field whose flag is
     false is left out. Raises InputError naming the joint and the field.
     """
-    try:
-        data = yaml.safe_load(Path(file).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"cannot read the joint limits {file}: {error.strerror}") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} is not YAML: {' '.join(str(error).split())}") from None
+    data = read_yaml(file, "joint limits")
     joints = data.get("joint_limits") if isinstance(data, dict) else None
     if not isinstance(joints, dict):
         raise InputError(
@@ -61,7 +56,7 @@ def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
 
 def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
     if not isinstance(entry, dict):
-        raise InputError(f"{file}: joint_limits of {joint} is {entry!r}; it must be a mapping")
+        raise InputError(f"{file}: joint_limits of {joint} is {shown(entry)}; it must be a mapping")
     fields: dict[str, float] = {}
     for key, value in entry.items():
         if key in FLAGS:
@@ -71,10 +66,12 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
         kind = "position" if key.endswith("position") else key.removeprefix("max_")
         if entry.get(f"has_{kind}_limits") is False:
             continue
+        most = LARGEST if kind == "position" else FASTEST
         number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or (kind != "position" and value <= 0):
+        if not number or abs(value) > most or (kind != "position" and value <= 0):
             raise InputError(
-                f"{file}: {key} of {joint} is {value!r}; it must be a finite number, above 0 for a rate"
+                f"{file}: {key} of {joint} is {shown(value)}; it must be a number within "
+                f"±{most:g}, above 0 for a rate"
             )
         fields[FIELDS[key]] = float(value)
     return fields

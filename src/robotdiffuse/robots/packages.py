@@ -5,7 +5,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shown
+from robotdiffuse.reading import is_file, read_bytes
 
 MOST_PACKAGES = 32
 """Packages of a xacro file that are looked for one after the other."""
@@ -46,21 +47,22 @@ class Packages:
         start = self.urdf.resolve().parent
         if not filename.startswith("package://"):
             found = start / filename.removeprefix("file://")
-            if found.is_file():
+            if is_file(found):
                 return found
             raise InputError(
-                f"{self.urdf}: mesh file {filename!r} is not there; put it there, or take its element out"
+                f"{self.urdf}: mesh file {shown(filename)} is not there; put it there, or take its "
+                f"element out"
             )
         package, _, rest = filename.removeprefix("package://").partition("/")
         folder = self.folder(package)
         upwards = [up / tail for up in (start, *start.parents) for tail in (f"{package}/{rest}", rest)]
         candidates = [*([] if folder is None else [folder / rest]), *upwards]
         for candidate in candidates:
-            if candidate.is_file():
+            if is_file(candidate):
                 return candidate
         raise InputError(
-            f"{self.urdf}: mesh file {filename!r} is not there (looked from {start} upwards); say where the "
-            f"package is: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
+            f"{self.urdf}: mesh file {shown(filename)} is not there (looked from {start} upwards); say where "
+            f"the package is: --package {package}=FOLDER, or ROS_PACKAGE_PATH"
         )
 
 
@@ -73,10 +75,7 @@ def urdf_text(path: Path, packages: Packages) -> bytes:
 
     Raises InputError if it cannot be read or compiled, or for a xacro file without xacrodoc.
     """
-    try:
-        text = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read the URDF {path}: {error.strerror}") from None
+    text = read_bytes(path, "URDF")
     if path.suffix == ".xacro" or b"<xacro:" in text:
         text = _compiled(path, packages)
     return _with_prefixes(text)
@@ -120,8 +119,8 @@ def _compiled(path: Path, packages: Packages) -> bytes:
             folder = packages.folder(name)
             if folder is None:
                 raise InputError(
-                    f"{path}: package {name!r} is not found; say where it is: --package {name}=FOLDER, or "
-                    f"ROS_PACKAGE_PATH"
+                    f"{path}: package {shown(name)} is not found; say where it is: --package {name}=FOLDER, "
+                    f"or ROS_PACKAGE_PATH"
                 ) from None
             known.update_package_cache({name: folder})
     raise InputError(f"{path}: it names more than {MOST_PACKAGES} packages")

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from robotdiffuse.checks import LARGEST
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
 from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
@@ -229,8 +230,8 @@ class Robot:
         for name, value in locked.items():
             if name not in movable:
                 raise unknown_name("joint in locked", name, movable)
-            if not np.isfinite(value):
-                raise InputError(f"locked: {name} is {value}; it must be a finite number")
+            if not abs(value) <= LARGEST:
+                raise InputError(f"locked: {name} is {value}; it must be a number within ±{LARGEST:g}")
         held = following(self.joints, self.locked | {name: float(value) for name, value in locked.items()})
         for name, value in locked.items():
             mimic = movable[name].mimic

@@ -8,7 +8,9 @@ import xml.etree.ElementTree as ET
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.checks import LARGEST
+from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.reading import is_file, parse_xml, read_bytes
 from robotdiffuse.robots.robot import MOVING_KINDS, Joint
 
 FOLDERS = (".", "../srdf", "../config", "srdf", "config")
@@ -88,18 +90,13 @@ def srdf_beside(urdf: str | Path, robot: str) -> Path | None:
     urdf = Path(urdf)
     names = dict.fromkeys((urdf.name.split(".")[0], robot))
     found = (urdf.parent / folder / f"{name}.srdf" for name in names for folder in FOLDERS)
-    return next((file for file in found if file.is_file()), None)
+    return next((file for file in found if is_file(file)), None)
 
 
 def read_srdf(file: str | Path) -> Srdf:
     """Read an SRDF; raises InputError, one line that names the file, where something is missing in it."""
     path = Path(file)
-    try:
-        root = ET.parse(path).getroot()
-    except OSError as error:
-        raise InputError(f"cannot read the SRDF {path}: {error.strerror}") from None
-    except ET.ParseError as error:
-        raise InputError(f"{path} is not well-formed XML: {error}") from None
+    root = parse_xml(read_bytes(path, "SRDF"), str(path))
     if root.tag != "robot":
         raise InputError(f"{path} is not an SRDF: its root element is <{root.tag}>, not <robot>")
 
@@ -114,9 +111,10 @@ def read_srdf(file: str | Path) -> Srdf:
             value = float(text(element, "value").split()[0])
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
+        if not abs(value) <= LARGEST:
             raise InputError(
-                f"{path}: joint {element.get('name')}: value is {element.get('value')!r}; it must be a number"
+                f"{path}: joint {element.get('name')}: value is {shown(element.get('value'))}; "
+                f"it must be a number within ±{LARGEST:g}"
             )
         return value
 

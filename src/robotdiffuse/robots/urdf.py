@@ -10,7 +10,9 @@ import trimesh
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.checks import FASTEST, LARGEST, SMALLEST, points, within
+from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.reading import parse_xml, read_triangles
 from robotdiffuse.robots.convex_parts import Surface, convex_hull
 from robotdiffuse.robots.groups import passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.packages import Packages, urdf_text
@@ -19,6 +21,8 @@ from robotdiffuse.robots.srdf import Srdf
 from robotdiffuse.transforms import inverse, rotation_from_rpy, transform
 
 KINDS = (*MOVING_KINDS, "fixed")
+MOST_LINKS = 500
+"""Of a robot; humanoids with hands have about 100."""
 DEFAULT_VELOCITY = 1.0
 """For movable joints whose URDF gives none [rad/s] or [m/s]."""
 ACCELERATION_PER_VELOCITY = 4.0
@@ -54,10 +58,7 @@ class UrdfTree:
     def __post_init__(self) -> None:
         self.packages = Packages(self.path, self.folders)
         self.text = urdf_text(self.path, self.packages)
-        try:
-            root = ET.fromstring(self.text)
-        except ET.ParseError as error:
-            raise InputError(f"{self.path} is not well-formed XML: {error}") from None
+        root = parse_xml(self.text, str(self.path))
         if root.tag != "robot":
             raise InputError(
                 f"{self.path} is not a URDF: its root element is <{root.tag}>, not <robot>; "
@@ -65,6 +66,8 @@ class UrdfTree:
             )
         self.name = root.get("name") or self.path.stem
         self.links = {self._name(link, "link"): link for link in root.findall("link")}
+        if len(self.links) > MOST_LINKS:
+            raise InputError(f"{self.path} has {len(self.links)} links; at most {MOST_LINKS} are read")
         solid = any(link.find("collision") is not None for link in self.links.values())
         self.kind = "collision" if solid else "visual"
         """The elements of links that are their geometry."""
@@ -168,16 +171,18 @@ class UrdfTree:
         end = element.find(what)
         link = "" if end is None else end.get("link", "")
         if link not in self.links:
-            raise InputError(f"{self.path}: joint {name}: its {what} link {link!r} is not in the file")
+            raise InputError(f"{self.path}: joint {name}: its {what} link {shown(link)} is not in the file")
         return link
 
-    def _numbers(self, text: str, count: int, what: str) -> Float[ndarray, "n"]:
+    def _numbers(self, text: str, count: int, what: str, most: float = LARGEST) -> Float[ndarray, "n"]:
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
             values = np.zeros(0)
         if len(values) != count or not np.isfinite(values).all():
-            raise InputError(f"{self.path}: {what} is {text!r}; it must be {count} finite number(s)")
+            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be {count} finite number(s)")
+        if not within(values, most):
+            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be within ±{most:g}")
         return values
 
     def _origin(self, element: ET.Element, what: str) -> Float[ndarray, "4 4"]:
@@ -217,7 +222,7 @@ class UrdfTree:
         if kind not in KINDS:
             child = self._end(name, element, "child")
             raise InputError(
-                f"{self.path}: {what} has type {kind!r}; supported: {', '.join(KINDS)}; "
+                f"{self.path}: {what} has type {shown(kind)}; supported: {', '.join(KINDS)}; "
                 f"--base {child} plans what is on {child} as it stands"
             )
         axis_element = element.find("axis")
@@ -247,8 +252,8 @@ class UrdfTree:
             leaders.append(leader.get("joint", ""))
             if leaders[-1] not in self.elements or leaders[-1] in leaders[:-1]:
                 raise InputError(
-                    f"{self.path}: joint {leaders[-2]} mimics {leaders[-1]!r}; it must be another joint of "
-                    f"the file that does not follow it"
+                    f"{self.path}: joint {leaders[-2]} mimics {shown(leaders[-1])}; it must be another "
+                    f"joint of the file that does not follow it"
                 )
             last, leader = leader, self.elements[leaders[-1]].find("mimic")
         if self.elements[leaders[-1]].get("type") == "fixed" or last is None:
@@ -263,8 +268,8 @@ class UrdfTree:
         given: dict[str, float] = {}
         for what in ("lower", "upper", "velocity"):
             if limit is not None and limit.get(what) is not None:
-                text = limit.get(what, "")
-                given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit")[0])
+                text, most = limit.get(what, ""), FASTEST if what == "velocity" else LARGEST
+                given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit", most)[0])
         if joint.kind == "continuous":
             given["lower"], given["upper"] = -TURNS, TURNS
         if "lower" not in given and "upper" not in given:
@@ -322,8 +327,8 @@ class UrdfTree:
         def positive(name: str, count: int) -> Float[ndarray, "n"]:
             what = f"link {link}: {shape.tag} {name}"
             values = self._numbers(shape.get(name, ""), count, what)
-            if (values <= 0).any():
-                raise InputError(f"{self.path}: {what} is {shape.get(name)!r}; it must be positive")
+            if (values < SMALLEST).any():
+                raise InputError(f"{self.path}: {what} is {shown(shape.get(name))}; it must be positive")
             return values
 
         if shape.tag == "mesh":
@@ -351,17 +356,24 @@ class UrdfTree:
 
     def _mesh(self, shape: ET.Element, link: str) -> Surface:
         file = self.packages.file(shape.get("filename", ""))
+        where = f"link {link}: mesh"
         try:
-            mesh = trimesh.load(file, force="mesh")
-        except Exception as error:  # trimesh's readers raise whatever they meet
-            raise InputError(f"{self.path}: link {link}: cannot read {file}: {error}") from None
-        if not isinstance(mesh, trimesh.Trimesh) or len(mesh.vertices) < 4:
+            vertices, faces = read_triangles(file, merge=True)
+            vertices = points(where, "vertices", vertices * self._scale(shape, where))
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from None
+        if len(vertices) < 4:
             raise InputError(
                 f"{self.path}: link {link}: {file} holds no triangle mesh with four corners; repair it or "
                 f"take its element out"
             )
-        scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"link {link}: mesh scale")
-        return Surface(np.array(mesh.vertices, np.float64) * scale, np.array(mesh.faces, np.int64))
+        return Surface(vertices, faces)
+
+    def _scale(self, shape: ET.Element, where: str) -> Float[ndarray, "3"]:
+        scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"{where} scale")
+        if (np.abs(scale) < SMALLEST).any():
+            raise InputError(f"{where} scale is {shown(shape.get('scale'))}; no number of it may be 0")
+        return scale
 
 
 def _ball() -> Float[ndarray, "n 3"]:

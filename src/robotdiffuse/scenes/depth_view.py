@@ -11,8 +11,9 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.scenes.shapes import PointCloud, numbers, shown, vector
+from robotdiffuse.checks import FASTEST, LARGEST, numbers, vector, within
+from robotdiffuse.errors import InputError, shown
+from robotdiffuse.scenes.shapes import PointCloud
 
 RIGID_SLACK = 1e-4
 """How far the rotation of a camera's pose may be from orthonormal, by entry."""
@@ -48,12 +49,13 @@ class DepthView:
         if depth is None or depth.ndim != 2 or depth.size == 0:
             form = "not numbers" if depth is None else f"an array of {' x '.join(map(str, depth.shape))}"
             raise InputError(f"view.depth is {form}; it must be an image of height x width")
-        intrinsics = vector("view", "intrinsics", self.intrinsics, 4)
+        intrinsics = vector("view", "intrinsics", self.intrinsics, 4, FASTEST)
         if intrinsics[0] <= 0 or intrinsics[1] <= 0:
             raise InputError(f"view.intrinsics is {shown(intrinsics)}; fx and fy must be positive [pixels]")
-        if T is None or T.shape != (4, 4) or not np.isfinite(T).all():
+        if T is None or T.shape != (4, 4) or not within(T):
             raise InputError(
-                f"view.T_base_camera is {shown(self.T_base_camera)}; it must be 4 x 4 finite numbers"
+                f"view.T_base_camera is {shown(self.T_base_camera)}; it must be 4 x 4 finite numbers "
+                f"within ±{LARGEST:g}"
             )
         rotation = T[:3, :3]
         orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK

@@ -11,11 +11,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.checks import numbers, positive, unit_quaternion, vector
+from robotdiffuse.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.reading import input_file, read_arrays
 from robotdiffuse.scenes.depth_view import DepthView
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
-from robotdiffuse.scenes.shapes import numbers, positive, shown, unit_quaternion, vector
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
 DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
@@ -32,14 +33,13 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
     file = Path(file)
     if file.suffix.lower() not in DEPTH_FORMATS:
         raise unknown_name(f"depth image format of {file}:", file.suffix, DEPTH_FORMATS)
-    if not file.is_file():
-        raise InputError(f"depth image {file} does not exist")
+    input_file(file, "depth image")
     try:
         image = _READERS[file.suffix.lower()](file)
     except InputError:
         raise
     except Exception as error:  # the readers raise whatever their library does about a damaged file
-        raise InputError(f"depth image {file} cannot be read: {' '.join(str(error).split())}") from None
+        raise InputError(f"depth image {file} cannot be read: {shortened(str(error))}") from None
     if image.ndim != 2 or image.dtype.kind not in "uif":
         form = " x ".join(map(str, image.shape))
         raise InputError(
@@ -60,10 +60,10 @@ def _read_png(file: Path) -> ndarray:
 
 
 def _read_npz(file: Path) -> ndarray:
-    arrays = np.load(file, allow_pickle=False)
-    if "depth" not in arrays and len(arrays.files) != 1:
-        raise InputError(f"depth image {file} holds {', '.join(arrays.files)}; one must be named depth")
-    return arrays["depth" if "depth" in arrays else arrays.files[0]]
+    arrays = read_arrays(file)
+    if "depth" not in arrays and len(arrays) != 1:
+        raise InputError(f"depth image {file} holds {shown([*arrays])}; one must be named depth")
+    return arrays.get("depth", next(iter(arrays.values())))
 
 
 def _read_exr(file: Path) -> ndarray:
@@ -84,7 +84,7 @@ def _read_exr(file: Path) -> ndarray:
 
 _READERS = {
     ".png": _read_png,
-    ".npy": lambda file: np.load(file, allow_pickle=False),
+    ".npy": lambda file: read_arrays(file)[""],
     ".npz": _read_npz,
     ".exr": _read_exr,
 }

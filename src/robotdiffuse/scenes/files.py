@@ -1,67 +1,23 @@
-"""Scenes in problem files: plain dictionaries to shapes and back; YAML and mesh files."""
+"""Scenes in problem files: plain dictionaries to shapes and back."""
 
-import re
 from collections.abc import Iterable
 from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import yaml
-from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.reading import read_triangles
 from robotdiffuse.scenes.point_cloud import read_points
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import (
-    IDENTITY,
-    Box,
-    Capsule,
-    Cylinder,
-    Mesh,
-    PointCloud,
-    Shape,
-    Sphere,
-    shown,
-)
+from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Box, Cylinder, Capsule, Mesh, PointCloud)
 }
-MESH_FORMATS = (".dae", ".glb", ".obj", ".off", ".ply", ".stl")
 CONTENT = {"mesh": ("vertices", "faces"), "point_cloud": ("points",)}
 """The fields that a `file` stands for."""
-
-
-class _Loader(yaml.CSafeLoader):
-    """Reads 1e-3 and 2.5e3 as numbers, which YAML 1.1 takes for texts."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
-    list("-+.0123456789"),
-)
-
-
-def read_text(file: str | Path) -> str:
-    """The content of a text file; InputError if it is missing or not text."""
-    try:
-        return Path(file).read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputError(f"{file} does not exist") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} cannot be read: {error}") from None
-
-
-def read_yaml(file: str | Path) -> object:
-    """The content of a YAML (or JSON) file; InputError with the line if it is not valid."""
-    text = read_text(file)
-    try:
-        return yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
-        raise InputError(f"{file} is not valid YAML: {' '.join(str(error).split())}") from None
 
 
 def check_fields(
@@ -119,7 +75,7 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
             raise InputError(f"{where}.file is {shown(values['file'])}; it must be the name of a file")
         values["file"] = str(folder / values["file"])
         try:
-            arrays = read_mesh(values["file"]) if kind is Mesh else _points(values["file"], notes)
+            arrays = read_triangles(values["file"]) if kind is Mesh else _points(values["file"], notes)
         except InputError as error:
             raise InputError(f"{where}: {error}") from None
         values |= dict(zip(content, arrays, strict=True))
@@ -135,26 +91,6 @@ def _points(file: str, notes: list[str]) -> tuple[ndarray]:
     points, more = read_points(file)
     notes.extend(more)
     return (points,)
-
-
-def read_mesh(file: str | Path) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
-    """Vertices [m] and faces of a mesh file; InputError if it is missing, empty or damaged."""
-    import trimesh
-
-    file = Path(file)
-    if file.suffix.lower() not in MESH_FORMATS:
-        raise unknown_name(f"mesh format of {file}:", file.suffix, MESH_FORMATS)
-    if not file.is_file():
-        raise InputError(f"mesh file {file} does not exist")
-    if file.stat().st_size == 0:
-        raise InputError(f"mesh file {file} is empty")
-    try:
-        mesh = trimesh.load_mesh(file, process=False)
-    except Exception as error:  # trimesh raises whatever its parsers meet in a damaged file
-        raise InputError(f"mesh file {file} cannot be read: {' '.join(str(error).split())}") from None
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f"mesh file {file} holds no triangles")
-    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
 def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str, object]]]:

@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.reading import input_file, read_arrays
 
 
 def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m 3"]:
@@ -47,16 +48,14 @@ def read_points(file: str | Path) -> tuple[Float[ndarray, "n 3"], tuple[str, ...
     reader = READERS.get(file.suffix.lower())
     if reader is None:
         raise unknown_name(f"point cloud format of {file}:", file.suffix, READERS)
-    if not file.is_file():
-        raise InputError(f"point cloud file {file} does not exist")
-    if file.stat().st_size == 0:
+    if input_file(file, "point cloud file").stat().st_size == 0:
         raise InputError(f"point cloud file {file} is empty")
     try:
         points = np.asarray(reader(file), dtype=np.float64)
     except InputError:
         raise
     except Exception as error:  # the readers raise whatever their library does about a damaged file
-        raise InputError(f"point cloud file {file} cannot be read: {' '.join(str(error).split())}") from None
+        raise InputError(f"point cloud file {file} cannot be read: {shortened(str(error))}") from None
     if points.size == 0:
         return np.zeros((0, 3)), (f"{file} holds no points",)
     if points.ndim != 2 or points.shape[1] < 3:
@@ -100,10 +99,10 @@ def _is_number(text: str) -> bool:
 
 
 def _read_npz(file: Path) -> ndarray:
-    arrays = np.load(file, allow_pickle=False)
-    if "points" not in arrays and len(arrays.files) != 1:
-        raise InputError(f"point cloud file {file} holds {', '.join(arrays.files)}; one must be named points")
-    return arrays["points" if "points" in arrays else arrays.files[0]]
+    arrays = read_arrays(file)
+    if "points" not in arrays and len(arrays) != 1:
+        raise InputError(f"point cloud file {file} holds {shown([*arrays])}; one must be named points")
+    return arrays.get("points", next(iter(arrays.values())))
 
 
 def _read_pcd(file: Path) -> ndarray:
@@ -142,6 +141,6 @@ READERS: dict[str, Callable[[Path], ndarray]] = {
     ".pcd": _read_pcd,
     ".xyz": _read_text,
     ".csv": _read_text,
-    ".npy": lambda file: np.load(file, allow_pickle=False),
+    ".npy": lambda file: read_arrays(file)[""],
     ".npz": _read_npz,
 }

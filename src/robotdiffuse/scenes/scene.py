@@ -25,16 +25,18 @@ class Scene:
 
     def __init__(self, shapes: Iterable[Shape] = ()) -> None:
         named: list[Shape] = []
-        taken: set[str] = set()
+        taken, last = set[str](), dict[str, int]()
         for i, shape in enumerate(shapes):
             if not isinstance(shape, Shape):
                 raise InputError(
                     f"scene[{i}] is a {type(shape).__name__}; it must be a shape, e.g. rd.Sphere"
                 )
-            name, number = shape.name, 2
+            name, number = shape.name, last.get(shape.name, 1)
             while name in taken:
-                name, number = f"{shape.name}_{number}", number + 1
+                number += 1
+                name = f"{shape.name}_{number}"
             taken.add(name)
+            last[shape.name] = number
             named.append(shape if name == shape.name else dataclass_replace(shape, name=name))  # type: ignore[type-var]
         object.__setattr__(self, "shapes", tuple(named))
 

@@ -14,56 +14,13 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.checks import SMALLEST, form, numbers, points, positive, unit_quaternion, vector
+from robotdiffuse.errors import InputError, shown
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.point_cloud import voxel_thin
 from robotdiffuse.transforms import rotation_from_quaternion, transform
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-
-
-def shown(value: object) -> str:
-    """A value as one short line, for error messages."""
-    text = " ".join(repr(value.tolist() if isinstance(value, ndarray) else value).split())
-    return text if len(text) <= 80 else text[:77] + "..."
-
-
-def numbers(value: object) -> ndarray | None:
-    """A float64 array, or None where the value is anything but (nested lists of) numbers."""
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError):
-        return None
-    return array.astype(np.float64) if array.dtype.kind in "iuf" else None
-
-
-def vector(owner: str, name: str, value: object, size: int) -> ndarray:
-    """`size` finite numbers, or an InputError that names owner.name."""
-    array = numbers(value)
-    if array is None or array.shape != (size,) or not np.isfinite(array).all():
-        raise InputError(f"{owner}.{name} is {shown(value)}; it must be {size} finite numbers")
-    return array
-
-
-def positive(owner: str, name: str, value: object) -> float:
-    """A positive number, or an InputError that names owner.name."""
-    array = numbers(value)
-    if array is None or array.ndim != 0 or not np.isfinite(array) or array <= 0:
-        raise InputError(f"{owner}.{name} is {shown(value)}; it must be a positive number")
-    return float(array)
-
-
-def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
-    """The quaternion scaled to length 1; one that has it already is kept bit for bit."""
-    wxyz = vector(owner, name, value, 4)
-    norm = np.linalg.norm(wxyz)
-    if norm < 1e-6:
-        raise InputError(f"{owner}.{name} is {shown(value)}; a quaternion must not be zero")
-    return wxyz if abs(norm - 1) < 1e-15 else wxyz / norm
-
-
-def _form(array: ndarray | None) -> str:
-    return "not numbers" if array is None else f"an array of {' x '.join(map(str, array.shape))}"
 
 
 class Shape(ABC):
@@ -162,8 +119,10 @@ class Box(Shape):
 
     def __post_init__(self) -> None:
         size = vector("box", "size", self.size, 3)
-        if (size <= 0).any():
-            raise InputError(f"box.size is {self.size!r}; edge lengths must be positive")
+        if (size < SMALLEST).any():
+            raise InputError(
+                f"box.size is {shown(self.size)}; edge lengths must be positive, at least {SMALLEST:g} m"
+            )
         center = vector("box", "center", self.center, 3)
         _set(self, center=center, size=size, wxyz=unit_quaternion("box", self.wxyz))
 
@@ -285,17 +244,10 @@ class Mesh(Triangulated):
     kind: ClassVar[str] = "mesh"
 
     def __post_init__(self) -> None:
-        vertices, faces = numbers(self.vertices), numbers(self.faces)
-        if (
-            vertices is None
-            or vertices.ndim != 2
-            or vertices.shape[1] != 3
-            or not np.isfinite(vertices).all()
-        ):
-            raise InputError(f"mesh.vertices is {_form(vertices)}; it must be n x 3 finite numbers")
+        vertices, faces = points("mesh", "vertices", self.vertices), numbers(self.faces)
         if faces is None or faces.ndim != 2 or faces.shape[1] != 3 or len(faces) == 0:
-            raise InputError(f"mesh.faces is {_form(faces)}; it must be n x 3 indices, at least one row")
-        if (faces != np.floor(faces)).any() or faces.min() < 0 or faces.max() >= len(vertices):
+            raise InputError(f"mesh.faces is {form(faces)}; it must be n x 3 indices, at least one row")
+        if not (faces == np.floor(faces)).all() or faces.min() < 0 or faces.max() >= len(vertices):
             raise InputError(
                 f"mesh.faces holds values from {faces.min():g} to {faces.max():g}; "
                 f"they must be indices of the {len(vertices)} vertices"
@@ -355,15 +307,11 @@ class PointCloud(Shape):
     kind: ClassVar[str] = "point_cloud"
 
     def __post_init__(self) -> None:
-        points = numbers(self.points)
-        if points is not None and points.size == 0:
-            points = points.reshape(0, 3)
-        if points is None or points.ndim != 2 or points.shape[1] != 3:
-            raise InputError(f"point_cloud.points is {_form(points)}; it must be n x 3 numbers")
-        if not np.isfinite(points).all():
-            bad = int((~np.isfinite(points).all(axis=1)).sum())
-            raise InputError(f"point_cloud.points holds {bad} points that are not finite; remove them")
-        _set(self, points=points, point_radius=positive("point_cloud", "point_radius", self.point_radius))
+        _set(
+            self,
+            points=points("point_cloud", "points", self.points),
+            point_radius=positive("point_cloud", "point_radius", self.point_radius),
+        )
 
     if TYPE_CHECKING:
 
