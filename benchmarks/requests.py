@@ -55,6 +55,8 @@ TRIES = 40
 """Places that are drawn until one can be reached."""
 STEP, TOLERANCE = 0.01, 0.001
 """Between the configurations of a path that oracles look at [rad]; PyBullet's own error [m]."""
+LOOKING = 0.5
+"""Time limit of a call that only looks for configurations at a place [s]."""
 CAN = "Can1"
 
 
@@ -92,7 +94,7 @@ def carried(folder: Path, places: int) -> Iterator[Asked]:
         for _ in range(TRIES):
             goal = PoseGoal(CAN, _place(scene, entry.problem.scene, rng), [0, 0, 0], [0, 0, np.pi])
             problem = Problem(holding, scene, q, goal)
-            if not isinstance(usable_ends(Call("places", problem, LONG, 0)), PlanResult):
+            if not isinstance(usable_ends(Call("places", problem, LOOKING, 0)), PlanResult):
                 yield Asked(f"{entry.name}-{kept}", problem, CAN)
                 kept += 1
             if kept == places:
