@@ -61,3 +61,11 @@ def test_no_problems_are_no_results() -> None:
 def test_arguments_are_checked_at_once(arguments: dict, message: str) -> None:
     with pytest.raises(rd.InputError, match=message):
         rd.plan_many(problems()[:1], **arguments)
+
+
+def test_robots_that_hold_something_go_to_processes_too() -> None:
+    cup = rd.Cylinder([0, 0, 0.16], 0.03, 0.12, name="cup")
+    held = [replace(problem, robot=PANDA.attach(cup, "panda_hand")) for problem in problems()[:2]]
+    results = list(rd.plan_many(held, "rrt_connect", workers=1, time_limit=20.0))
+    for problem, result in zip(held, results, strict=True):
+        assert result.path is not None and rd.verify(problem, result.path).valid

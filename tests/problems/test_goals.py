@@ -215,3 +215,14 @@ def test_every_planner_answers_every_request(name: str) -> None:
         assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
     if name in ("robotdiffuse", "aorrtc", "rrt_connect", "diffusion", "guided_prior", "ompl_rrt_connect"):
         assert result.solved, result.reason
+
+
+def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:
+    """A pose on a line of 10 m, of which 3 % are in reach and free: 20 draws mostly miss them."""
+    T = transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
+    block = rd.Box([0.65, 0.325, 0.5], [0.7, 1.35, 1.0], name="block")
+    narrow = PoseGoal("panda_hand", T, [0.0, 5.0, 0.0], [0.0, 0.0, np.pi])
+    problem = rd.Problem(ROBOT, rd.Scene([block]), [-1.5, 0.2, 0, -2.0, 0, 2.2, 0.2], narrow)
+    result = rd.plan(problem, time_limit=20.0)
+    assert result.path is not None, result.reason
+    assert link_pose(ROBOT, result.path.positions[-1], "panda_hand")[1, 3] < -0.35

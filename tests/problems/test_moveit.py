@@ -11,7 +11,7 @@ import trimesh
 import yaml
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.problems.files import load_motion_bench_maker, load_problems
+from robotdiffuse.problems.files import load_motion_bench_maker, load_problems, problem_record
 from robotdiffuse.problems.moveit import (
     MoveItFrames,
     moveit_frames,
@@ -23,9 +23,15 @@ from robotdiffuse.problems.problem import JointGoal, PoseGoal
 from robotdiffuse.reading import read_yaml
 from robotdiffuse.robots import Robot, load_robot
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.urdf import read_urdf
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
-from robotdiffuse.transforms import rotation_about, rotation_from_quaternion
+from robotdiffuse.transforms import (
+    quaternion_from_rotation,
+    rotation_about,
+    rotation_from_quaternion,
+    transform,
+)
 
 FOLDER = Path(__file__).parents[1] / "files" / "motion_bench_maker"
 Z = np.array([0.0, 0.0, 1.0])
@@ -348,6 +354,38 @@ def test_pose_goal(tmp_path: Path) -> None:
     np.testing.assert_allclose(T[:3, :3], flipped, atol=1e-12)
 
 
+@pytest.mark.parametrize("frame", ["panda_hand", "world"])
+def test_objects_are_held_at_the_start(frame: str, tmp_path: Path) -> None:
+    for file in FOLDER.glob("*0001.yaml"):
+        shutil.copy(file, tmp_path)
+    bare = load_motion_bench_maker(tmp_path)[0].load()
+    T_base_hand = link_pose(bare.robot, bare.start, "panda_hand")
+    T = (
+        T_base_hand @ transform(np.array([0.0, 0.0, 0.2]))
+        if frame == "world"
+        else transform(np.array([0, 0, 0.2]))
+    )
+    x, y, z, w = np.roll(quaternion_from_rotation(T[:3, :3]), -1).tolist()
+    held = {
+        "link_name": "panda_hand",
+        "touch_links": ["panda_link6", "no_link_of_it"],
+        "object": {
+            "header": {"frame_id": frame},
+            "id": "rod",
+            "primitives": [{"type": "cylinder", "dimensions": [0.2, 0.01]}],
+            "primitive_poses": [{"position": T[:3, 3].tolist(), "orientation": [x, y, z, w]}],
+        },
+    }
+    data = change(request_data(), ["start_state", "attached_collision_objects"], [held])
+    (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(data))
+    problem = load_motion_bench_maker(tmp_path)[0].load()
+    [rod] = problem.robot.attached
+    assert rod.name == "rod" and rod.touch_links == ("panda_link6",)
+    np.testing.assert_allclose(rod.T_link_body, transform(np.array([0.0, 0.0, 0.2])), atol=1e-9)
+    T_world = problem_record(problem)["attached"][0]["cylinder"]  # type: ignore[index]
+    np.testing.assert_allclose(T_world["center"], [0, 0, 0.2], atol=1e-9)
+
+
 def change(data: dict[str, Any], path: list[Any], value: object) -> dict[str, Any]:
     at: Any = data
     for key in path[:-1]:
@@ -367,7 +405,18 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
         request_data() | {"path_constraints": {"joint_constraints": [1]}},
         "path_constraints",
     ),
-    "attached": (change(request_data(), ["start_state", "attached_collision_objects"], [1]), "attached"),
+    "attached": (
+        change(request_data(), ["start_state", "attached_collision_objects"], [1]),
+        r"attached_collision_objects\[0\] is 1; it must be a mapping",
+    ),
+    "attached shape": (
+        change(
+            request_data(),
+            ["start_state", "attached_collision_objects"],
+            [{"link_name": "panda_hand", "object": {"planes": [1], "header": {"frame_id": "panda_hand"}}}],
+        ),
+        r"attached_collision_objects\[0\].object: planes are not supported",
+    ),
     "positions": (
         change(request_data(), ["start_state", "joint_state", "position"], [0]),
         "9 finite numbers",

@@ -130,3 +130,11 @@ def test_files_keep_views_and_policy(tmp_path: Path) -> None:
 def test_what_is_refused(fields: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Problem(PANDA, Scene(), START, GOAL, **fields)
+
+
+def test_what_the_arm_holds_is_not_seen_as_an_obstacle() -> None:
+    held = PANDA.attach(Box([0, 0, 0.2], [0.1, 0.1, 0.15], name="parcel"), "panda_hand")
+    spheres = placed_spheres(held, START)
+    alone = DepthView(picture(spheres), K, T)
+    assert not len(seen_points([alone], held, START))
+    assert len(seen_points([alone], PANDA, START)), "the bare arm sees the parcel"

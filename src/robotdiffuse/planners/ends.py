@@ -20,8 +20,10 @@ from robotdiffuse.types import Status
 
 GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""
-POSES, OF_EACH = 60, 2
+POSES, OF_EACH = 20, 2
 """Poses within the tolerances of a goal that are tried, and configurations that are looked for in each."""
+MOST_POSES, LOOKING = 1000, 0.5
+"""Poses that are tried at most as long as none has a free configuration, and the share of the time left."""
 SOME_ROUNDS = InverseKinematicsSettings(max_rounds=2, patience=1)
 """Of these: many may be out of reach."""
 END_MARGIN = 0.0005
@@ -240,15 +242,15 @@ def _reaching(
     robot, rng = call.problem.robot, call.rng
     if not goal.tolerant:
         return inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=accept)
-    found = np.zeros((0, robot.dof))
-    for i in range(POSES):
+    found, until = np.zeros((0, robot.dof)), call.elapsed + LOOKING * call.remaining
+    for i in range(MOST_POSES):
+        if len(found) >= GOAL_COUNT or (len(found) and i >= POSES) or (i and call.elapsed > until):
+            break
         T_base_frame = goal.draw(rng) if i else goal.T_base_frame
         few = inverse_kinematics(
             robot, goal.frame, T_base_frame, OF_EACH, rng=rng, accept=accept, settings=SOME_ROUNDS
         )
         found = np.concatenate([found, few])
-        if len(found) >= GOAL_COUNT or call.remaining <= 0:
-            break
     return found[:GOAL_COUNT]
 
 

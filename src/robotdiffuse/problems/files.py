@@ -18,7 +18,13 @@ from robotdiffuse.problems.equipment import (
     rounded,
 )
 from robotdiffuse.problems.goal_files import goal_entry, read_goal, read_waypoints
-from robotdiffuse.problems.moveit import MoveItRequest, moveit_frames, moveit_request, moveit_scene
+from robotdiffuse.problems.moveit import (
+    MoveItRequest,
+    holding_at,
+    moveit_frames,
+    moveit_request,
+    moveit_scene,
+)
 from robotdiffuse.problems.problem import (
     OPTIMISTIC,
     JointGoal,
@@ -217,7 +223,7 @@ def _moveit_problem(scene_file: Path, robot: Robot | None) -> Problem:
         frames = moveit_frames(data, robot)
         scene = moveit_scene(data, frames, scene_file.parent)
         where = request_file
-        return _requested(robot, scene, moveit_request(read_yaml(request_file), frames))
+        return _requested(robot, scene, moveit_request(read_yaml(request_file), frames, scene_file.parent))
     except InputError as error:
         prefix = "" if str(error).startswith(str(where)) else f"{where}: "
         raise InputError(f"{prefix}{error}") from None
@@ -243,6 +249,8 @@ def _requested(
         return [positions[name] for name in robot.joint_names]
 
     start = values("start_state", request.start)
+    for held in request.attached:
+        robot = holding_at(robot, held, start)
     if request.pose_goal is not None:
         return Problem(robot, scene, start, PoseGoal(*request.pose_goal), (), clearance, views, unseen)
     goals = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
@@ -277,7 +285,7 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
         if requested and "waypoints" in values:
             raise InputError("waypoints are for goals in the file itself, not beside a request")
         if requested:
-            request = moveit_request(read_yaml(folder / str(values["request"])), frames)
+            request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
             return _requested(robot, scene, request, clearance, views, unseen)
         goal, notes = read_goal("goal", values["goal"], scene), (*notes, *more)
         asked = robot, scene, values["start"], goal, notes, clearance, views, unseen

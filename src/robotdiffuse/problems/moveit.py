@@ -16,6 +16,8 @@ from numpy import ndarray
 from robotdiffuse.checks import unit_quaternion, vector
 from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.reading import read_triangles, read_yaml
+from robotdiffuse.robots.bodies import Attached
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Shape, Sphere
@@ -33,6 +35,19 @@ NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
 
 
 @dataclass(frozen=True, eq=False)
+class MoveItAttached:
+    """An object that the robot holds at the start."""
+
+    name: str
+    link: str
+    shapes: tuple[Shape, ...]
+    in_link: bool
+    """Whether the shapes are in the frame of the link; else they are where they stand at the start, in the
+    base's."""
+    touch_links: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
 class MoveItRequest:
     """What a motion plan request asks for. Either `joint_goals` is not empty or `pose_goal` is not None."""
 
@@ -42,6 +57,7 @@ class MoveItRequest:
     """Each a goal of its own."""
     pose_goal: tuple[str, Float[ndarray, "4 4"]] | None = None
     """A link and T_base_link."""
+    attached: tuple[MoveItAttached, ...] = ()
 
 
 def read_moveit_scene(file: str | Path, robot: Robot | None = None) -> Scene:
@@ -105,7 +121,8 @@ def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
     says none. Raises InputError if it places more than the robot's root, which one transform does.
     """
     state = _mapping("robot_state", _mapping("a planning scene", data).get("robot_state"))
-    _refuse_attached(state)
+    if state.get("attached_collision_objects"):
+        raise InputError("attached_collision_objects are for the start_state of a request")
     floating = _mapping("multi_dof_joint_state", state.get("multi_dof_joint_state"))
     transforms = _list("multi_dof_joint_state.transforms", floating.get("transforms"))
     T_own_root = np.eye(4)
@@ -197,19 +214,20 @@ def _mesh(where: str, part: dict[str, Any], xyz: ndarray, wxyz: ndarray, name: s
     return Mesh(vertices, faces, xyz, wxyz, name=name)
 
 
-def moveit_request(data: object, frames: MoveItFrames) -> MoveItRequest:
-    """Start and goals of a parsed request; `frames` as of its scene.
+def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) -> MoveItRequest:
+    """Start, held objects and goals of a parsed request; `frames` and `folder` as of its scene.
 
     Several goal constraints of joints are a set of goals. A position and an orientation constraint of one
     link are a pose: the centre of the region; its size and the tolerances are not used. Raises InputError for
-    anything else, and for path constraints and attached objects, which would change the problem if ignored.
+    anything else, and for path constraints, which would change the problem if ignored.
     """
     data = _mapping("a motion plan request", data)
     for name in ("path_constraints", "trajectory_constraints"):
         if any(_mapping(name, data.get(name)).values()):
             raise InputError(f"{name} are not supported")
     state = _mapping("start_state", data.get("start_state"))
-    _refuse_attached(state)
+    held = _list("attached_collision_objects", state.get("attached_collision_objects"))
+    attached = tuple(_attached(i, entry, frames, folder) for i, entry in enumerate(held))
     joints = _mapping("start_state.joint_state", state.get("joint_state"))
     names = _list("start_state.joint_state.name", joints.get("name"))
     positions = _list("start_state.joint_state.position", joints.get("position"))
@@ -219,8 +237,38 @@ def moveit_request(data: object, frames: MoveItFrames) -> MoveItRequest:
         raise InputError("goal_constraints is empty; it must hold at least one goal")
     start = dict(zip(map(str, names), values, strict=True))
     if len(goals) == 1 and _mapping("goal_constraints[0]", goals[0]).get("position_constraints"):
-        return MoveItRequest(start, pose_goal=_pose_goal(goals[0], frames))
-    return MoveItRequest(start, tuple(_joint_goal(f"goal_constraints[{i}]", g) for i, g in enumerate(goals)))
+        return MoveItRequest(start, pose_goal=_pose_goal(goals[0], frames), attached=attached)
+    each = tuple(_joint_goal(f"goal_constraints[{i}]", goal) for i, goal in enumerate(goals))
+    return MoveItRequest(start, each, attached=attached)
+
+
+def _attached(i: int, entry: object, frames: MoveItFrames, folder: Path) -> MoveItAttached:
+    where = f"attached_collision_objects[{i}]"
+    entry = _mapping(where, entry)
+    link, given = str(entry.get("link_name") or ""), _mapping(f"{where}.object", entry.get("object"))
+    header = _mapping(f"{where}.object.header", given.get("header"))
+    in_link = str(header.get("frame_id") or "").removeprefix("/") == link
+    if in_link:  # its shapes are as they are given
+        frames = MoveItFrames(None, np.eye(4), (link,))
+    try:
+        shapes = tuple(_object(given, frames, folder))
+    except InputError as error:
+        raise InputError(f"{where}.object: {error}") from None
+    touch = tuple(map(str, _list(f"{where}.touch_links", entry.get("touch_links"))))
+    return MoveItAttached(str(given.get("id") or "object"), link, shapes, in_link, touch)
+
+
+def holding_at(robot: Robot, held: MoveItAttached, start: list[float]) -> Robot:
+    """The robot with an object that it holds at the start. Links that it has no geometry of may be named."""
+    from robotdiffuse.robots.attached import attach  # compiled code, which most problems do not need
+
+    shapes = held.shapes
+    if not held.in_link and held.link in robot.link_names:
+        T_link_base = inverse(link_pose(robot, np.array(start), held.link))
+        shapes = tuple(shape.moved(T_link_base) for shape in shapes)
+    touch = tuple(link for link in held.touch_links if link in robot.link_names)
+    T_link_body = shapes[0].solid()[0] if shapes else np.eye(4)
+    return attach(robot, Attached(held.name, held.link, T_link_body, shapes, touch))
 
 
 def _joint_goal(where: str, goal: object) -> dict[str, float]:
@@ -255,11 +303,6 @@ def _pose_goal(goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray
     turned = _pose(where, {"position": [0, 0, 0], "orientation": turn.get("orientation")})
     rotation = (frames.of("header", turn) @ turned)[:3, :3]
     return str(link), transform(T_base_region[:3, 3], rotation)
-
-
-def _refuse_attached(state: dict[str, Any]) -> None:
-    if state.get("attached_collision_objects"):
-        raise InputError("attached_collision_objects are not supported")
 
 
 def _mapping(where: str, value: object) -> dict[str, Any]:
