@@ -92,6 +92,14 @@ def test_what_a_link_carries_is_the_arms_own() -> None:
     assert reasons(replace(robot, tip="hand", joints=(*robot.joints, turn)))["a", "c"] == "default"
 
 
+@pytest.mark.parametrize(("bend", "found"), [(2.2, "pose"), (2.1, "checked")])
+def test_what_touches_in_a_named_pose_is_allowed(bend: float, found: str) -> None:
+    """Tucked arms lie upon each other."""
+    arm = box_arm()
+    pose = dict(zip(arm.joint_names, (0.0, 2.2, bend), strict=True))
+    assert reasons(replace(arm, poses={"tucked": pose}))["l1", "l3"] == found
+
+
 @pytest.mark.parametrize(("bound", "found"), [(2.5, "limits"), (3.1, "checked")])
 def test_what_one_joint_folds_into_up_to_its_stop_is_allowed(bound: float, found: str) -> None:
     """Baxter's forearm and wrist collide by mesh in half of the bend's range; its arm never does. Of a joint

@@ -16,7 +16,7 @@ from robotdiffuse.robots.sphere_kernels import deepest_touches
 from robotdiffuse.transforms import rotation_about
 
 ADJACENT, ALWAYS, NEVER, CHECKED = "adjacent", "always", "never", "checked"
-DEFAULT, LIMITS = "default", "limits"
+DEFAULT, POSE, LIMITS = "default", "pose", "limits"
 NAMED, BY_SRDF = "named", "srdf"
 """Reasons from outside: the pair was named by who adds the robot, or an SRDF allows it."""
 BINS = 24
@@ -26,6 +26,8 @@ STOPPED = 5.2
 OFTEN, UNCERTAIN = 0.2, 0.25
 """Share of the configurations in which links collide that a joint's stops keep apart, at least, and of the
 variance of colliding that the other joints may explain, at most."""
+COARSE = 0.03
+"""Meshes of links that overlap in a named pose by no more are taken for coarse there [m]."""
 NEAR = 0.1
 """Links whose balls never come so near [m] are driven towards each other from few samples."""
 
@@ -54,7 +56,7 @@ class PairReport:
 
     links: tuple[str, str]
     reason: str
-    """adjacent, always, never, default, limits, named or srdf (allowed), or checked."""
+    """adjacent, always, never, default, pose, limits, named or srdf (allowed), or checked."""
     colliding: float
     """Share of the configurations in which the meshes collide."""
 
@@ -70,7 +72,8 @@ def find_allowed_collisions(
     holds that pose to be safe, so the meshes are coarse there. Hence it must be within the limits, and both
     links must be the arm's own: the limits know nothing of a tool that is fixed to the last link. For the
     same reason a pair is allowed that collides in a fifth of the configurations or more, up to a stop of one
-    joint between them, which alone says where: stops are where the links on both sides of a joint meet.
+    joint between them, which alone says where: stops are where the links on both sides of a joint meet. And
+    so is one that overlaps a little in a pose that an SRDF names, as the tucked one.
 
     Meshes are tested with Coal, where the covering spheres do not already show that they are apart. Pairs
     that never collided are driven together by random descent from their closest samples; those that can be
@@ -81,6 +84,7 @@ def find_allowed_collisions(
     q = links.random(settings.samples, rng)
     poses = links.poses(q)
     default_poses = links.poses(default)
+    named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
     adjacent = _adjacent(robot)
 
     def reason(a: str, b: str, near: ndarray, colliding: ndarray) -> str:
@@ -92,6 +96,8 @@ def find_allowed_collisions(
         zero = between is not None and all(joint.lower <= 0 <= joint.upper for joint in between)
         if zero and links.collide(default_poses, a, b, 0):
             return DEFAULT
+        if any(-COARSE < links.mesh_distance(pose, a, b) <= 0 for pose in named):
+            return POSE
         if colliding.mean() >= OFTEN and any(links.stops(joint, q, colliding) for joint in between or ()):
             return LIMITS
         descents = settings.descents if near.min() < NEAR else settings.descents // 5
@@ -193,6 +199,11 @@ class Links:
 
     def random(self, count: int, rng: np.random.Generator) -> Float[ndarray, "n d"]:
         return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
+
+    def named(self, pose: dict[str, float]) -> Float[ndarray, "d"]:
+        """The values of all joints in a pose of some of them; the others' as they are held, else zero."""
+        rest = self.robot.locked | pose
+        return np.array([rest.get(j.name, min(max(0.0, j.lower), j.upper)) for j in self.joints])
 
     def stops(self, joint: Joint, q: Float[ndarray, "n d"], colliding: Bool[ndarray, "n"]) -> bool:
         """Whether a joint alone says in which configurations two links collide, up to one of its stops."""
