@@ -27,8 +27,8 @@ def write_bundle(robot: Robot, folder: str | Path, source: dict[str, Any]) -> No
     """Write robot.json and meshes.npz into a folder, each whole or not at all; other files in it stay.
 
     `source` says where the robot comes from: urdf, sha256, licence, and, where preparation measured them, the
-    shares of free configurations and of those that spheres refuse, free and refused. Raises InputError if the folder cannot
-    be written.
+    shares of free configurations and of those that spheres refuse, free and refused. Raises InputError if the
+    folder cannot be written.
     """
     folder = Path(folder)
     meshes = io.BytesIO()
