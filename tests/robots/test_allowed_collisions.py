@@ -13,7 +13,7 @@ from robotdiffuse.robots.allowed_collisions import (
     allowed_pairs,
     find_allowed_collisions,
 )
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 from robotdiffuse.transforms import transform
 
 QUICK = SamplingSettings(samples=1500)
@@ -90,6 +90,28 @@ def test_what_a_link_carries_is_the_arms_own() -> None:
     robot = with_middle(overlapping(0.0, own=False))
     turn = Joint("4", "revolute", "m", "hand", np.eye(4), np.array([0, 0, 1.0]), -1.0, 1.0)
     assert reasons(replace(robot, tip="hand", joints=(*robot.joints, turn)))["a", "c"] == "default"
+
+
+@pytest.mark.parametrize(("bend", "found"), [(2.2, "pose"), (2.1, "checked")])
+def test_what_touches_in_a_named_pose_is_allowed(bend: float, found: str) -> None:
+    """Tucked arms lie upon each other."""
+    arm = box_arm()
+    pose = dict(zip(arm.joint_names, (0.0, 2.2, bend), strict=True))
+    assert reasons(replace(arm, poses={"tucked": pose}))["l1", "l3"] == found
+
+
+@pytest.mark.parametrize(("bound", "found"), [(2.5, "limits"), (3.1, "checked")])
+def test_what_one_joint_folds_into_up_to_its_stop_is_allowed(bound: float, found: str) -> None:
+    """Baxter's forearm and wrist collide by mesh in half of the bend's range; its arm never does. Of a joint
+    that turns all the way round, the range says nothing."""
+    wide = limited(box_arm(), bound)
+    last = wide.joint_names[2]
+    joints = (replace(j, lower=-0.2, upper=0.2) if j.name == last else j for j in wide.joints)
+    wide = replace(wide, joints=tuple(joints))
+    (box,) = wide.meshes["l1"]
+    thick, ball = ConvexMesh(box.vertices * (1, 16, 1), box.faces), np.array([[0.25, 0, 0, 0.6]])
+    meshes, spheres = wide.meshes | {"l1": (thick,)}, wide.spheres | {"l1": ball}
+    assert reasons(replace(wide, meshes=meshes, spheres=spheres))["l1", "l3"] == found
 
 
 def test_always_colliding() -> None:

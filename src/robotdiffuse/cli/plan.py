@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from robotdiffuse.results import PlanResult
     from robotdiffuse.settings import Settings
 
-DEMO = "shelf.yaml"
+DEMO, DEMO_FAMILY = "shelf.yaml", "shelf"
 DEMO_TIME_LIMIT = 5.0
 """[s]"""
 DEMO_CAMERA, DEMO_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
@@ -104,6 +104,11 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
         action="store_true",
         help="plan on what one depth camera sees of it; demo_true.png shows the motion in the true scene",
     )
+    parser.add_argument(
+        "--robot",
+        metavar="NAME",
+        help="plan with another arm between shelves that are drawn for it, see `robotdiffuse robot list`",
+    )
     parser.set_defaults(run=run_demo)
 
 
@@ -167,8 +172,11 @@ def run_demo(arguments: argparse.Namespace) -> int:
     from robotdiffuse.problems.files import load_problem
 
     outputs = [check_output(file, ENDINGS) for file in ("demo.png", "demo.html")]
-    with as_file(files("robotdiffuse") / "examples" / DEMO) as file:
-        problem = load_problem(file)
+    if arguments.robot is None:
+        with as_file(files("robotdiffuse") / "examples" / DEMO) as file:
+            problem = load_problem(file)
+    else:
+        problem = among_shelves(arguments.robot)
     true = problem
     if arguments.camera:
         outputs.append(check_output("demo_true.png", ENDINGS))
@@ -186,6 +194,17 @@ def run_demo(arguments: argparse.Namespace) -> int:
         draw(true if file.name == "demo_true.png" else problem, result, file)
         print(f"wrote {file.resolve()}")
     return 0
+
+
+def among_shelves(robot: str) -> "Problem":
+    """A problem of the family shelf for another arm; InputError if none of them suits it."""
+    import numpy as np
+
+    from robotdiffuse.problems.families import load_family
+    from robotdiffuse.robots import load_robot
+
+    arm = load_robot(robot)
+    return load_family(DEMO_FAMILY).draw(arm, np.random.default_rng(0)).problem(arm)
 
 
 def through_camera(problem: "Problem") -> "Problem":

@@ -91,18 +91,21 @@ def run_list(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation.tables import Column, Table, show
     from robotdiffuse.learning.weights_at_hand import comes_with_package
     from robotdiffuse.robots import known_robots, load_robot
+    from robotdiffuse.robots.bundle import read_source
 
     rows = []
     for name, place in known_robots().items():
         try:
             robot = load_robot(name)
         except InputError as error:
-            rows.append((name, None, None, None, "", str(error)))
+            rows.append((name, None, None, None, None, "", str(error)))
             continue
         spheres = sum(len(part) for part in robot.spheres.values())
         weights = "yes" if comes_with_package("model", robot) else "no"
-        rows.append((name, robot.dof, spheres, len(robot.checked_pairs()), weights, str(place)))
-    columns = ("robot", "joints", "spheres", "checked pairs", "weights", Column("folder", left=True))
+        refused, pairs = read_source(place).get("refused"), len(robot.checked_pairs())
+        rows.append((name, robot.dof, spheres, pairs, refused, weights, str(place)))
+    refused = Column("refused", "%", ".1f", scale=100.0)
+    columns = ("robot", "joints", "spheres", "checked pairs", refused, "weights", Column("folder", left=True))
     show(Table.of("", columns, rows))
     return 0
 

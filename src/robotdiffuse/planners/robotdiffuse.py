@@ -2,7 +2,8 @@
 
 The straight line if it is free. Else a search for a first path, within milliseconds, then ever shorter ones;
 and, for a share of the work, batches of trajectories sampled by the diffusion model under collision guidance,
-or, where none of them is free, the same after more gradient steps (refinement). What the network proposes is
+or, where none of them is free, the same after more gradient steps (refinement). For an arm without weights
+the batches are smooth noise after as many such steps (see smooth_noise.py). What the batches propose is
 simplified by the same code as what search finds, and the shortest path of either bounds the next search.
 Everything goes through the judge, and the result names the stage that its path comes from.
 """
@@ -24,14 +25,16 @@ from robotdiffuse.planners.aorrtc.search import AnytimeSearch, anytime
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, encode
 from robotdiffuse.planners.ends import Ends
+from robotdiffuse.planners.learned import nearest_goals
+from robotdiffuse.planners.smooth_noise import smooth_noise
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Bound, Count, Natural
 
 BATCH_WORK = 8_000
 """Iterations of search that take about as long as a batch of 16 samples in two steps."""
-
-
+WAYPOINTS = 48
+"""Of smooth noise: as many as the networks have."""
 BATCH_SECONDS = 0.05
 """What a batch takes, until it is known [s]."""
 LOAD_SECONDS = 3.0
@@ -48,8 +51,8 @@ class RobotDiffuseSettings(SamplingSettings, name="robotdiffuse"):
     shortened: Count = 6
     """Most candidates of a batch that are simplified."""
     network_share: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
-    """Share of the work that goes to batches of the network; a batch counts as BATCH_WORK iterations of
-    search."""
+    """Share of the work that goes to batches, of the network or of smooth noise; a batch counts as BATCH_WORK
+    iterations of search."""
     search: AORRTCSettings = field(default_factory=AORRTCSettings)
 
 
@@ -76,17 +79,19 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
         settings, robot = self.settings, call.problem.robot
-        search, batches = AnytimeSearch(call, ends, settings.search, AORRTC.name), None
+        search = AnytimeSearch(call, ends, settings.search, AORRTC.name)
         if settings.weights is not None or comes_with_package(self.network_name, robot):
-            batches = _Batches(self, call, ends, search)
+            batches = _NetworkBatches(self, call, ends, search)
         else:
-            call.notes.append(f"no weights come with the package for {robot.name}; planned by search")
+            batches = _Batches(self, call, ends, search)
+            note = f"no weights come with the package for {robot.name}; planned by search and smooth noise"
+            call.notes.append(note)
 
         def improve() -> None:
-            if batches is None or not batches.due:
-                search.improve(call.search_until, STEP)
-            else:
+            if batches.due:
                 batches.offer()
+            else:
+                search.improve(call.search_until, STEP)
 
         return anytime(
             call,
@@ -94,7 +99,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             search,
             lambda: search.pays(settings.search.gain, settings.search.patience),
             improve,
-            None if batches is None else batches.offer,
+            batches.offer,
         )
 
     def refine(
@@ -105,12 +110,11 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
 
 class _Batches:
-    """Batches of the network in the anytime loop of a call."""
+    """Batches of smooth noise in the anytime loop of a call."""
 
     def __init__(self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch) -> None:
         self.planner, self.call, self.ends, self.search = planner, call, ends, search
-        self._code: Float[ndarray, "code"] | None = None
-        self._drawn, self._at_hand = 0, planner.wanted
+        self._drawn = 0
 
     @property
     def due(self) -> bool:
@@ -119,29 +123,24 @@ class _Batches:
         share = self.planner.settings.network_share
         return batches <= share * (self.search.work + batches) and self._can()
 
-    def _can(self) -> bool:
-        """Whether there is time for a batch, and for loading the network, which takes seconds once in a
-        process: without time for that, the next call begins with it."""
-        self._at_hand |= self.call.remaining > LOAD_SECONDS
-        self.planner.wanted = True
-        return self._at_hand and self.call.remaining > self.planner.batch_seconds
-
     def offer(self) -> None:
-        """Draw a batch, refine it where none is free, and offer the shortest free ones to the search."""
-        if not self._can():
-            return
-        began = self.call.elapsed
-        planner, checker, call = self.planner, self.ends.checker, self.call
-        model = planner.model(call.problem.robot)
-        assert model is not None  # there are weights, or there were no batches
+        """Draw a batch and offer the shortest free ones to the search."""
+        if self._can():
+            began = self.call.elapsed
+            self._drawn += 1
+            self._draw()
+            self.planner.batch_seconds = 0.5 * (self.planner.batch_seconds + self.call.elapsed - began)
+
+    def _can(self) -> bool:
+        """Whether there is time for a batch."""
+        return self.call.remaining > self.planner.batch_seconds
+
+    def _draw(self) -> None:
+        planner, checker, count = self.planner, self.ends.checker, self.planner.settings.samples
         start, goals = self.ends.rows()
-        if self._code is None:
-            self._code = encode(model, checker, planner.settings.points, call.rng)
-        self._drawn += 1
-        sampled = planner.draw(model, checker, self._code, start, goals, call.rng)
-        if not self._take(sampled, "network") and call.remaining > 0:
-            self._take(planner.refine(checker, sampled), "refinement")
-        planner.batch_seconds = 0.5 * (planner.batch_seconds + self.call.elapsed - began)
+        goals = nearest_goals(start, goals, count)
+        q = smooth_noise(start, goals, count, WAYPOINTS, checker.robot, self.call.rng)
+        self._take(planner.refine(checker, q), "smooth_noise")
 
     def _take(self, q: Float[ndarray, "count waypoints dof"], stage: str) -> bool:
         """Offer the shortest ones that are free in the space of the search; whether there were any."""
@@ -152,6 +151,33 @@ class _Batches:
             if self.call.remaining > 0 or self.search.best is None:
                 self.search.offer(path, stage)
         return bool(paths)
+
+
+class _NetworkBatches(_Batches):
+    """Batches of the network in its place, refined where none is free."""
+
+    def __init__(self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch) -> None:
+        super().__init__(planner, call, ends, search)
+        self._code: Float[ndarray, "code"] | None = None
+        self._at_hand = planner.wanted
+
+    def _can(self) -> bool:
+        """Whether there is time for a batch, and for loading the network, which takes seconds once in a
+        process: without time for that, the next call begins with it."""
+        self._at_hand |= self.call.remaining > LOAD_SECONDS
+        self.planner.wanted = True
+        return self._at_hand and super()._can()
+
+    def _draw(self) -> None:
+        planner, checker, call = self.planner, self.ends.checker, self.call
+        model = planner.model(call.problem.robot)
+        assert model is not None  # there are weights, or these were no batches of a network
+        start, goals = self.ends.rows()
+        if self._code is None:
+            self._code = encode(model, checker, planner.settings.points, call.rng)
+        sampled = planner.draw(model, checker, self._code, start, goals, call.rng)
+        if not self._take(sampled, "network") and call.remaining > 0:
+            self._take(planner.refine(checker, sampled), "refinement")
 
 
 def unlearned_starts(

@@ -145,11 +145,12 @@ def add_robot(
     )
     folder = user_robots() / name if out is None else Path(out)
     source = {"urdf": Path(urdf).name, "sha256": tree.digest, "licence": licence}
+    shares = {"free": round(made.refusals.free, 4), "refused": round(made.refusals.by_spheres, 4)}
     note = (
         f"{made.refusals.free:.1%} of the configurations are free of self-collision; convex parts refuse "
         f"{made.refusals.by_parts:.1%} of these, spheres {made.refusals.by_spheres:.1%}"
     )
-    write_bundle(replace(made.robot, notes=(*robot.notes, note)), folder, source)
+    write_bundle(replace(made.robot, notes=(*robot.notes, note)), folder, source | shares)
     seconds, memory = time.process_time() - begin, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KILO
     shown = (made.links, made.pairs, made.refusals, seconds, memory, found, differences)
     return AddReport(read_bundle(folder), folder, *shown)

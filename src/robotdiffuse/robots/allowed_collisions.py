@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import coal
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
@@ -15,9 +15,21 @@ from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.robots.sphere_kernels import deepest_touches
 from robotdiffuse.transforms import rotation_about
 
-ADJACENT, ALWAYS, NEVER, DEFAULT, CHECKED = "adjacent", "always", "never", "default", "checked"
+ADJACENT, ALWAYS, NEVER, CHECKED = "adjacent", "always", "never", "checked"
+DEFAULT, POSE, LIMITS = "default", "pose", "limits"
 NAMED, BY_SRDF = "named", "srdf"
 """Reasons from outside: the pair was named by who adds the robot, or an SRDF allows it."""
+BINS = 24
+"""Of a joint's range, to see whether it alone says where two links collide."""
+STOPPED = 5.2
+"""A joint whose range is narrower has a stop [rad]; that of wider ones may be chosen."""
+OFTEN, UNCERTAIN = 0.2, 0.25
+"""Share of the configurations in which links collide that a joint's stops keep apart, at least, and of the
+variance of colliding that the other joints may explain, at most."""
+COARSE = 0.03
+"""Meshes of links that overlap in a named pose by no more are taken for coarse there [m]."""
+NEAR = 0.1
+"""Links whose balls never come so near [m] are driven towards each other from few samples."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +56,7 @@ class PairReport:
 
     links: tuple[str, str]
     reason: str
-    """adjacent, always, never, default, named or srdf (allowed), or checked."""
+    """adjacent, always, never, default, pose, limits, named or srdf (allowed), or checked."""
     colliding: float
     """Share of the configurations in which the meshes collide."""
 
@@ -58,7 +70,10 @@ def find_allowed_collisions(
     between them skipped); pairs that always or never collide; and pairs that collide in the default pose,
     with the joints between them at zero. For such a pair the limits of the joints say that the manufacturer
     holds that pose to be safe, so the meshes are coarse there. Hence it must be within the limits, and both
-    links must be the arm's own: the limits know nothing of a tool that is fixed to the last link.
+    links must be the arm's own: the limits know nothing of a tool that is fixed to the last link. For the
+    same reason a pair is allowed that collides in a fifth of the configurations or more, up to a stop of one
+    joint between them, which alone says where: stops are where the links on both sides of a joint meet. And
+    so is one that overlaps a little in a pose that an SRDF names, as the tucked one.
 
     Meshes are tested with Coal, where the covering spheres do not already show that they are apart. Pairs
     that never collided are driven together by random descent from their closest samples; those that can be
@@ -69,24 +84,34 @@ def find_allowed_collisions(
     q = links.random(settings.samples, rng)
     poses = links.poses(q)
     default_poses = links.poses(default)
+    named = [links.poses(links.named(pose)[None]) for pose in robot.poses.values()]
     adjacent = _adjacent(robot)
+
+    def reason(a: str, b: str, near: ndarray, colliding: ndarray) -> str:
+        if frozenset((a, b)) in adjacent:
+            return ADJACENT
+        if colliding.mean() >= settings.always:
+            return ALWAYS
+        between = _own_between(robot, a, b)
+        zero = between is not None and all(joint.lower <= 0 <= joint.upper for joint in between)
+        if zero and links.collide(default_poses, a, b, 0):
+            return DEFAULT
+        if any(-COARSE < links.mesh_distance(pose, a, b) <= 0 for pose in named):
+            return POSE
+        if colliding.mean() >= OFTEN and any(links.stops(joint, q, colliding) for joint in between or ()):
+            return LIMITS
+        descents = settings.descents if near.min() < NEAR else settings.descents // 5
+        if not colliding.any() and not _descend(links, a, b, q[np.argsort(near)[:descents]], rng):
+            return NEVER
+        return CHECKED
+
     reports = []
     for a, b in _moving_pairs(robot):
         near = links.sphere_distance(poses, a, b)
         colliding = np.zeros(len(q), dtype=bool)
         for i in np.flatnonzero(near <= 0):
             colliding[i] = links.collide(poses, a, b, int(i))
-        if frozenset((a, b)) in adjacent:
-            reason = ADJACENT
-        elif colliding.mean() >= settings.always:
-            reason = ALWAYS
-        elif _default_counts(robot, a, b) and links.collide(default_poses, a, b, 0):
-            reason = DEFAULT
-        elif not colliding.any() and not _descend(links, a, b, q[np.argsort(near)[: settings.descents]], rng):
-            reason = NEVER
-        else:
-            reason = CHECKED
-        reports.append(PairReport((a, b), reason, float(colliding.mean())))
+        reports.append(PairReport((a, b), reason(a, b, near, colliding), float(colliding.mean())))
     return tuple(reports)
 
 
@@ -97,13 +122,17 @@ def allowed_pairs(reports: tuple[PairReport, ...]) -> frozenset[frozenset[str]]:
 
 def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator) -> bool:
     """Whether random descent on the distance between the meshes finds a collision of the links."""
+
+    def poses(q: Float[ndarray, "n d"]) -> dict[str, ndarray]:
+        return links.poses(q, {a, b})
+
     for start in starts:
         q, step = start, 0.1 * (links.upper - links.lower)
-        least = links.mesh_distance(links.poses(q[None]), a, b)
+        least = links.mesh_distance(poses(q[None]), a, b)
         for _ in range(15):
             around = np.clip(q + step * rng.normal(size=(8, len(q))), links.lower, links.upper)
-            poses = links.poses(around)
-            distances = [links.mesh_distance(poses, a, b, i) for i in range(len(around))]
+            at = poses(around)
+            distances = [links.mesh_distance(at, a, b, i) for i in range(len(around))]
             i = int(np.argmin(distances))
             if distances[i] <= 0:
                 return True
@@ -114,8 +143,8 @@ def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng:
     return False
 
 
-def _default_counts(robot: Robot, a: str, b: str) -> bool:
-    """Whether both are links of the arm itself, and zero is within the limits of all joints between them."""
+def _own_between(robot: Robot, a: str, b: str) -> list[Joint] | None:
+    """The movable joints between two links of the arm itself; None if one of them is not the arm's."""
     by_child = {joint.child: joint for joint in robot.joints}
 
     def joints_above(link: str) -> list[Joint]:
@@ -128,9 +157,10 @@ def _default_counts(robot: Robot, a: str, b: str) -> bool:
         return not tool and all(joint in robot.planned_joints for joint in moving)
 
     above = {link: joints_above(link) for link in (a, b)}
-    between = {j.name: j for j in (*above[a], *above[b]) if (j in above[a]) != (j in above[b])}.values()
-    zero = all(joint.lower <= 0 <= joint.upper for joint in between if joint.kind in MOVING_KINDS)
-    return zero and own(a) and own(b)
+    if not own(a) or not own(b):
+        return None
+    either = {joint.name: joint for joint in (*above[a], *above[b])}.values()
+    return [j for j in either if (j in above[a]) != (j in above[b]) and j.kind in MOVING_KINDS]
 
 
 def _moving_pairs(robot: Robot) -> list[tuple[str, str]]:
@@ -164,13 +194,34 @@ class Links:
         self.upper = np.array([joint.upper for joint in self.joints])
         self.hulls = {link: [_coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
         self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
+        self._leading: dict[frozenset[str], list[Joint]] = {}
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
 
     def random(self, count: int, rng: np.random.Generator) -> Float[ndarray, "n d"]:
         return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
 
-    def poses(self, q: Float[ndarray, "n d"]) -> dict[str, Float[ndarray, "n 4 4"]]:
-        """T_base_link by link."""
+    def named(self, pose: dict[str, float]) -> Float[ndarray, "d"]:
+        """The values of all joints in a pose of some of them; the others' as they are held, else zero."""
+        rest = self.robot.locked | pose
+        return np.array([rest.get(j.name, min(max(0.0, j.lower), j.upper)) for j in self.joints])
+
+    def stops(self, joint: Joint, q: Float[ndarray, "n d"], colliding: Bool[ndarray, "n"]) -> bool:
+        """Whether a joint alone says in which configurations two links collide, up to one of its stops."""
+        if joint not in self.joints or joint.upper - joint.lower > STOPPED:
+            return False
+        share = (q[:, self.joints.index(joint)] - joint.lower) / (joint.upper - joint.lower)
+        place = np.minimum((share * BINS).astype(int), BINS - 1)
+        count = np.maximum(np.bincount(place, minlength=BINS), 1)
+        often = np.bincount(place, colliding, minlength=BINS) / count
+        left = (often * (1 - often) * count).sum() / len(q)
+        whole = colliding.mean() * (1 - colliding.mean())
+        return bool(max(often[0], often[-1]) > 0.99 and left < UNCERTAIN * whole)
+
+    def poses(
+        self, q: Float[ndarray, "n d"], wanted: set[str] | None = None
+    ) -> dict[str, Float[ndarray, "n 4 4"]]:
+        """T_base_link by link; of `wanted` links and those above them, if given."""
+        joints = self.robot.joints if wanted is None else self._above(frozenset(wanted))
         values = {joint.name: q[:, i] for i, joint in enumerate(self.joints)}
 
         def value(joint: Joint) -> Float[ndarray, "n"]:
@@ -180,17 +231,27 @@ class Links:
 
         by_name = {joint.name: joint for joint in self.robot.joints}
         poses = {self.robot.base: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
-        for joint in self.robot.joints:
+        for joint in joints:
             T = poses[joint.parent] @ joint.T_parent_joint
             if joint.kind in MOVING_KINDS:
                 T = T @ _motions(joint.axis, joint.kind == "prismatic", value(joint))
             poses[joint.child] = T
         return poses
 
+    def _above(self, links: frozenset[str]) -> list[Joint]:
+        """The joints that lead to some links."""
+        if links in self._leading:
+            return self._leading[links]
+        needed = set(links)
+        for joint in reversed(self.robot.joints):
+            if joint.child in needed:
+                needed.add(joint.parent)
+        self._leading[links] = [joint for joint in self.robot.joints if joint.child in needed]
+        return self._leading[links]
+
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
         """Signed distance between the covering spheres of two links [m]: at most that of their meshes."""
-        T_a_b = np.linalg.inv(poses[a]) @ poses[b]
-        return -deepest_touches(T_a_b, self.robot.spheres[a], self.robot.spheres[b])[0]
+        return -deepest_touches(poses[a], poses[b], self.robot.spheres[a], self.robot.spheres[b], NEAR)[0]
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""

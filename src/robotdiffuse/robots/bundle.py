@@ -5,6 +5,7 @@ import json
 import os
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -26,11 +27,12 @@ ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
 LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
 
 
-def write_bundle(robot: Robot, folder: str | Path, source: dict[str, str]) -> None:
+def write_bundle(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
     """Write robot.json and meshes.npz into a folder, each whole or not at all; other files in it stay.
 
-    `source` says where the robot comes from (urdf, sha256, licence). Raises InputError if the folder cannot
-    be written.
+    `source` says where the robot comes from: urdf, sha256, licence, and, where preparation measured them, the
+    shares of free configurations and of those that spheres refuse, free and refused. Raises InputError if the
+    folder cannot be written.
     """
     folder = Path(folder)
     meshes = io.BytesIO()
@@ -91,13 +93,13 @@ def _check_tree(robot: Robot) -> None:
         raise ValueError("spheres without a size")
 
 
-def read_source(folder: str | Path) -> dict[str, str]:
-    """Where the robot in a folder comes from: urdf, sha256, licence."""
+def read_source(folder: str | Path) -> dict[str, Any]:
+    """Where the robot in a folder comes from, as `write_bundle` got it."""
     source = _read_json(Path(folder) / ROBOT_FILE).get("source", {})
     return source if isinstance(source, dict) else {}
 
 
-def _to_json(robot: Robot, source: dict[str, str]) -> dict:
+def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
     return {
         "format": FORMAT,
         "name": robot.name,

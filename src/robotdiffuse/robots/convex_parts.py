@@ -34,6 +34,8 @@ CHOICE_POINTS = 1200
 """Points of the surface from which the best cut is chosen, about."""
 MOST_NORMALS = 1000
 """Faces of a hull whose planes are all looked at when it is simplified."""
+DEEPEST = 60
+"""Times that a triangle is halved, at most."""
 GROWTH = 1e-7
 """Simplified hulls are larger by this [m]: more than rounding takes away."""
 
@@ -209,8 +211,7 @@ class _Space:
         shape = np.ceil((high - origin) / pitch).astype(int) + 3
         occupied = np.zeros(shape, dtype=bool)
         for soup in soups:
-            samples = split(soup, pitch / 2).reshape(-1, 3)
-            occupied[tuple(np.floor((samples - origin) / pitch).astype(int).T)] = True
+            _mark(occupied, split(soup, pitch / 2), origin, pitch)
         found: Any = ndimage.label(~occupied)
         free = found[0] == found[0][0, 0, 0]
         return _Space(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
@@ -220,6 +221,16 @@ class _Space:
         low = np.floor((hull.vertices.min(0) - self.origin) / self.pitch).astype(int)
         high = np.ceil((hull.vertices.max(0) - self.origin) / self.pitch).astype(int) + 1
         return _farthest_inside(self.distance, self.origin, self.pitch, low, high, *planes_of(hull))
+
+
+@njit(cache=True)
+def _mark(occupied, triangles, origin, pitch):
+    """Mark the voxels in which corners of triangles lie."""
+    for t in range(len(triangles)):
+        for k in range(3):
+            i = int((triangles[t, k, 0] - origin[0]) / pitch)
+            j = int((triangles[t, k, 1] - origin[1]) / pitch)
+            occupied[i, j, int((triangles[t, k, 2] - origin[2]) / pitch)] = True
 
 
 @njit(cache=True)
@@ -339,16 +350,38 @@ def _without_contained(hulls: list[ConvexMesh]) -> list[ConvexMesh]:
 
 def split(triangles: Float[ndarray, "n 3 3"], size: "float | Float[ndarray, 'n']") -> Float[ndarray, "m 3 3"]:
     """Halve triangles at their longest edge until no edge is longer than `size` [m]."""
-    done = []
-    size = np.broadcast_to(size, len(triangles))
-    while len(triangles):
-        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
-        longest = edges.argmax(1)
-        small = edges.max(1) <= size
-        done.append(triangles[small])
-        triangles, longest, size = triangles[~small], longest[~small], np.tile(size[~small], 2)
-        turn = (longest[:, None] + np.arange(3)) % 3
-        a, b, c = np.moveaxis(np.take_along_axis(triangles, turn[:, :, None], axis=1), 1, 0)
-        middle = (a + b) / 2
-        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return np.concatenate(done)
+    sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
+    return _split(np.ascontiguousarray(triangles, np.float64), sizes**2)
+
+
+@njit(cache=True)
+def _split(triangles, squares):
+    out, count = np.empty((4 * len(triangles) + 64, 3, 3)), 0
+    open_ones = np.empty((DEEPEST + 2, 3, 3))
+    for t in range(len(triangles)):
+        open_ones[0], left = triangles[t], 1
+        while left > 0:
+            left -= 1
+            longest, k = -1.0, 0
+            for i in range(3):
+                j = (i + 1) % 3
+                square = 0.0
+                for d in range(3):
+                    square += (open_ones[left, i, d] - open_ones[left, j, d]) ** 2
+                if square > longest:
+                    longest, k = square, i
+            if longest <= squares[t] or left >= DEEPEST:
+                if count == len(out):
+                    out = np.concatenate((out, np.empty_like(out)))
+                out[count] = open_ones[left]
+                count += 1
+                continue
+            for d in range(3):
+                a, b = open_ones[left, k, d], open_ones[left, (k + 1) % 3, d]
+                c = open_ones[left, (k + 2) % 3, d]
+                middle = 0.5 * (a + b)
+                open_ones[left, 0, d], open_ones[left, 1, d], open_ones[left, 2, d] = a, middle, c
+                open_ones[left + 1, 0, d], open_ones[left + 1, 1, d] = middle, b
+                open_ones[left + 1, 2, d] = c
+            left += 2
+    return out[:count].copy()

@@ -72,21 +72,20 @@ def measure_refusals(
     trees = {link: tuple(map(_tree, parts)) for link, parts in surfaces.items()}
     found = []
     for a, b in robot.checked_pairs():
-        T_a_b = np.linalg.inv(poses[a]) @ poses[b]
-        depth, middle = deepest_touches(T_a_b, robot.spheres[a], robot.spheres[b])
+        depth, middle = deepest_touches(poses[a], poses[b], robot.spheres[a], robot.spheres[b], 0.0)
         spheres = depth > 0
         parts, meshes = np.zeros(samples, dtype=bool), np.zeros(samples, dtype=bool)
         for i in np.flatnonzero(spheres):
             parts[i] = links.collide(poses, a, b, int(i))
             if parts[i]:
                 meshes[i] = _collide(trees[a], trees[b], poses[a][i], poses[b][i])
-        found.append((spheres, parts, meshes, middle, T_a_b))
+        found.append((spheres, parts, meshes, middle))
     if not found:
         return Refusals(1.0, 0.0, 0.0, ())
-    free = ~np.any([meshes for _, _, meshes, _, _ in found], axis=0)
+    free = ~np.any([meshes for _, _, meshes, _ in found], axis=0)
     count = max(int(free.sum()), 1)
     pairs = []
-    for (a, b), (spheres, parts, meshes, middle, T_a_b) in zip(robot.checked_pairs(), found, strict=True):
+    for (a, b), (spheres, parts, meshes, middle) in zip(robot.checked_pairs(), found, strict=True):
         idle = np.flatnonzero(spheres & ~parts & free)[:MOST_PLACES]
         gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in idle])
         # the narrowest few stay refused
@@ -94,12 +93,14 @@ def measure_refusals(
             initial=0.0
         )
         idle, gaps = idle[wide], gaps[wide]
-        on_b = np.einsum("nji,nj->ni", T_a_b[idle, :3, :3], middle[idle] - T_a_b[idle, :3, 3])
+        T_base_a, T_base_b = poses[a][idle], poses[b][idle]
+        at = np.einsum("nij,nj->ni", T_base_a[:, :3, :3], middle[idle]) + T_base_a[:, :3, 3]
+        on_b = np.einsum("nji,nj->ni", T_base_b[:, :3, :3], at - T_base_b[:, :3, 3])
         places = {a: _one_per_cube(middle[idle], gaps), b: _one_per_cube(on_b, gaps)}
         shares = (float((parts & free).sum() / count), float((spheres & free).sum() / count))
         pairs.append(PairRefusals((a, b), float(meshes.mean()), *shares, places))
-    by_parts = np.any([parts for _, parts, _, _, _ in found], axis=0)
-    by_spheres = np.any([spheres for spheres, _, _, _, _ in found], axis=0)
+    by_parts = np.any([parts for _, parts, _, _ in found], axis=0)
+    by_spheres = np.any([spheres for spheres, _, _, _ in found], axis=0)
     return Refusals(
         float(free.mean()),
         float((by_parts & free).sum() / count),

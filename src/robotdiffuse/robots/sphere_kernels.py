@@ -143,12 +143,43 @@ def greedy_cover(points, corners, places, depths):
 
 
 @njit(cache=True)
-def deepest_touches(T_a_b, first, second):
-    """For each pose [n, 4, 4] of one set of spheres in the frame of another how deep any two overlap [m]
-    (negative if none do), and the middle of where they do, in the frame of the first set."""
-    depth, middle = np.full(len(T_a_b), -np.inf), np.zeros((len(T_a_b), 3))
-    for n in range(len(T_a_b)):
-        T = T_a_b[n]
+def enclosing(spheres):
+    """Centre and radius of a ball that holds spheres."""
+    center = np.array([0.5 * (spheres[:, k].min() + spheres[:, k].max()) for k in range(3)])
+    radius = 0.0
+    for i in range(len(spheres)):
+        x, y, z = spheres[i, 0] - center[0], spheres[i, 1] - center[1], spheres[i, 2] - center[2]
+        radius = max(radius, math.sqrt(x * x + y * y + z * z) + spheres[i, 3])
+    return center, radius
+
+
+@njit(cache=True)
+def deepest_touches(T_base_a, T_base_b, first, second, apart):
+    """For poses [n, 4, 4] of two sets of spheres how deep any two of them overlap [m] (negative if none do),
+    and the middle of where they do, in the frame of the first set.
+
+    Where balls around the two sets are further from each other than `apart`, only that is told.
+    """
+    depth, middle = np.full(len(T_base_a), -np.inf), np.zeros((len(T_base_a), 3))
+    a_center, a_radius = enclosing(first)
+    b_center, b_radius = enclosing(second)
+    T = np.empty((3, 4))
+    for n in range(len(T_base_a)):
+        A, B = T_base_a[n], T_base_b[n]
+        for i in range(3):
+            for j in range(3):
+                T[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
+            T[i, 3] = 0.0
+            for k in range(3):
+                T[i, 3] += A[k, i] * (B[k, 3] - A[k, 3])
+        square = 0.0
+        for i in range(3):
+            at = T[i, 0] * b_center[0] + T[i, 1] * b_center[1] + T[i, 2] * b_center[2] + T[i, 3]
+            square += (at - a_center[i]) ** 2
+        far = math.sqrt(square) - a_radius - b_radius
+        if far > apart:
+            depth[n] = -far
+            continue
         for j in range(len(second)):
             x = T[0, 0] * second[j, 0] + T[0, 1] * second[j, 1] + T[0, 2] * second[j, 2] + T[0, 3]
             y = T[1, 0] * second[j, 0] + T[1, 1] * second[j, 1] + T[1, 2] * second[j, 2] + T[1, 3]
