@@ -161,7 +161,7 @@ def read_yaml(file: str | Path, what: str = "") -> Any:
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """The value of a YAML text: null, booleans, numbers, texts, lists and mappings by any of these.
+    """The value of a YAML text: null, booleans, numbers, texts, lists, and mappings by texts.
 
     Dates are texts. InputError, naming the place, for invalid, deep and endless ones, and for tags.
     """
@@ -250,10 +250,10 @@ class _Composer:
         else:
             value = {}
             while not self.loader.check_event(yaml.MappingEndEvent):
-                key = self._node(depth + 1)
-                if isinstance(key, list | dict):
-                    self._refuse(event, "a list or mapping is a key")
-                value[key] = self._node(depth + 1)
+                key: Any = self.loader.get_event()
+                if not isinstance(key, yaml.ScalarEvent) or key.tag is not None:
+                    self._refuse(key, "a key is no plain text")
+                value[key.value] = self._node(depth + 1)
             self.loader.get_event()
         if event.anchor is not None:
             self.anchors[event.anchor] = value, self.count - begun
