@@ -208,6 +208,20 @@ PROBLEM: dict[str, Any] = {
 }
 POSE = {"frame": "panda_hand", "xyz": [0.5, 0, 0.5], "wxyz": [0, 1, 0, 0]}
 VIEW = {"cloud": [[1, 0, 1], [1, 0.1, 1]], "camera": {"xyz": [0, 0, 1], "wxyz": [0.5, 0.5, 0.5, 0.5]}}
+EQUIPPED: dict[str, Any] = {
+    "base": {"xyz": [0.0, 0.0, 0.7], "wxyz": [1, 0, 0, 0]},
+    "tool": {
+        "link": "panda_hand",
+        "name": "sucker",
+        "xyz": [0, 0, 0.14],
+        "shapes": [{"cylinder": {"center": [0, 0, 0.09], "radius": 0.012, "height": 0.1}}],
+    },
+    "attached": [
+        {"link": "sucker", "box": {"center": [0, 0, 0.06], "size": [0.1, 0.1, 0.1], "name": "parcel"}}
+    ],
+    "goal": {"pose": {"frame": "parcel", "xyz": [0.45, 0.3, 1.0], "wxyz": [0, 1, 0, 0]}},
+    "waypoints": [{"joints": [0.2, -0.785, 0, -2.356, 0, 1.571, 0.785]}],
+}
 MOVEIT = {
     "name": "",
     "robot_model_name": "panda",
@@ -279,6 +293,8 @@ def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
         data["goal"] = {"pose": POSE}
     if rng.random() < 0.1:
         data["views"], data["unseen"] = [VIEW], "optimistic"
+    elif rng.random() < 0.15:
+        data |= EQUIPPED
     ending = (".yaml", ".json", ".jsonl")[rng.integers(3)]
     file = folder / f"problem{ending}"
     file.write_bytes(text_of(rng, data, ending))
@@ -372,7 +388,7 @@ def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
     from robotdiffuse.robots.limits import read_limits, with_limits
     from robotdiffuse.robots.srdf import read_srdf
-    from robotdiffuse.robots.urdf import content_hash, read_urdf
+    from robotdiffuse.robots.urdf import UrdfTree
 
     part = bytes(trimesh.creation.box((0.1, 0.05, 0.3)).export(file_type="stl"))  # type: ignore[arg-type]
     (folder / "part.stl").write_bytes(damaged(rng, part) if rng.random() < 0.2 else part)
@@ -386,8 +402,9 @@ def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
     def read() -> None:
         srdf = read_srdf(files["two.srdf"])
-        robot = read_urdf(files["two.urdf"], tip="lower", srdf=srdf)
-        content_hash(files["two.urdf"])
+        tree = UrdfTree(files["two.urdf"], {})
+        robot = tree.robot(None, "lower", None, None, srdf)
+        assert tree.digest
         with_limits(robot, read_limits(files["limits.yaml"]))
 
     return read
