@@ -116,19 +116,21 @@ def read_triangles(file: str | Path, what: str = "mesh file", merge: bool = Fals
 
 
 def read_arrays(file: str | Path, what: str = "") -> dict[str, ndarray]:
-    """The arrays of an .npz file, or of an .npy file under the name "". InputError as `input_file`; raises
-    what NumPy does for damaged ones, and ValueError for an archive that unpacks to more than LARGEST_FILE."""
+    """The arrays of an .npz file, or of an .npy file under the name "". InputError as `input_file`, for a
+    damaged file, and for an archive that unpacks to more than LARGEST_FILE."""
     path = input_file(file, what)
-    if path.suffix.lower() != ".npz":
-        return {"": np.load(path, allow_pickle=False)}
-    with zipfile.ZipFile(path) as archive:
-        size = sum(member.file_size for member in archive.infolist())
-    if size > LARGEST_FILE:
-        raise ValueError(
-            f"it unpacks to {size // MEGABYTE} MB; at most {LARGEST_FILE // MEGABYTE} MB are read"
-        )
-    with np.load(path, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+    try:
+        if path.suffix.lower() != ".npz":
+            return {"": np.load(path, allow_pickle=False)}
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size <= LARGEST_FILE:
+            with np.load(path, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
+    except Exception as error:  # NumPy, zipfile and zlib raise whatever they meet in a damaged file
+        raise InputError(f"{what} {file} is damaged: {shortened(str(error))}".strip()) from None
+    most = LARGEST_FILE // MEGABYTE
+    raise InputError(f"{what} {file} unpacks to {size // MEGABYTE} MB; at most {most} MB are read".strip())
 
 
 def read_json(file: str | Path, what: str = "") -> Any:
@@ -159,7 +161,7 @@ def read_yaml(file: str | Path, what: str = "") -> Any:
 
 
 def parse_yaml(text: str, where: str) -> Any:
-    """The value of a YAML text: null, booleans, numbers, texts, lists and mappings by any of these.
+    """The value of a YAML text: null, booleans, numbers, texts, lists, and mappings by texts.
 
     Dates are texts. InputError, naming the place, for invalid, deep and endless ones, and for tags.
     """
@@ -248,10 +250,10 @@ class _Composer:
         else:
             value = {}
             while not self.loader.check_event(yaml.MappingEndEvent):
-                key = self._node(depth + 1)
-                if isinstance(key, list | dict):
-                    self._refuse(event, "a list or mapping is a key")
-                value[key] = self._node(depth + 1)
+                key: Any = self.loader.get_event()
+                if not isinstance(key, yaml.ScalarEvent) or key.tag is not None:
+                    self._refuse(key, "a key is no plain text")
+                value[key.value] = self._node(depth + 1)
             self.loader.get_event()
         if event.anchor is not None:
             self.anchors[event.anchor] = value, self.count - begun

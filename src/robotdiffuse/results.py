@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from robotdiffuse.checks import FASTEST, within
 from robotdiffuse.errors import InputError, shown
 from robotdiffuse.files import check_output, write_atomically
 from robotdiffuse.reading import read_json
@@ -143,7 +144,7 @@ def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any
 
 def _result(record: dict[str, Any]) -> PlanResult:
     known = {status.value: status for status in Status}
-    if record["status"] not in known:
+    if not isinstance(record["status"], str) or record["status"] not in known:
         raise InputError(f"status is {shown(record['status'])}; known: {', '.join(known)}")
     status = known[record["status"]]
     names = _names(record, "joint_names")
@@ -238,6 +239,6 @@ def _rows(record: dict[str, Any], name: str, rows: int | None, columns: int | No
         raise InputError(f"{name} has shape {shape or 'none'}; it must be {wanted}")
     if (rows is not None and len(array) != rows) or (columns is not None and array.shape[1] != columns):
         raise InputError(f"{name} has shape {shape}; it must be {wanted}")
-    if not np.isfinite(array).all():
-        raise InputError(f"{name} holds numbers that are not finite")
+    if not within(array, FASTEST):
+        raise InputError(f"{name} holds numbers that are not finite, or not within ±{FASTEST:g}")
     return array

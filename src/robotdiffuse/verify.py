@@ -14,6 +14,7 @@ from jaxtyping import Float
 from numba import njit
 from numpy import ndarray
 
+from robotdiffuse.checks import LARGEST, within
 from robotdiffuse.collision.hulls import describe_contact
 from robotdiffuse.collision.motion import Contact, ContinuousCollision
 from robotdiffuse.errors import InputError
@@ -157,7 +158,7 @@ class Verifier:
         if trajectory.duration - trajectory.times[0] > LONGEST:
             message = f"the motion takes {trajectory.duration:.6g} s; at most {LONGEST:g} s can be judged"
             return Report(False, Violation("time", float(trajectory.times[0]), message), None, None)
-        if not np.isfinite(trajectory.positions).all():
+        if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
         found = [
             Violation(wrong.kind, wrong.time, wrong.message, wrong.joint, None, wrong.excess)
@@ -189,10 +190,10 @@ class Verifier:
 
         `at_rest`: at which rows a timed motion stands still.
         """
-        bad = np.flatnonzero(~np.isfinite(q).all(axis=1))
+        bad = np.flatnonzero(~(np.abs(q) <= LARGEST).all(axis=1))
         if len(bad):
             at = float(bad[0] if times is None else times[bad[0]])
-            message = f"waypoint {bad[0]} holds values that are not finite"
+            message = f"waypoint {bad[0]} holds values that are not finite, or not within ±{LARGEST:g}"
             return Report(False, Violation("not_finite", at, message), None, None)
         clock = np.arange(len(q), dtype=float) if times is None else times
         limits = self._limits(q, clock, "waypoint {:g}" if times is None else "{:.3f} s")

@@ -427,3 +427,19 @@ def test_example_in_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     runpy.run_path(str(ROOT / "examples" / "plan.py"))
     assert capsys.readouterr().out.startswith("solved")
     assert (tmp_path / "motion.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "status", "said"),
+    [
+        ("{} > /dev/full", 3, "the output could not be written: No space left on device"),
+        ("{} | true; exit ${{PIPESTATUS[0]}}", 3, "the output could not be written: its reader has gone"),
+        ("{} >&-", 0, ""),
+        ("PYTHONIOENCODING=ascii {} > /dev/null", 0, ""),
+    ],
+)
+def test_output_that_leads_nowhere(command: str, status: int, said: str) -> None:
+    """No traceback, and not the status of a problem without a plan."""
+    line = command.format(f"{sys.executable} -m robotdiffuse robot info panda")
+    ended = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr.strip()) == (status, f"robotdiffuse: {said}" if said else "")

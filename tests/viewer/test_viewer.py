@@ -265,3 +265,9 @@ def test_bad_output_is_one_line(arm, motion, write, ending, name, tmp_path):
 def test_bad_settings(settings):
     with pytest.raises(InputError):
         PictureSettings(**settings)
+
+
+@pytest.mark.parametrize("flat", [[[1, 1, 1]] * 3, [[1, 1, 1], [2, 2, 2], [3, 3, 3]]])
+def test_meshes_without_area_are_drawn(flat: list[list[int]]) -> None:
+    surface = creased(np.array(flat, np.float64), np.array([[0, 1, 2]]), np.ones((1, 3)))
+    assert np.isfinite(surface.normals).all()

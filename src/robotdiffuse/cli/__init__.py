@@ -1,15 +1,19 @@
-"""The command line. Exit status: 0 solved or done, 1 no plan, 2 bad input, 130 stopped by Ctrl-C."""
+"""The command line. Exit status: 0 solved or done, 1 no plan, 2 bad input, 3 output that could not be
+written, 130 stopped by Ctrl-C."""
 
 import argparse
+import io
+import os
 import sys
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import NoReturn
 
 from robotdiffuse import __version__
 from robotdiffuse.cli import bench, data, plan, planners, robot, simulate, train, view
 from robotdiffuse.errors import InputError
 
-SOLVED, NO_PLAN, BAD_INPUT, STOPPED = 0, 1, 2, 130
+SOLVED, NO_PLAN, BAD_INPUT, UNWRITTEN, STOPPED = 0, 1, 2, 3, 130
 
 COMMANDS = (
     plan.add_plan,
@@ -46,9 +50,12 @@ def build_parser() -> Parser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return the exit status; bad input is one line on standard error."""
-    arguments = build_parser().parse_args(argv)
+    _prepare_streams()
     try:
-        return arguments.run(arguments)
+        arguments = build_parser().parse_args(argv)
+        status = arguments.run(arguments)
+        sys.stdout.flush()
+        return status
     except InputError as error:
         print(f"robotdiffuse: error: {error}", file=sys.stderr)
         return BAD_INPUT
@@ -56,5 +63,29 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("robotdiffuse: stopped", file=sys.stderr)
         return STOPPED
     except BrokenPipeError:
-        sys.stderr.close()
-        return SOLVED
+        return _unwritten("its reader has gone")
+    except SystemExit as stop:
+        if isinstance(stop.__context__, BrokenPipeError):  # by rich, which would end with status 1
+            return _unwritten("its reader has gone")
+        raise
+    except OSError as error:
+        return _unwritten(error.strerror or str(error))
+
+
+def _prepare_streams() -> None:
+    """Characters that the terminal lacks become question marks; closed streams lead nowhere."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115  (as long as the process)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def _unwritten(why: str) -> int:
+    """Standard output leads nowhere from here on, so that nothing fails as the process ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    with suppress(OSError):
+        print(f"robotdiffuse: the output could not be written: {why}", file=sys.stderr)
+    return UNWRITTEN

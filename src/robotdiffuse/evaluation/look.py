@@ -113,6 +113,7 @@ def style() -> Iterator[None]:
         "svg.fonttype": "none",
         "svg.hashsalt": "robotdiffuse",
         "font.size": 8.0,
+        "text.parse_math": False,
         "text.color": INK,
         "axes.edgecolor": LINE,
         "axes.labelcolor": SOFT,

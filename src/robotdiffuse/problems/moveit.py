@@ -192,7 +192,7 @@ def _primitive(
 ) -> Shape:
     kind = part.get("type")
     kind = TYPE_NUMBERS.get(kind, kind) if isinstance(kind, int) else kind
-    if kind not in PRIMITIVES:
+    if not isinstance(kind, str) or kind not in PRIMITIVES:
         raise unknown_name(f"type of {where}:", kind, PRIMITIVES)
     count, build = PRIMITIVES[kind]
     return build(vector(where, "dimensions", part.get("dimensions"), count), xyz, wxyz, name)

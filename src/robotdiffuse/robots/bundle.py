@@ -3,7 +3,6 @@
 import io
 import json
 import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -239,8 +238,8 @@ def _pack(robot: Robot) -> dict[str, ndarray]:
 
 
 def _unpack(file: Path) -> dict[str, tuple[ConvexMesh, ...]]:
+    arrays = read_arrays(file)
     try:
-        arrays = read_arrays(file)
         links, sizes, vertices, faces = (arrays[key] for key in ("links", "sizes", "vertices", "faces"))
         ends = np.cumsum(sizes, axis=0)
         if len(links) and (ends[-1] != (len(vertices), len(faces))).any():
@@ -252,8 +251,6 @@ def _unpack(file: Path) -> dict[str, tuple[ConvexMesh, ...]]:
             if not ((mesh.faces >= 0) & (mesh.faces < len(corners))).all():
                 raise ValueError(f"faces of {link}: indices of its {len(corners)} vertices expected")
             meshes[str(link)] = (*meshes.get(str(link), ()), mesh)
-    except OSError as error:
-        raise InputError(f"cannot read {file}: {error.strerror or error}") from None
-    except (KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file} is damaged: {error}") from None
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{file} is damaged: {type(error).__name__}: {shortened(str(error))}") from None
     return meshes

@@ -119,16 +119,14 @@ def _read_pcd(file: Path) -> ndarray:
     names, storage = header["FIELDS"], header["DATA"][0]
     counts = [int(count) for count in header.get("COUNT", ["1"] * len(names))]
     if not {"x", "y", "z"} <= {*names}:
-        raise InputError(
-            f"point cloud file {file} has the fields {', '.join(names)}; it must have x, y and z"
-        )
+        raise InputError(f"point cloud file {file} has the fields {shown(names)}; it must have x, y and z")
     total = int(header["POINTS"][0])
     if storage == "ascii":
         columns = [sum(counts[: names.index(axis)]) for axis in "xyz"]
         rows = content[at:].decode("ascii").splitlines()
         return np.loadtxt(rows, usecols=columns, ndmin=2, max_rows=total) if total else np.zeros((0, 3))
     if storage != "binary":
-        raise InputError(f"point cloud file {file} is stored as {storage}; it must be ascii or binary")
+        raise InputError(f"point cloud file {file} is stored as {shown(storage)}; it must be ascii or binary")
     kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
     # Positions as names: PCL writes several padding fields that are all called "_".
     record = np.dtype([(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))])

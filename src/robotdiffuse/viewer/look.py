@@ -77,7 +77,7 @@ def creased(
     face = corner // 3
     alike = np.einsum("ij,ij->i", unit[face[mine]], unit[face[other]]) > np.cos(CREASE)
     summed = [np.bincount(mine[alike], area[face[other[alike]], i], minlength=len(owner)) for i in range(3)]
-    normals = np.stack(summed, axis=1)
+    normals = np.stack(summed, axis=1).astype(np.float64)  # whole numbers where no face has an area
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     keys = np.column_stack([owner, np.round(normals * 100), np.round(colors[face] * 255)]).astype(np.int64)
     _, keep, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)

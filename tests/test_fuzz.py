@@ -1,0 +1,38 @@
+"""A few thousand inputs of benchmarks/fuzz.py: an answer or a one-line error."""
+
+import importlib.util
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+
+spec = importlib.util.spec_from_file_location("fuzz", Path(__file__).parents[1] / "benchmarks" / "fuzz.py")
+assert spec is not None
+assert spec.loader is not None
+fuzz = importlib.util.module_from_spec(spec)
+sys.modules["fuzz"] = fuzz
+spec.loader.exec_module(fuzz)
+
+COUNTS = {
+    "problem": 300,
+    "moveit": 400,
+    "cloud": 1000,
+    "mesh": 300,
+    "urdf": 400,
+    "result": 400,
+    "bundle": 100,
+}
+
+
+@pytest.mark.parametrize("kind", fuzz.KINDS)
+def test_damaged_inputs(kind: str, tmp_path: Path) -> None:
+    faults = []
+    for seed in range(COUNTS[kind]):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        outcome, said = fuzz.one(kind, seed, folder)
+        if outcome == "fault":
+            faults.append(f"{kind} {seed}: {said}")
+        shutil.rmtree(folder)
+    assert not faults
