@@ -127,7 +127,7 @@ def solved(robot: Robot, problems: int) -> tuple[int, int, int] | None:
     planner.plan(drawn[0].problem(robot), time_limit=10.0)  # compiles
     for k, limit in enumerate((1.0, 10.0)):
         for one in drawn:
-            counts[k] += planner.plan(one.problem(robot), time_limit=limit).status == "solved"
+            counts[k] += planner.plan(one.problem(robot), time_limit=limit).solved
     return len(drawn), counts[0], counts[1]
 
 

@@ -30,7 +30,7 @@ class PlanResult:
     """Wall time of plan() [s], with verification and without the timing of the trajectory."""
     seed: int
     stage: str = ""
-    """The part of the planner that produced the path, e.g. 'aorrtc', 'network', 'refinement'."""
+    """The part of the planner that produced the path, e.g. 'aorrtc', 'network', 'smooth_noise'."""
     path: Path | None = None
     trajectory: Trajectory | None = None
     min_clearance: float | None = None

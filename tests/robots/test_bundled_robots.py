@@ -10,6 +10,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
 from robotdiffuse.robots.bundle import read_source
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.sphere_kernels import gaps, within
 from robotdiffuse.robots.sphere_room import stacked_planes
 from robotdiffuse.scenes.scene import Scene
@@ -44,3 +45,19 @@ def test_what_spheres_call_free_is_free_and_little_else_is(name: str) -> None:
 def test_licences_are_named(name: str) -> None:
     assert name in NOTICE.lower() and read_source(DATA / name)["licence"]
     assert sum(file.stat().st_size for file in (DATA / name).iterdir()) < 1_000_000
+
+
+def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
+    """No problem between shelves was solved: the ends differed by turns of a UR's shoulder, which the floor
+    blocks."""
+    robot = load_robot("ur5e")
+    q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, 6))
+    least = robot.least_turns(q)
+    assert (np.abs(least) <= np.pi + 1e-9).all() and (least != q).any()
+    for one, other in zip(q[:5], least[:5], strict=True):
+        np.testing.assert_allclose(
+            link_pose(robot, one, "tool0"), link_pose(robot, other, "tool0"), atol=1e-9
+        )
+    panda = load_robot("panda")
+    middle = 0.5 * (panda.lower + panda.upper)
+    assert np.array_equal(panda.least_turns(middle), middle)

@@ -157,7 +157,7 @@ def test_bad_arguments_give_one_clear_line(tmp_path: Path) -> None:
         (lambda: read_urdf(file, base="fore", tip="base"), "'base'; known: fore"),
         (lambda: read_urdf(file, base="fore"), "no movable joint"),
         (lambda: read_urdf(file, locked={"wrist": 0.0}), "'wrist'"),
-        (lambda: load_robot("no_such_robot"), "known: panda"),
+        (lambda: load_robot("no_such_robot"), "known: baxter_left, "),
         (lambda: load_robot("nowhere/arm.urdf"), "arm.urdf"),
     ):
         with pytest.raises(InputError, match=r"^[^\n]*$") as error:
@@ -290,7 +290,7 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     assert {pair.links: pair.reason for pair in report.pairs}["base", "upper"] == "adjacent"
     for key in ("tiny", str(file), file, str(report.folder)):
         same(load_robot(key), report.robot)
-    with pytest.raises(InputError, match="known: panda, tiny"):
+    with pytest.raises(InputError, match="known: .*panda, .*tiny"):
         load_robot("other")
 
     # a changed URDF is another robot: it is fitted anew, and kept

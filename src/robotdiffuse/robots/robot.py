@@ -177,6 +177,13 @@ class Robot:
         turn."""
         return np.where(self.continuous, 2 * np.pi * np.round(q / (2 * np.pi)), 0.0)
 
+    def least_turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
+        """Configurations with the joints that can turn more than once within half a turn of the middle of
+        their limits: they stand as before, but do not differ by turns that something may block."""
+        middle, turn = 0.5 * (self.lower + self.upper), 2 * np.pi
+        many = (self.upper - self.lower > turn) & ~np.array(self.prismatic, dtype=bool)
+        return np.where(many, q - turn * np.round((q - middle) / turn), q)
+
     @cached_property
     def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], list[ndarray]]:
         links: dict[str, tuple[int, ndarray]] = {self.base: (0, np.eye(4))}

@@ -122,8 +122,7 @@ def uniform_configurations(
     and have the origin of the tip link in the region; fewer where a number of draws found no more."""
     found = np.zeros((0, robot.dof))
     for _ in range(BATCHES):
-        q = rng.uniform(robot.lower, robot.upper, (BATCH, robot.dof))
-        q -= robot.turns(q)
+        q = robot.least_turns(rng.uniform(robot.lower, robot.upper, (BATCH, robot.dof)))
         xyz = link_origins(robot, q, robot.tip)
         q = q[((xyz >= region[0]) & (xyz <= region[1])).all(axis=1)]
         found = np.concatenate([found, q[checker.free(q)] if len(q) else q])
@@ -151,7 +150,7 @@ def reaching_configurations(
         return inside & checker.free(q)
 
     q = inverse_kinematics(robot, robot.tip, T_base_tip, count, rng=rng, accept=accept, settings=settings)
-    return q.astype(np.float32)
+    return robot.least_turns(q).astype(np.float32)
 
 
 def base_spheres(robot: Robot) -> Float[ndarray, "m 4"]:
