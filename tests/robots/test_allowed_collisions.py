@@ -1,6 +1,7 @@
 """Pairs of links that never, always or by default collide, on arms made by hand; what the spheres add."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,11 +9,14 @@ import pytest
 from helpers.box_arm import box_arm, box_mesh
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.add import AddReport
 from robotdiffuse.robots.allowed_collisions import (
+    PairReport,
     SamplingSettings,
     allowed_pairs,
     find_allowed_collisions,
 )
+from robotdiffuse.robots.refusals import Refusals
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 from robotdiffuse.transforms import transform
 
@@ -112,6 +116,13 @@ def test_what_one_joint_folds_into_up_to_its_stop_is_allowed(bound: float, found
     thick, ball = ConvexMesh(box.vertices * (1, 16, 1), box.faces), np.array([[0.25, 0, 0, 0.6]])
     meshes, spheres = wide.meshes | {"l1": (thick,)}, wide.spheres | {"l1": ball}
     assert reasons(replace(wide, meshes=meshes, spheres=spheres))["l1", "l3"] == found
+
+
+def test_pairs_that_meet_and_are_not_checked_are_told() -> None:
+    pairs = (PairReport(("l1", "l3"), "limits", 0.27), PairReport(("l1", "l2"), "adjacent", 1.0))
+    report = AddReport(box_arm(), Path(), (), pairs, Refusals(0.7, 0.0, 0.0, ()), 0.0, 0)
+    (warning,) = report.warnings
+    assert "l1 against l3 is not checked" in warning and "27.0%" in warning
 
 
 def test_always_colliding() -> None:

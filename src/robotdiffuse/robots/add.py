@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.robots.allowed_collisions import BY_SRDF, CHECKED, NAMED, PairReport
+from robotdiffuse.robots.allowed_collisions import BY_SRDF, CHECKED, LIMITS, NAMED, POSE, PairReport
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
 from robotdiffuse.robots.limits import read_limits, with_limits
 from robotdiffuse.robots.preparation import LinkReport, PreparationSettings, Progress, prepare
@@ -20,6 +20,11 @@ from robotdiffuse.robots.urdf import UrdfTree
 
 LITTLE, REFUSED = 0.2, 0.08
 """Shares of free configurations, and of those that spheres refuse, from which on there is a warning."""
+TAKEN_FOR_SAFE = {
+    LIMITS: "up to a stop of one joint, which its limits allow",
+    POSE: "as in a pose that the SRDF names",
+}
+"""Reasons that somebody should look at, with what speaks for the pair."""
 KILO = 1 if sys.platform == "darwin" else 1024
 """Bytes per unit of what the system says of a process's memory."""
 
@@ -61,7 +66,7 @@ class AddReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What will keep this robot from moving, if anything."""
+        """What will keep this robot from moving, and pairs that are taken for safe though they meet."""
         found, of = [], self.refusals
         worst = "; ".join(f"{' against '.join(p.links)} {p.by_spheres:.1%}" for p in of.pairs[:3])
         if of.free < LITTLE:
@@ -76,6 +81,13 @@ class AddReport:
                 f"covering spheres refuse {of.by_spheres:.1%} of the free configurations, more than "
                 f"{REFUSED:.0%} ({worst}); plans there will not be found"
             )
+        found += [
+            f"{' against '.join(pair.links)} is not checked, though the URDF's meshes collide in "
+            f"{pair.colliding:.1%} of the configurations, {TAKEN_FOR_SAFE[pair.reason]}; see that the arm "
+            f"cannot hit itself there"
+            for pair in self.pairs
+            if pair.reason in TAKEN_FOR_SAFE and pair.colliding
+        ]
         return (*found, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
 
 
