@@ -58,14 +58,14 @@ def test_points_lie_on_surfaces_and_nothing_is_nearer(seed: int) -> None:
     view = ray_cast(scene, T, INTRINSICS, SIZE)
     points = view.points()
     nearest = np.min([distance(shape, points) for shape in scene.shapes], axis=0)
-    assert np.abs(nearest).max(initial=0) < 2e-5, "float32, at 2 m"
+    assert np.abs(nearest).max(initial=0) < 5e-5, "float32, at 2 m"
     # along each ray, up to the surface or to the end, everything is outside of all shapes
     v, u = np.mgrid[: SIZE[1], : SIZE[0]]
     fx, fy, cx, cy = INTRINSICS
     rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
     ends = np.minimum(view.depth, FAR) - 1e-4
     between = position + (ends[..., None] * rays)[..., None, :] * np.linspace(0.02, 1, 60)[:, None]
-    assert min(distance(shape, between).min() for shape in scene.shapes) > -2e-5
+    assert min(distance(shape, between).min() for shape in scene.shapes) > -5e-5
 
 
 def test_the_arm_is_its_covering_spheres() -> None:
