@@ -55,7 +55,7 @@ TRIES = 40
 """Places that are drawn until one can be reached."""
 STEP, TOLERANCE = 0.01, 0.001
 """Between the configurations of a path that oracles look at [rad]; PyBullet's own error [m]."""
-LOOKING = 0.5
+LOOKING = 0.15
 """Time limit of a call that only looks for configurations at a place [s]."""
 CAN = "Can1"
 
