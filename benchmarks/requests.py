@@ -1,6 +1,6 @@
 """What people ask a planner for: objects carried, tools, bases elsewhere, goals that leave room, waypoints.
 
-    python benchmarks/requests.py --scenes FOLDER [--places 2] [--number 100] [--planner aorrtc]
+    python benchmarks/requests.py --scenes FOLDER [--places 1] [--number 120] [--planner aorrtc]
 
 Carried: MotionBenchMaker's table_pick (FOLDER), with the can in the hand where its problems end, to random
 places on the table: upright, at any turn about the vertical, 5 mm above the top. Places that the can itself
@@ -55,7 +55,7 @@ TRIES = 40
 """Places that are drawn until one can be reached."""
 STEP, TOLERANCE = 0.01, 0.001
 """Between the configurations of a path that oracles look at [rad]; PyBullet's own error [m]."""
-LOOKING = 0.5
+LOOKING = 0.15
 """Time limit of a call that only looks for configurations at a place [s]."""
 CAN = "Can1"
 
@@ -239,8 +239,8 @@ def attaching() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Requests: held objects, tools, bases, goals, waypoints.")
     parser.add_argument("--scenes", type=Path, required=True, help="folder of table_pick")
-    parser.add_argument("--places", type=int, default=2, help="of each scene (2)")
-    parser.add_argument("--number", type=int, default=100, help="of problems with all of it (100)")
+    parser.add_argument("--places", type=int, default=1, help="of each scene (1)")
+    parser.add_argument("--number", type=int, default=120, help="of problems with all of it (120)")
     parser.add_argument("--planner", default="aorrtc", help="(aorrtc)")
     arguments = parser.parse_args()
     call.time = CpuClock  # type: ignore[attr-defined]

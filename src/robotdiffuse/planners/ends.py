@@ -22,8 +22,8 @@ GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""
 POSES, OF_EACH = 20, 2
 """Poses within the tolerances of a goal that are tried, and configurations that are looked for in each."""
-MOST_POSES, LOOKING = 1000, 0.5
-"""Poses that are tried at most as long as none has a free configuration, and the share of the time left."""
+ROUNDS, LOOKING = 100, 0.5
+"""How often others are tried, by the exact meshes, as long as none is free; the share of the time left."""
 SOME_ROUNDS = InverseKinematicsSettings(max_rounds=2, patience=1)
 """Of these: many may be out of reach."""
 END_MARGIN = 0.0005
@@ -217,20 +217,25 @@ def _pose_goals(
     found = _reaching(call, goal, checker.free)
     if len(found):
         return found
-    reached = _reaching(call, goal, None)
+    until, collisions = call.elapsed + LOOKING * call.remaining, list[str | None]()
+    for _ in range(ROUNDS):
+        reached = _reaching(call, goal, None)
+        found = [_explained(robot, scene, q) for q in reached]
+        kept = [q for q, collision in zip(reached, found, strict=True) if collision is None]
+        if kept:
+            return np.stack(kept)
+        collisions += found
+        if not goal.tolerant or call.elapsed > until:
+            break
     xyz = ", ".join(f"{value:.3f}" for value in goal.T_base_frame[:3, 3])
-    if not len(reached):
+    if not collisions:
         return call.fail(
             Status.UNREACHABLE_GOAL,
             f"no configuration within the joint limits brings {goal.frame} to the pose at ({xyz}) m",
         )
-    collisions = [_explained(robot, scene, q) for q in reached]
-    kept = [q for q, collision in zip(reached, collisions, strict=True) if collision is None]
-    if kept:
-        return np.stack(kept)
     return call.fail(
         Status.INVALID_GOAL,
-        f"all {len(reached)} configurations found for the pose of {goal.frame} at ({xyz}) m are in "
+        f"all {len(collisions)} configurations found for the pose of {goal.frame} at ({xyz}) m are in "
         f"collision, e.g. {collisions[0]}",
     )
 
@@ -238,19 +243,19 @@ def _pose_goals(
 def _reaching(
     call: Call, goal: PoseGoal, accept: Callable[[ndarray], ndarray] | None
 ) -> Float[ndarray, "k dof"]:
-    """Configurations that bring the link to the pose; where it has tolerances, to poses within them too."""
+    """Configurations that bring the link to the pose; where it has tolerances, to some poses within them."""
     robot, rng = call.problem.robot, call.rng
     if not goal.tolerant:
         return inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=accept)
-    found, until = np.zeros((0, robot.dof)), call.elapsed + LOOKING * call.remaining
-    for i in range(MOST_POSES):
-        if len(found) >= GOAL_COUNT or (len(found) and i >= POSES) or (i and call.elapsed > until):
-            break
+    found = np.zeros((0, robot.dof))
+    for i in range(POSES):
         T_base_frame = goal.draw(rng) if i else goal.T_base_frame
         few = inverse_kinematics(
             robot, goal.frame, T_base_frame, OF_EACH, rng=rng, accept=accept, settings=SOME_ROUNDS
         )
         found = np.concatenate([found, few])
+        if len(found) >= GOAL_COUNT:
+            break
     return found[:GOAL_COUNT]
 
 
