@@ -290,7 +290,7 @@ def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.Mo
     assert {pair.links: pair.reason for pair in report.pairs}["base", "upper"] == "adjacent"
     for key in ("tiny", str(file), file, str(report.folder)):
         same(load_robot(key), report.robot)
-    with pytest.raises(InputError, match="known: .*panda, .*tiny"):
+    with pytest.raises(InputError, match=r"known: .*panda, .*tiny"):
         load_robot("other")
 
     # a changed URDF is another robot: it is fitted anew, and kept
