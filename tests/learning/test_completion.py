@@ -182,6 +182,14 @@ def test_temperature_and_calibration() -> None:
     )
 
 
+def test_nothing_is_imagined_where_nothing_was_learned() -> None:
+    """Walls of the network's fancy stood a metre around the arm."""
+    unknown = np.zeros((1, *SHAPE), np.uint8)
+    p = load_completion().probabilities(*(torch.from_numpy(unknown) for _ in range(2))).detach().numpy()
+    reachable = training.reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    assert not p[0][~reachable].any() and p[0][reachable].any()
+
+
 @pytest.mark.parametrize("family", FAMILIES)
 def test_bundled_weights_know_more_than_how_much_is_occupied(family: str) -> None:
     """Average precision over unknown voxels of 2 cm above ground: of a guess, the share that is occupied."""

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from robotdiffuse.settings import Settings
 
 DEMO, DEMO_FAMILY = "shelf.yaml", "shelf"
-DEMO_TIME_LIMIT = 5.0
+DEMO_TIME_LIMIT = 10.0
 """[s]"""
 DEMO_CAMERA, DEMO_TARGET = (-0.5, 1.1, 1.2), (0.6, 0.0, 0.5)
 """Where `demo --camera` looks from, and at [m]."""
@@ -208,9 +208,11 @@ def among_shelves(robot: str) -> "Problem":
 
 
 def through_camera(problem: "Problem") -> "Problem":
-    """The problem with what a depth camera behind the arm's shoulder sees of the scene in place of it."""
+    """The problem with what a depth camera behind the arm's shoulder sees of the scene in place of it, and
+    the floor, which is known."""
     import numpy as np
 
+    from robotdiffuse.problems.families.furniture import FLOOR
     from robotdiffuse.problems.problem import IMAGINED
     from robotdiffuse.scenes.ray_caster import looking_at, ray_cast
     from robotdiffuse.scenes.scene import Scene
@@ -218,8 +220,9 @@ def through_camera(problem: "Problem") -> "Problem":
     T_base_camera = looking_at(np.array(DEMO_CAMERA), np.array(DEMO_TARGET))
     width, height = 640, 480
     intrinsics = (460.0, 460.0, (width - 1) / 2, (height - 1) / 2)
-    view = ray_cast(problem.scene, T_base_camera, intrinsics, (width, height), problem.robot, problem.start)
-    return replace(problem, scene=Scene(), views=(view,), unseen=IMAGINED)
+    stands = Scene([FLOOR, *problem.scene.shapes])
+    view = ray_cast(stands, T_base_camera, intrinsics, (width, height), problem.robot, problem.start)
+    return replace(problem, scene=Scene([FLOOR]), views=(view,), unseen=IMAGINED)
 
 
 def solve(

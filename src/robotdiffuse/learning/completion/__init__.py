@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 def imagine(
     volume: "ObservedVolume", network: "CompletionNetwork | None" = None
 ) -> Float32[ndarray, "112 112 64"]:
-    """The probability that each voxel of 2 cm holds an obstacle; 0 where it was seen free.
+    """The probability that each voxel of 2 cm holds an obstacle; 0 where it was seen free, and farther than
+    1 m from a Panda's shoulder, where nothing was learned.
 
     The grid begins at the volume's LOW. `network`: None for the one that comes with the package. Computed in
     bf16 where the processor does so fast.

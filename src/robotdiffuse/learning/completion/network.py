@@ -94,6 +94,7 @@ class CompletionNetwork(nn.Module):
 
     places: Tensor
     temperature: Tensor
+    beyond: Tensor
 
     def __init__(self, settings: CompletionSettings) -> None:
         super().__init__()
@@ -109,6 +110,7 @@ class CompletionNetwork(nn.Module):
         self.to(memory_format=torch.channels_last_3d)  # type: ignore[call-overload]
         self.register_buffer("places", _places(), persistent=False)
         self.register_buffer("temperature", torch.ones(()))
+        self.register_buffer("beyond", torch.from_numpy(~reachable()), persistent=False)
 
     def features(
         self, seen: UInt8[Tensor, "n 56 56 32"], behind: UInt8[Tensor, "n 56 56 32"]
@@ -143,9 +145,9 @@ class CompletionNetwork(nn.Module):
     def probabilities(
         self, seen: UInt8[Tensor, "n 56 56 32"], behind: UInt8[Tensor, "n 56 56 32"]
     ) -> Float[Tensor, "n 112 112 64"]:
-        """Of each voxel of 2 cm; 0 in voxels seen free."""
+        """Of each voxel of 2 cm; 0 in voxels seen free, and beyond the reach that it was trained for."""
         logits = unfolded(unfolded(self(seen, behind).float()))[..., 0] / self.temperature
-        free = (seen & FREE).bool()
+        free = (seen & FREE).bool() | self.beyond
         for axis in (1, 2, 3):
             free = free.repeat_interleave(2, axis)
         return torch.sigmoid(logits).masked_fill_(free, 0.0)
