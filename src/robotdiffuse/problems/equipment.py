@@ -28,8 +28,13 @@ DIGITS = 12
 
 def read_pose(where: str, data: object) -> Float[ndarray, "4 4"]:
     """The transform of {xyz: [...], wxyz: [...]}, each of which may be left out; InputError otherwise."""
-    values = check_fields(where, data, (), ("xyz", "wxyz"))
-    return _pose(where, values)
+    return pose_of(where, check_fields(where, data, (), ("xyz", "wxyz")))
+
+
+def pose_of(where: str, values: dict[str, Any]) -> Float[ndarray, "4 4"]:
+    """The transform of the fields xyz and wxyz among others, each of which may be left out."""
+    xyz = vector(where, "xyz", values.get("xyz", ORIGIN), 3)
+    return transform(xyz, rotation_from_quaternion(unit_quaternion(where, values.get("wxyz", IDENTITY))))
 
 
 def pose_entry(T: Float[ndarray, "4 4"]) -> dict[str, Any]:
@@ -47,7 +52,7 @@ def equipped(robot: Robot, tool: object, attached: object, folder: Path) -> tupl
         values = check_fields("tool", tool, ("link",), ("name", "xyz", "wxyz", "shapes", "touch_links"))
         shapes, more = read_scene(values.get("shapes", []), folder, "tool.shapes")
         notes += more
-        T, name = _pose("tool", values), _text("tool.name", values.get("name", TOOL))
+        T, name = pose_of("tool", values), _text("tool.name", values.get("name", TOOL))
         touch = _names("tool.touch_links", values.get("touch_links", []))
         robot = robot.with_tool(_text("tool.link", values["link"]), T, shapes.shapes, touch, name)
     if attached is not None and not isinstance(attached, list):
@@ -92,11 +97,6 @@ def rounded(value: Any) -> Any:
     if isinstance(value, list):
         return [rounded(item) for item in value]
     return {key: rounded(item) for key, item in value.items()} if isinstance(value, dict) else value
-
-
-def _pose(where: str, values: dict[str, Any]) -> Float[ndarray, "4 4"]:
-    xyz = vector(where, "xyz", values.get("xyz", ORIGIN), 3)
-    return transform(xyz, rotation_from_quaternion(unit_quaternion(where, values.get("wxyz", IDENTITY))))
 
 
 def _one_shape(where: str, entry: dict[str, Any], folder: Path) -> tuple[tuple[Shape, ...], tuple[str, ...]]:

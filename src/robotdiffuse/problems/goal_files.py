@@ -12,13 +12,12 @@ from typing import Any
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.checks import numbers, unit_quaternion, vector
+from robotdiffuse.checks import numbers
 from robotdiffuse.errors import InputError, shown, unknown_name
-from robotdiffuse.problems.equipment import pose_entry
+from robotdiffuse.problems.equipment import pose_entry, pose_of
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.transforms import rotation_from_quaternion, transform
 
 GOALS = ("joints", "joint_set", "pose", "any")
 TOLERANCES = ("xyz_tolerance", "rpy_tolerance")
@@ -67,8 +66,7 @@ def goal_entry(goal: Goal) -> dict[str, Any]:
 
 def _pose_goal(field: str, value: object, scene: Scene) -> PoseGoal:
     pose = check_fields(field, value, ("frame", "xyz", "wxyz"), ("relative_to", *TOLERANCES))
-    xyz = vector(field, "xyz", pose["xyz"], 3)
-    T = transform(xyz, rotation_from_quaternion(unit_quaternion(field, pose["wxyz"])))
+    T = pose_of(field, pose)
     if "relative_to" in pose:
         T = _object_pose(field, pose["relative_to"], scene) @ T
     return PoseGoal(pose["frame"], T, *(pose.get(name) for name in TOLERANCES))  # type: ignore[arg-type]
