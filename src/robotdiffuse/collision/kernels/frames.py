@@ -1,4 +1,4 @@
-"""Compiled kinematics in float64: the next frame of a chain, places in a frame, and balls beside boxes."""
+"""Compiled kinematics in float64: the next frame of a chain, places in a frame, and points beside boxes."""
 
 import numpy as np
 from numba import njit
@@ -24,14 +24,13 @@ def placed(T, p, r):
 
 
 @njit(cache=True)
-def ball_to_box(T, ball, rotation, middle, half, disc):
-    """Lower bound of the distance [m] from a frame's point to a box, R_box_base[3, 3], whose half edges are
-    longer by the radius of a disc around its z axis; negative within."""
+def point_to_box(x, y, z, rotation, middle, half, disc):
+    """Lower bound of the distance [m] from a point to a box, R_box_base[3, 3], whose half edges are longer by
+    the radius of a disc around its z axis; negative within."""
     outside, deepest = 0.0, -np.inf
+    x, y, z = x - middle[0], y - middle[1], z - middle[2]
     for r in range(3):
-        d = 0.0
-        for k in range(3):
-            d += rotation[r, k] * (placed(T, ball, k) - middle[k])
+        d = rotation[r, 0] * x + rotation[r, 1] * y + rotation[r, 2] * z
         d = abs(d) - half[r] - (disc if r < 2 else 0.0)
         outside += max(d, 0.0) ** 2
         deepest = max(deepest, d)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from robotdiffuse.collision.kernels.frames import ball_to_box, placed, step
+from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
 
 MOST_STEPS = 32
 """Of GJK; mostly it takes three to eight."""
@@ -115,7 +115,8 @@ def part_speed(hulls, p, base, posture):
 def ball_to_solid(hulls, p, solids, o, posture):
     """A lower bound of the distance of a part to an obstacle in the middle, from ball and box."""
     T, ball = posture.frames[hulls.frame[p]], hulls.balls[p]
-    gap = ball_to_box(T, ball, solids.rotation[o], solids.middle[o], solids.half[o], solids.disc[o])
+    x, y, z = placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)
+    gap = point_to_box(x, y, z, solids.rotation[o], solids.middle[o], solids.half[o], solids.disc[o])
     return gap - solids.rounding[o] - ball[3]
 
 

@@ -4,7 +4,7 @@ obstacles."""
 import numpy as np
 from numba import njit
 
-from robotdiffuse.collision.kernels.frames import ball_to_box, placed, step
+from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
 
 
 @njit(cache=True)
@@ -29,9 +29,11 @@ def scene_bounds(frames, frame, centers, radii, boxes):
     obstacles = len(middle)
     out = np.empty((len(frames), len(radii) * obstacles))
     for i in range(len(frames)):
+        T = frames[i, frame]
         for p in range(len(radii)):
+            x, y, z = placed(T, centers[p], 0), placed(T, centers[p], 1), placed(T, centers[p], 2)
             for o in range(obstacles):
-                gap = ball_to_box(frames[i, frame], centers[p], rotation[o], middle[o], half[o], 0.0)
+                gap = point_to_box(x, y, z, rotation[o], middle[o], half[o], 0.0)
                 out[i, p * obstacles + o] = gap - rounding[o] - radii[p]
     return out
 
@@ -42,11 +44,12 @@ def pair_bounds(frames, frame, centers, radii, other_frame, other_centers, other
     others = len(other_radii)
     out = np.empty((len(frames), len(radii) * others))
     for i in range(len(frames)):
+        S, T = frames[i, frame], frames[i, other_frame]
         for p in range(len(radii)):
+            x, y, z = placed(S, centers[p], 0), placed(S, centers[p], 1), placed(S, centers[p], 2)
             for o in range(others):
-                square = 0.0
-                for r in range(3):
-                    a = placed(frames[i, frame], centers[p], r)
-                    square += (a - placed(frames[i, other_frame], other_centers[o], r)) ** 2
-                out[i, p * others + o] = np.sqrt(square) - radii[p] - other_radii[o]
+                c = other_centers[o]
+                u, v, w = x - placed(T, c, 0), y - placed(T, c, 1), z - placed(T, c, 2)
+                gap = np.sqrt(u * u + v * v + w * w)
+                out[i, p * others + o] = gap - radii[p] - other_radii[o]
     return out
