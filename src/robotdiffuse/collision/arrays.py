@@ -41,6 +41,8 @@ class RobotArrays(NamedTuple):
     last one fills up."""
     row_bounds: ndarray
     """[rows, 4] a sphere around all spheres of the row."""
+    row_sizes: ndarray
+    """[rows] spheres in the row, without what fills it up."""
     first_row: ndarray
     """[groups + 1] first row of each group."""
     frame: ndarray
@@ -109,6 +111,7 @@ def compile_robot(robot: Robot) -> RobotArrays:
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
         rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [EMPTY, *rows]]),
         row_bounds=np.array([row for group in placed for row in group.row_bounds], np.float32).reshape(-1, 4),
+        row_sizes=np.array([len(row) for row in rows], np.int64),
         first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),
         bounds=np.array([group.bounds for group in placed], np.float32).reshape(-1, 4),

@@ -7,14 +7,10 @@ from jaxtyping import Float
 from numba import njit
 from numpy import ndarray
 
+from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.distance import CAP, cost_gradient_at
-from robotdiffuse.collision.kernels.lane_clearance import (
-    clearances_into,
-    count_obstacles,
-    make_clearance_workspace,
-    pair_clearances_into,
-)
+from robotdiffuse.collision.kernels.distance import CAP
+from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace, pair_clearances_into
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -49,33 +45,22 @@ def descend(robot, scene, q, lower, upper, steps, prefix, suffix, count):
     """
     batch, n, dof = q.shape
     first, last = prefix, n - suffix
-    frames = np.empty((dof + 1, 12), np.float32)
+    scratch = make_cost_workspace(dof)
     pushes, active = np.empty((n, dof), np.float32), np.empty(n, np.float32)
     gradient = np.empty(dof, np.float32)
     costs = np.zeros(batch, np.float32)
-    work = make_clearance_workspace(robot, count_obstacles(scene))
-    links = np.full((n, len(robot.frame) - np.searchsorted(robot.frame, 1)), CAP)
+    work = make_clearance_workspace(robot, 1)
     pairs = np.full((n, len(robot.pairs)), CAP)
     pushed = max(steps.margin, steps.self_margin, steps.limit_margin) > OFF
     for b in range(batch):
         for _ in range(count):
             total = _ZERO
-            if steps.margin > OFF:
-                clearances_into(robot, scene, q[b], steps.margin, work, links)
             if steps.self_margin > OFF:
                 pair_clearances_into(robot, q[b], steps.self_margin, work, pairs)
             for i in range(first, last):
                 gradient[:] = _ZERO
                 cost = cost_gradient_at(
-                    robot,
-                    scene,
-                    q[b, i],
-                    links[i],
-                    pairs[i],
-                    steps.margin,
-                    steps.self_margin,
-                    frames,
-                    gradient,
+                    robot, scene, q[b, i], pairs[i], steps.margin, steps.self_margin, scratch, gradient
                 )
                 total += cost
                 active[i] = _push_away(cost, gradient, steps.push, pushes[i])

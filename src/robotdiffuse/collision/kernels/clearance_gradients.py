@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from robotdiffuse.collision.kernels.distance import cost_gradient_at
+from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.lane_clearance import (
     clearances_into,
     count_obstacles,
@@ -21,14 +21,12 @@ def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearanc
     obstacle; those of the cost itself differ by a thousandfold.
     """
     clearances_into(robot, scene, q, limit, work, clearances)
-    frames = np.empty((q.shape[1] + 1, 12), np.float32)
+    scratch = make_cost_workspace(q.shape[1])
     pairs = np.zeros(len(robot.pairs), np.float32)  # at a margin of 0: no cost
     gradients[:] = np.float32(0.0)
     for i in range(len(q)):
         if clearances[i].min() < margin:
-            cost = cost_gradient_at(
-                robot, scene, q[i], clearances[i], pairs, margin, np.float32(0.0), frames, gradients[i]
-            )
+            cost = cost_gradient_at(robot, scene, q[i], pairs, margin, np.float32(0.0), scratch, gradients[i])
             if cost > np.float32(0.0):
                 gradients[i] /= np.sqrt(np.float32(2.0) * cost)
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.distance import cost_gradient_at
 from robotdiffuse.collision.kernels.lanes import W, place, place_frames
 from robotdiffuse.collision.kernels.point_grid import KEEP, points_distance, points_lower_bound
 
@@ -339,10 +339,8 @@ def cost_gradients(robot, scene, q, margin, self_margin):
     """Collision costs [n] of the rows of q[n, dof] and their gradients [n, dof]; see `cost_gradient_at`."""
     n, dof = q.shape
     costs, grads = np.empty(n, np.float32), np.zeros((n, dof), np.float32)
-    frames = np.empty((dof + 1, 12), np.float32)
-    links, pairs = link_clearances(robot, scene, q, margin), pair_clearances(robot, q, self_margin)
+    scratch = make_cost_workspace(dof)
+    pairs = pair_clearances(robot, q, self_margin)
     for i in range(n):
-        costs[i] = cost_gradient_at(
-            robot, scene, q[i], links[i], pairs[i], margin, self_margin, frames, grads[i]
-        )
+        costs[i] = cost_gradient_at(robot, scene, q[i], pairs[i], margin, self_margin, scratch, grads[i])
     return costs, grads

@@ -29,6 +29,9 @@ HELP_AFTER = 8_000
 RESTART_AFTER = 1_000
 """Iterations without a shorter path after which every third slice is of a round without bound: where it is
 tight, trees hold longer paths than simplification has made of a first one that goes the long way round."""
+JUDGE_AFTER = 4_000
+"""Iterations between two shorter paths that are judged on the way: at the end of the time, what the judge
+refuses would cost all that was found since the last path that passed."""
 SLICE = 100
 """Iterations between two looks at the clock."""
 NO_SHORTER = 1e-4
@@ -217,11 +220,19 @@ class Answers:
         self.call, self.ends = call, ends
         self.best: PlanResult | None = None
         self._path: ndarray | None = None
+        self._judged_at = 0
+
+    def due(self, search: AnytimeSearch) -> bool:
+        """Whether a path is to be judged before the search goes on: the first one, and then shorter ones, now
+        and then."""
+        rested = search.work >= self._judged_at + JUDGE_AFTER
+        return self.best is None or (rested and search.best is not self._path)
 
     def take(self, search: AnytimeSearch) -> bool:
         """Whether the best path of the search passes the judge; if not, the search goes on from the last that
         did."""
         assert search.best is not None
+        self._judged_at = search.work
         if search.best is self._path:
             return True
         if self._accepts(search.best, search.stage, search):
@@ -260,7 +271,7 @@ def anytime(
 
     answers = Answers(call, ends)
     while search.first(call.search_until, help_out):
-        if ended() or (answers.best is None and call.ample):
+        if ended() or (call.ample and answers.due(search)):
             if answers.take(search) and ended():
                 break
             if answers.best is None and call.remaining <= 0:
