@@ -8,6 +8,8 @@ simplified by the same code as what search finds, and the shortest path of eithe
 Everything goes through the judge, and the result names the stage that its path comes from.
 """
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Annotated
@@ -31,12 +33,12 @@ from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Bound, Count, Natural
 
-BATCH_WORK = 8_000
-"""Iterations of search that take about as long as a batch of 16 samples in two steps."""
+BATCH_WORK = 12_000
+"""Iterations of search that take about as long as a batch of 16 samples in two steps, or its refinement."""
 WAYPOINTS = 48
 """Of smooth noise: as many as the networks have."""
 BATCH_SECONDS = 0.05
-"""What a batch takes, until it is known [s]."""
+"""What a batch or its refinement takes, until it is known [s]."""
 LOAD_SECONDS = 3.0
 """A call that has so much time left may load PyTorch and the network [s]."""
 
@@ -68,8 +70,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         self.wanted = self.settings.weights is not None
         """Whether the network is to be loaded before the next call's clock starts: given weights are, those
         of the package once a call would have used them."""
-        self.batch_seconds = BATCH_SECONDS
-        """What a batch took of late [s]."""
+        self.seconds = {"batch": BATCH_SECONDS, "refinement": BATCH_SECONDS}
+        """What they took of late [s]: the last one, or more if those before did."""
 
     def prepare(self, robot: Robot) -> None:
         """See `planners.base.Planner`."""
@@ -114,33 +116,39 @@ class _Batches:
 
     def __init__(self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch) -> None:
         self.planner, self.call, self.ends, self.search = planner, call, ends, search
-        self._drawn = 0
+        self._spent = 0
 
     @property
     def due(self) -> bool:
         """Whether the batches have had less than their share of the work, and there is time for one."""
-        batches = (self._drawn + 1) * BATCH_WORK
-        share = self.planner.settings.network_share
+        batches, share = self._spent + BATCH_WORK, self.planner.settings.network_share
         return batches <= share * (self.search.work + batches) and self._can()
 
     def offer(self) -> None:
         """Draw a batch and offer the shortest free ones to the search."""
         if self._can():
-            began = self.call.elapsed
-            self._drawn += 1
             self._draw()
-            self.planner.batch_seconds = 0.5 * (self.planner.batch_seconds + self.call.elapsed - began)
 
     def _can(self) -> bool:
         """Whether there is time for a batch."""
-        return self.call.remaining > self.planner.batch_seconds
+        return self.call.remaining > self.planner.seconds["batch"]
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        """A batch or its refinement, which counts as work and whose time the next ones will know."""
+        began = self.call.elapsed
+        yield
+        took, self._spent = self.call.elapsed - began, self._spent + BATCH_WORK
+        self.planner.seconds[part] = max(took, 0.5 * (self.planner.seconds[part] + took))
 
     def _draw(self) -> None:
         planner, checker, count = self.planner, self.ends.checker, self.planner.settings.samples
         start, goals = self.ends.rows()
         goals = nearest_goals(start, goals, count)
-        q = smooth_noise(start, goals, count, WAYPOINTS, checker.robot, self.call.rng)
-        self._take(planner.refine(checker, q), "smooth_noise")
+        with self._timed("batch"):
+            q = smooth_noise(start, goals, count, WAYPOINTS, checker.robot, self.call.rng)
+            q = planner.refine(checker, q)
+        self._take(q, "smooth_noise")
 
     def _take(self, q: Float[ndarray, "count waypoints dof"], stage: str) -> bool:
         """Offer the shortest ones that are free in the space of the search; whether there were any."""
@@ -173,11 +181,14 @@ class _NetworkBatches(_Batches):
         model = planner.model(call.problem.robot)
         assert model is not None  # there are weights, or these were no batches of a network
         start, goals = self.ends.rows()
-        if self._code is None:
-            self._code = encode(model, checker, planner.settings.points, call.rng)
-        sampled = planner.draw(model, checker, self._code, start, goals, call.rng)
-        if not self._take(sampled, "network") and call.remaining > 0:
-            self._take(planner.refine(checker, sampled), "refinement")
+        with self._timed("batch"):
+            if self._code is None:
+                self._code = encode(model, checker, planner.settings.points, call.rng)
+            sampled = planner.draw(model, checker, self._code, start, goals, call.rng)
+        if not self._take(sampled, "network") and call.remaining > planner.seconds["refinement"]:
+            with self._timed("refinement"):
+                refined = planner.refine(checker, sampled)
+            self._take(refined, "refinement")
 
 
 def unlearned_starts(
