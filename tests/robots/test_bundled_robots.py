@@ -8,6 +8,8 @@ import trimesh
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.planners import load_planner
+from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
 from robotdiffuse.robots.bundle import read_source
 from robotdiffuse.robots.kinematics import link_pose
@@ -61,3 +63,21 @@ def test_joints_that_turn_twice_are_drawn_without_needless_turns() -> None:
     panda = load_robot("panda")
     middle = 0.5 * (panda.lower + panda.upper)
     assert np.array_equal(panda.least_turns(middle), middle)
+
+
+def test_a_pose_does_not_say_how_often_a_joint_turns() -> None:
+    """One random problem in ten had no way for a UR even without obstacles: its upper arm hung down beyond
+    the base, from where the goal can be reached over the top, a turn further."""
+    robot, home = load_robot("ur5e"), np.array([0, -1.57, 1.57, -1.57, -1.57, 0])
+    start = np.array([0.5, 2.9, 0.7, 0.4, 2.7, 0.2])
+    goals = robot.same_stance(home, start)
+    assert np.allclose(goals[0], home + 2 * np.pi * np.array([0, 1, 0, 0, 1, 0])) and len(goals) == 6
+    assert ((goals >= robot.lower) & (goals <= robot.upper)).all()
+    T = link_pose(robot, home, "tool0")
+    for q in goals:
+        np.testing.assert_allclose(link_pose(robot, q, "tool0"), T, atol=1e-9)
+    pose = Problem(robot, Scene([]), start, PoseGoal("tool0", T))
+    result = load_planner("aorrtc").plan(pose, time_limit=10.0, until="first")
+    assert result.solved, result.reason
+    panda = load_robot("panda")
+    assert np.array_equal(panda.same_stance(panda.upper, panda.lower), panda.upper[None])

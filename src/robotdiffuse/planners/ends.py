@@ -1,6 +1,6 @@
 """Where a motion begins and may end: goals of a pose, ends that touch, and why there can be no plan."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -216,14 +216,14 @@ def _pose_goals(
     robot, scene = call.problem.robot, call.problem.scene
     found = _reaching(call, goal, checker.free)
     if len(found):
-        return found
+        return _by_turns(call, found)
     until, collisions = call.elapsed + LOOKING * call.remaining, list[str | None]()
     for _ in range(ROUNDS):
         reached = _reaching(call, goal, None)
         found = [_explained(robot, scene, q) for q in reached]
         kept = [q for q, collision in zip(reached, found, strict=True) if collision is None]
         if kept:
-            return np.stack(kept)
+            return _by_turns(call, kept)
         collisions += found
         if not goal.tolerant or call.elapsed > until:
             break
@@ -238,6 +238,12 @@ def _pose_goals(
         f"all {len(collisions)} configurations found for the pose of {goal.frame} at ({xyz}) m are in "
         f"collision, e.g. {collisions[0]}",
     )
+
+
+def _by_turns(call: Call, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:
+    """Goals of a pose, which does not say how often a joint turns."""
+    robot, start = call.problem.robot, call.problem.start
+    return np.concatenate([robot.same_stance(q, start) for q in goals])
 
 
 def _reaching(

@@ -15,6 +15,7 @@ from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
 from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
+TURN = 2 * np.pi
 TURNS = 3 * np.pi
 """Planners turn continuous joints this far either way [rad]: they begin within half a turn, and end at most a
 turn from there. The joints themselves have no limits."""
@@ -175,14 +176,33 @@ class Robot:
     def turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
         """The whole turns of continuous joints in configurations [rad]: less these, they are within half a
         turn."""
-        return np.where(self.continuous, 2 * np.pi * np.round(q / (2 * np.pi)), 0.0)
+        return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
 
     def least_turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
         """Configurations with the joints that can turn more than once within half a turn of the middle of
         their limits: they stand as before, but do not differ by turns that something may block."""
-        middle, turn = 0.5 * (self.lower + self.upper), 2 * np.pi
-        many = (self.upper - self.lower > turn) & ~np.array(self.prismatic, dtype=bool)
-        return np.where(many, q - turn * np.round((q - middle) / turn), q)
+        middle = 0.5 * (self.lower + self.upper)
+        return np.where(self._turns_twice, q - TURN * np.round((q - middle) / TURN), q)
+
+    def same_stance(self, q: Float[ndarray, "dof"], start: Float[ndarray, "dof"]) -> Float[ndarray, "k dof"]:
+        """Configurations within the limits that stand as one does but for whole turns of joints that have
+        limits and can turn more than once: first with all of these as near to `start` as can be, then with
+        one after the other turned the other way, for something may block the short way."""
+        many = self._turns_twice & ~self.continuous
+        nearest = np.where(many, q - TURN * np.round((q - start) / TURN), q)
+        nearest = np.where(many & (nearest > self.upper), nearest - TURN, nearest)
+        nearest = np.where(many & (nearest < self.lower), nearest + TURN, nearest)
+        rows = [nearest]
+        for j in np.flatnonzero(many):
+            other = nearest.copy()
+            other[j] -= np.copysign(TURN, nearest[j] - start[j])
+            if self.lower[j] <= other[j] <= self.upper[j]:
+                rows.append(other)
+        return np.stack(rows)
+
+    @cached_property
+    def _turns_twice(self) -> Bool[ndarray, "dof"]:
+        return (self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool)
 
     @cached_property
     def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], list[ndarray]]:

@@ -64,8 +64,9 @@ class Drawn:
     """The target; where only its position is given, the orientation is that of the first goal."""
 
     def problem(self, robot: Robot) -> Problem:
-        """Any of the goals will do."""
-        return Problem(robot, self.scene, self.start, JointGoal(self.goals))
+        """Any of the goals will do, and any of whole turns of their joints."""
+        goals = np.concatenate([robot.same_stance(goal, self.start) for goal in self.goals])
+        return Problem(robot, self.scene, self.start, JointGoal(goals))
 
 
 @runtime_checkable
