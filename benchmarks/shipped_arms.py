@@ -1,0 +1,139 @@
+"""The robots that come with the package, in furniture and clutter: solved, how soon, how short, on meshes.
+
+    python benchmarks/shipped_arms.py [--robots ur5e fr3 ...] [--problems 200]
+
+Prints a report that is kept in benchmarks/results/shipped_arms.txt. First motions of `robotdiffuse` with a
+limit of 1 s; what that does not solve, with 10 s. The lengths stand beside those of `aorrtc` after the same
+time, on every tenth problem: for robots without weights that is what batches of smooth noise add to search.
+Returned motions are checked at 5 mrad by Coal and by PyBullet on the robots' meshes.
+"""
+
+import argparse
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+from report import header, print_table, progress
+
+from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.errors import InputError
+from robotdiffuse.planners import load_planner
+from robotdiffuse.problems.families import load_family
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.results import PlanResult
+from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.simulation.oracle import PyBulletOracle
+
+FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
+SEED = 11
+"""Of the problems; no setting was chosen on them."""
+SOON, LATE = 1.0, 10.0
+"""Time limits [s]."""
+EACH = 10
+"""Of so many problems, one is planned for all of SOON, by both planners."""
+STEP = 0.005
+"""Between two checked configurations, the largest joint's [rad]."""
+
+
+@dataclass
+class Tally:
+    """What was counted on one robot."""
+
+    problems: int = 0
+    soon: int = 0
+    late: int = 0
+    times: list[float] = field(default_factory=list)
+    ratios: list[float] = field(default_factory=list)
+    noise: int = 0
+    configurations: int = 0
+    by_coal: int = 0
+    by_pybullet: int = 0
+
+
+def check(problem: Problem, result: PlanResult, tally: Tally) -> None:
+    """The timed motion on the meshes."""
+    assert result.trajectory is not None
+    legs = pairwise(result.trajectory.positions)
+    counts = [(a, b, max(int(np.ceil(np.abs(b - a).max() / STEP)), 1)) for a, b in legs]
+    dense = np.concatenate([np.linspace(a, b, count) for a, b, count in counts])
+    tally.configurations += len(dense)
+    tally.by_coal += bool(ExactCollision(problem.robot, problem.scene).collides(dense).any())
+    with PyBulletOracle(problem.robot, problem.scene) as oracle:
+        tally.by_pybullet += any(oracle.collides(q) for q in dense)
+
+
+def tried(name: str, problems: int) -> Tally:
+    robot, tally = load_robot(name), Tally()
+    hybrid, search = load_planner("robotdiffuse"), load_planner("aorrtc")
+    drawn = []
+    for family in FAMILIES:
+        rng = np.random.default_rng(SEED)
+        try:
+            drawn += [
+                load_family(family).draw(robot, rng).problem(robot) for _ in range(problems // len(FAMILIES))
+            ]
+        except InputError:  # the arm is too small for this family's furniture
+            continue
+    for planner in (hybrid, search):
+        for problem in drawn[:1]:
+            planner.warm_up(problem)
+    for i, problem in enumerate(progress(drawn, name)):
+        tally.problems += 1
+        result = hybrid.plan(problem, SOON, seed=i, until="first")
+        tally.soon += result.solved
+        if result.solved:
+            tally.times.append(1e3 * result.planning_time)
+        else:
+            result = hybrid.plan(problem, LATE, seed=i, until="first")
+        tally.late += result.solved
+        if result.solved:
+            check(problem, result, tally)
+        if i % EACH == 0 and result.solved and result.stage != "straight_line":
+            ours, theirs = (
+                p.plan(problem, SOON, seed=i, until="limit", clearance=0.0) for p in (hybrid, search)
+            )
+            if ours.path is not None and theirs.path is not None:
+                tally.ratios.append(ours.path.length / theirs.path.length)
+                tally.noise += ours.stage in ("smooth_noise", "network", "refinement")
+    return tally
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="The robots that come with the package, in furniture.")
+    parser.add_argument(
+        "--robots", nargs="+", choices=ROBOTS, default=list(ROBOTS), metavar="ROBOT", help="(all)"
+    )
+    parser.add_argument("--problems", type=int, default=200, help="for each robot (200)")
+    arguments = parser.parse_args()
+    print(header("numpy", "numba", "coal", "pybullet"))
+    rows = []
+    for name in arguments.robots:
+        of = tried(name, arguments.problems)
+        if of.problems == 0:
+            rows.append([name, "0", *["-"] * 9])
+            continue
+        p50, p95 = np.percentile(of.times, (50, 95))
+        lengths = (
+            [f"{np.mean(of.ratios):.4f}", f"{of.noise} of {len(of.ratios)}"] if of.ratios else ["-", "-"]
+        )
+        found = [f"{of.problems}", f"{of.soon}", f"{of.late}", f"{p50:.1f}", f"{p95:.1f}", *lengths]
+        rows.append([name, *found, f"{of.configurations}", f"{of.by_coal}", f"{of.by_pybullet}"])
+    columns = (
+        "robot",
+        "problems",
+        "solved in 1 s",
+        "in 10 s",
+        "first ms, median",
+        "p95",
+        "length",
+        "batches'",
+    )
+    notes = (
+        "length: of the hybrid over that of search alone at the same second, mean; batches': how many of "
+        "those answers come from batches (smooth noise; of the Panda, the network)",
+    )
+    print_table("Furniture and clutter", (*columns, "checked", "Coal", "PyBullet"), rows, notes)
+
+
+if __name__ == "__main__":
+    main()
