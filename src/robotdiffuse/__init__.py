@@ -13,6 +13,11 @@ if TYPE_CHECKING:
     from robotdiffuse.planners import load_planner as load_planner
     from robotdiffuse.planners import plan as plan
     from robotdiffuse.planners.many import plan_many as plan_many
+    from robotdiffuse.problems.constraints import AxisCone as AxisCone
+    from robotdiffuse.problems.constraints import CartesianLine as CartesianLine
+    from robotdiffuse.problems.constraints import OnLine as OnLine
+    from robotdiffuse.problems.constraints import OnPlane as OnPlane
+    from robotdiffuse.problems.constraints import PositionBox as PositionBox
     from robotdiffuse.problems.files import load_problem as load_problem
     from robotdiffuse.problems.goals import AnyGoal as AnyGoal
     from robotdiffuse.problems.goals import JointGoal as JointGoal
@@ -47,6 +52,11 @@ _HOME = {
     "AnyGoal": "robotdiffuse.problems.goals",
     "JointGoal": "robotdiffuse.problems.goals",
     "PoseGoal": "robotdiffuse.problems.goals",
+    "AxisCone": "robotdiffuse.problems.constraints",
+    "CartesianLine": "robotdiffuse.problems.constraints",
+    "OnLine": "robotdiffuse.problems.constraints",
+    "OnPlane": "robotdiffuse.problems.constraints",
+    "PositionBox": "robotdiffuse.problems.constraints",
     "Problem": "robotdiffuse.problems.problem",
     "load_problem": "robotdiffuse.problems.files",
     "load_robot": "robotdiffuse.robots",

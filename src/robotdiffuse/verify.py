@@ -19,6 +19,7 @@ from robotdiffuse.collision.hulls import describe_contact
 from robotdiffuse.collision.motion import Contact, ContinuousCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal
+from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.robots.kinematics import link_pose
@@ -60,6 +61,9 @@ class VerifySettings(Settings, name="verify"):
     chord: Positive = 1e-3
     """Between rows a trajectory is judged on straight lines, unless the cubic through their positions and
     velocities, as controllers follow it, leaves them by more than this [rad] or [m]: then along the cubic."""
+    constraint_chord: Positive = 1e-6
+    """Path constraints are judged along that cubic always: on straight lines that leave it by no more than
+    this [rad] or [m], which is taken from their tolerances."""
     reversal_angle: NotNegative = float(np.radians(150))
     """A turn in joint space by more than this [rad] is a sharp reversal ..."""
     reversal_step: NotNegative = 0.05
@@ -80,19 +84,19 @@ class Violation:
     """The first thing along the motion that is wrong."""
 
     kind: str
-    """not_finite, start, limits, scene_collision, self_collision, twitch, waypoint or goal; for trajectories
-    also time, rest, velocity, acceleration, jump and rates."""
+    """not_finite, start, limits, scene_collision, self_collision, constraint, twitch, waypoint or goal; for
+    trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
     time: float
     """Where: for a path, waypoint index plus fraction of the segment; for a trajectory, seconds."""
     message: str
     """One line."""
     subject: str | None = None
-    """The link that collides, or the joint that is out of limits."""
+    """The link that collides or is constrained, or the joint that is out of limits."""
     other: str | None = None
-    """The obstacle or the other link."""
+    """The obstacle, the other link or the kind of constraint."""
     excess: float | None = None
-    """By how much: the greatest depth until the contact ends [m]; beyond the limit, or off the goal, in its
-    unit."""
+    """By how much: the greatest depth until the contact ends [m], the greatest value of a constraint until it
+    is kept; beyond the limit, or off the goal, in its unit."""
 
 
 @dataclass(frozen=True)
@@ -167,11 +171,18 @@ class Verifier:
         rows = trajectory.times, trajectory.positions
         times, positions = rows if found else between_rows(trajectory, self.settings.chord)
         still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
-        return self._report(positions, times, found, np.isin(times, trajectory.times[still]))
+        along = None
+        if self.constraints is not None:
+            found += self._too_fast(trajectory)
+            along = between_rows(trajectory, self.settings.constraint_chord) if not found else None
+        return self._report(positions, times, found, np.isin(times, trajectory.times[still]), along)
 
     def collision_free(self, path: Path) -> bool:
-        """Whether a path is certified free of collision; neither its ends nor limits are looked at."""
+        """Whether a path is certified free of collision and keeps path constraints; neither its ends nor
+        limits are looked at."""
         self._check_shape(path.joint_names, path.positions)
+        if self.constraints is not None and self.constraints.first(path.positions) is not None:
+            return False
         return self._continuous.sweep(path.positions).contact is None
 
     def _check_shape(self, joint_names: tuple[str, ...], positions: ndarray) -> None:
@@ -184,11 +195,17 @@ class Verifier:
             )
 
     def _report(
-        self, q: ndarray, times: ndarray | None, found: list[Violation], at_rest: ndarray | None = None
+        self,
+        q: ndarray,
+        times: ndarray | None,
+        found: list[Violation],
+        at_rest: ndarray | None = None,
+        along: tuple[ndarray, ndarray] | None = None,
     ) -> Report:
         """The verdict on waypoints; `found` are violations known already. The earliest one is reported.
 
-        `at_rest`: at which rows a timed motion stands still.
+        `at_rest`: at which rows a timed motion stands still. `along`: times and positions of one for path
+        constraints.
         """
         bad = np.flatnonzero(~(np.abs(q) <= LARGEST).all(axis=1))
         if len(bad):
@@ -197,7 +214,7 @@ class Verifier:
             return Report(False, Violation("not_finite", at, message), None, None)
         clock = np.arange(len(q), dtype=float) if times is None else times
         limits = self._limits(q, clock, "waypoint {:g}" if times is None else "{:.3f} s")
-        every = (self._start(q), limits, *found, self._twitch(q, clock))
+        every = (self._start(q), limits, *found, self._twitch(q, clock), self._constrained(q, clock, along))
         found = [violation for violation in every if violation is not None]
         first = min(found, key=lambda violation: violation.time, default=None)
         last = len(q) - 1 if first is None else int(np.searchsorted(clock, first.time))
@@ -237,6 +254,35 @@ class Verifier:
         message = f"{name} is {q[i, j]:.6g} at {at}; its limits are {low:.6g} to {high:.6g}"
         return Violation("limits", float(clock[i]), message, name, None, float(excess[i, j]))
 
+    def _constrained(
+        self, q: ndarray, clock: ndarray, along: tuple[ndarray, ndarray] | None
+    ) -> Violation | None:
+        """Where the motion is first not proved to keep the path constraints."""
+        if self.constraints is None:
+            return None
+        chord = 0.0 if along is None else self.settings.constraint_chord
+        clock, q = (clock, q) if along is None else along
+        wrong = self.constraints.first(q, chord)
+        if wrong is None:
+            return None
+        at = float(np.interp(wrong.at, np.arange(len(clock)), clock))
+        one = wrong.constraint
+        return Violation("constraint", at, wrong.message, one.frame, one.kind, wrong.excess)
+
+    def _too_fast(self, trajectory: Trajectory) -> list[Violation]:
+        """Where a frame is first faster than its constraint allows."""
+        assert self.constraints is not None
+        speeds = self.constraints.speeds(trajectory.positions, trajectory.velocities)
+        excess = speeds - self.constraints.most_speeds * (1 + self.settings.rate_slack)
+        bad = np.flatnonzero((excess > 0).any(axis=1))
+        if not len(bad):
+            return []
+        i, k = int(bad[0]), int(excess[bad[0]].argmax())
+        one, at = self.constraints.paced[k], float(trajectory.times[bad[0]])
+        most = self.constraints.most_speeds[k]
+        message = f"{one.frame} moves at {speeds[i, k]:.4g} m/s; {one.kind} allows {most:.4g} m/s"
+        return [Violation("speed", at, message, one.frame, one.kind, float(excess[:, k].max()))]
+
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
         """More sharp reversals than allowed, counted on waypoints at least `reversal_step` apart."""
         settings = self.settings
@@ -272,6 +318,11 @@ class Verifier:
                 return Violation("waypoint", float(clock[-1]), message, f"waypoints[{k}]", None, None)
             after = int(stop)
         return None
+
+    @cached_property
+    def constraints(self) -> PathConstraints | None:
+        """The problem's path constraints made ready; None if it has none."""
+        return PathConstraints(self.problem) if self.problem.constraints else None
 
     @property
     def _rate_tolerances(self) -> RateTolerances:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -26,6 +26,8 @@ FINE = 0.001
 """Time between the rows that a limit of jerk is kept by [s]."""
 GENTLER = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
 """Shares of the acceleration limits of which the fastest motion of limited jerk is taken."""
+BETWEEN = 8
+"""Parts of a grid interval between which a pace is looked at."""
 SAME = 1e-6
 """Waypoints nearer to each other than this are one [rad]."""
 
@@ -53,6 +55,14 @@ class TimingSettings(Settings, name="timing"):
 DEFAULT = TimingSettings()
 
 
+class Pace(NamedTuple):
+    """Speeds that are bounded beside those of the joints."""
+
+    speeds: Callable[[ndarray, ndarray], ndarray]
+    """[n, k] at configurations [n, dof] with joint rates [n, dof]; in proportion to the rates."""
+    most: Float[ndarray, "k"]
+
+
 def time_parameterize(
     robot: Robot,
     path: Path,
@@ -60,6 +70,7 @@ def time_parameterize(
     free: Callable[[Path], bool],
     settings: TimingSettings = DEFAULT,
     keeps: Callable[[ndarray], bool] = lambda _: True,
+    pace: "Pace | None" = None,
 ) -> Trajectory:
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
 
@@ -70,6 +81,8 @@ def time_parameterize(
 
     `keeps` says of configurations [n, dof] along a rounded corner whether they keep what the path does, a
     clearance say; corners that do not are rounded less from the start.
+
+    `pace` bounds further speeds, those of frames.
 
     A limit of jerk takes time at both ends of the motion and at each stop, and may cut corners a little more.
 
@@ -90,15 +103,15 @@ def time_parameterize(
             break
         deviations = np.where(bad, shrink * deviations, deviations)
     for shrink in SHRINKS:
-        trajectory = _timed(robot, path, waypoints, deviations, settings)
+        trajectory = _timed(robot, path, waypoints, deviations, settings, pace)
         if not deviations.any() or valid(trajectory):
             return trajectory
         bad = _bad_corners(path, waypoints, deviations, free)
         deviations = np.where(bad, shrink * deviations, deviations)
-    trajectory = _timed(robot, path, waypoints, deviations, settings)
+    trajectory = _timed(robot, path, waypoints, deviations, settings, pace)
     if not deviations.any() or valid(trajectory):
         return trajectory
-    return _timed(robot, path, waypoints, np.zeros(len(waypoints) - 2), settings)
+    return _timed(robot, path, waypoints, np.zeros(len(waypoints) - 2), settings, pace)
 
 
 def _check_limits(robot: Robot) -> None:
@@ -155,6 +168,7 @@ def _timed(
     waypoints: Float[ndarray, "n dof"],
     deviations: Float[ndarray, "corners"],
     settings: TimingSettings,
+    pace: Pace | None,
 ) -> Trajectory:
     """Pieces between stops, one after the other. The motion stops where the deviation is zero."""
     stops = [0, *(np.flatnonzero(deviations == 0) + 1), len(waypoints) - 1]
@@ -162,7 +176,7 @@ def _timed(
     for a, b in pairwise(stops):
         part = waypoints[a : b + 1]
         line = BlendedPolyline(part, half_widths(part, deviations[a : b - 1]))
-        pieces.append(_piece(robot, line, settings))
+        pieces.append(_piece(robot, line, settings, pace))
     start, rows = 0.0, []
     for k, (times, positions, velocities, accelerations) in enumerate(pieces):
         first = 0 if k == 0 else 1
@@ -231,18 +245,19 @@ Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof
 """Times, positions, velocities and accelerations."""
 
 
-def _piece(robot: Robot, line: BlendedPolyline, settings: TimingSettings) -> Rows:
+def _piece(robot: Robot, line: BlendedPolyline, settings: TimingSettings, pace: Pace | None) -> Rows:
     """A motion from rest to rest."""
     grid, limits = _grid(line, settings), _limits(robot, settings)
     if settings.jerk is None:
-        speeds = _speeds(line, grid, settings.solver, *limits)
+        speeds = _paced(line, grid, _speeds(line, grid, settings.solver, *limits, pace), pace)
         return sampled(line.arrays, grid, speeds, settings.sample_time)
     every = max(round(settings.sample_time / FINE), 1)
     step, found = settings.sample_time / every, list[tuple[float, ndarray, int]]()
     for share in GENTLER:
         velocity, acceleration = limits[0], share * limits[1]
         window = max(int(np.ceil(2 * acceleration.max() / settings.jerk / step)), 1)
-        speeds = _speeds(line, grid, settings.solver, velocity, acceleration)
+        speeds = _speeds(line, grid, settings.solver, velocity, acceleration, pace)
+        speeds = _paced(line, grid, speeds, pace)
         lasts = float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
         slower = np.ceil(lasts / step) * step / lasts  # whole steps
         found.append((lasts * slower + window * step, speeds / slower, window))
@@ -257,15 +272,34 @@ def _speeds(
     solver: str,
     velocity: Float[ndarray, "dof"],
     acceleration: Float[ndarray, "dof"],
+    pace: Pace | None,
 ) -> Float[ndarray, "m"]:
     """ṡ at each value of s in the grid, such that the limits are kept in between too."""
+    first, second = line(grid, 1), line(grid, 2)
     if solver == TOPPRA:
         speeds = _speeds_by_toppra(line, grid, velocity, acceleration)
-    else:
-        speeds = fastest(line(grid, 1), line(grid, 2), grid, velocity, acceleration)
+    elif pace is None:
+        speeds = fastest(first, second, grid, velocity, acceleration)
+    else:  # as joints without limits of acceleration
+        more = pace.speeds(line(grid, 0), first)
+        first, second = np.column_stack([first, more]), np.column_stack([second, np.zeros_like(more)])
+        without = np.full(len(pace.most), np.inf)
+        limits = np.append(velocity, pace.most), np.append(acceleration, without)
+        speeds = fastest(first, second, grid, *limits)
     if not (speeds[1:-1] > 0).all():
         raise RuntimeError("no timing was found; every path has one, so this is a numerical failure")
     return speeds / slowdown(line.arrays, grid, speeds, velocity, acceleration)
+
+
+def _paced(
+    line: BlendedPolyline, grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"], pace: Pace | None
+) -> Float[ndarray, "m"]:
+    """The speeds, slowed down so that the pace is kept between grid points too."""
+    if pace is None:
+        return speeds
+    s = np.interp(np.arange(BETWEEN * (len(grid) - 1) + 1), BETWEEN * np.arange(len(grid)), grid)
+    rates = line(s, 1) * np.sqrt(np.interp(s, grid, speeds**2))[:, None]
+    return speeds / max(1.0, float((pace.speeds(line(s, 0), rates) / pace.most).max(initial=0.0)))
 
 
 def _limits(robot: Robot, settings: TimingSettings) -> tuple[ndarray, ndarray]:

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.timing import TimingSettings, time_parameterize
+from robotdiffuse.paths.timing import DEFAULT, Pace, TimingSettings, time_parameterize
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Bound, NotNegative, OneOf, Positive, Settings
@@ -21,7 +21,9 @@ from robotdiffuse.verify import Report, Verifier, Violation, verifier
 CLEARANCE = 0.01
 """What neither call nor problem says [m]."""
 
-
+CLOSE_ROWS = 0.002
+"""Time between the rows of motions under path constraints, whose corners are many and near to each other
+[s]."""
 AMPLE = 5.0
 """Times that a path could be judged and timed in the time left, where the first one found is at once."""
 MOST_RESERVED = 0.5
@@ -64,6 +66,7 @@ class Call:
         self.clearance = next(value for value in wanted if value is not None)
         """Distance to obstacles that is to be kept where it can be [m]."""
         self._timing = TimingSettings(
+            sample_time=CLOSE_ROWS if problem.constraints else DEFAULT.sample_time,
             velocity_scale=request.velocity_scaling,
             acceleration_scale=request.acceleration_scaling,
             jerk=request.jerk,
@@ -173,7 +176,7 @@ class Call:
         planning_time = self.elapsed
         motion = _TimedMotion(self.judge)
         trajectory = time_parameterize(
-            problem.robot, path, motion.valid, self.judge.collision_free, self._timing, keeps
+            problem.robot, path, motion.valid, self.judge.collision_free, self._timing, keeps, self._pace
         )
         timed = motion.report(trajectory)
         if timed.violation is not None:
@@ -201,6 +204,14 @@ class Call:
             progress=(*longer, (found[0] if found else planning_time, path.length)),
             refused=self._refused,
         )
+
+    @property
+    def _pace(self) -> Pace | None:
+        """The speeds that constraints bound."""
+        constraints = self.judge.constraints
+        if constraints is None or not len(constraints.paced):
+            return None
+        return Pace(constraints.speeds, constraints.most_speeds)
 
     def _refuse(self, violation: Violation) -> None:
         self._refused = violation.kind

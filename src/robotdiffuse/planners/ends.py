@@ -11,12 +11,15 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.planners.call import Call
+from robotdiffuse.problems.constraints import PositionBox
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
+from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.types import Status
+from robotdiffuse.verify import DEFAULT, goal_error
 
 GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""
@@ -26,6 +29,10 @@ ROUNDS, LOOKING = 100, 0.5
 """How often others are tried, by the exact meshes, as long as none is free; the share of the time left."""
 SOME_ROUNDS = InverseKinematicsSettings(max_rounds=2, patience=1)
 """Of these: many may be out of reach."""
+FEW_ROUNDS = InverseKinematicsSettings(max_rounds=8, patience=2)
+"""Of these under path constraints: none may keep them."""
+SHARE_AT_GOAL, LEAST_BOX = 0.9, 2e-4
+"""Share of the tolerances that projected goals keep; half edges of the box that they are kept in [m]."""
 END_MARGIN = 0.0005
 """What an end that is closer than the wanted clearance keeps less than it has [m]."""
 RETREAT_STEP = 0.01
@@ -42,14 +49,20 @@ class Ends:
     goal stands for its images, see `images`.
     """
 
-    def __init__(self, checker: CollisionChecker, start: ndarray, goals: ndarray) -> None:
+    def __init__(
+        self,
+        checker: CollisionChecker,
+        start: ndarray,
+        goals: ndarray,
+        constraints: PathConstraints | None = None,
+    ) -> None:
         robot = self._robot = checker.robot
         self.checker = checker
         self._turns = robot.turns(start)
         self.start = start - self._turns
-        self.start_lead = retreat(checker, self.start)
+        self.start_lead = retreat(checker, self.start, constraints)
         ways = [image for goal in goals for image in images(robot, self.start, goal)]
-        leads = [(retreat(checker, image), image) for image in ways]
+        leads = [(retreat(checker, image, constraints), image) for image in ways]
         self.goals = [goal for lead, goal in leads if lead is not None]
         self.goal_leads = [lead for lead, _ in leads if lead is not None]
 
@@ -127,7 +140,7 @@ def usable_ends(call: Call) -> Ends | PlanResult:
     goals = _usable_goals(call, checker)
     if isinstance(goals, PlanResult):
         return goals
-    ends = Ends(checker, call.problem.start, goals)
+    ends = Ends(checker, call.problem.start, goals, call.judge.constraints)
     if ends.start_lead is None:
         why = closeness(checker, call.problem.start)
         return call.fail(Status.INVALID_START, f"the start is too close to contact to plan from: {why}")
@@ -138,16 +151,19 @@ def usable_ends(call: Call) -> Ends | PlanResult:
     return ends
 
 
-def retreat(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> Float[ndarray, "dof"] | None:
+def retreat(
+    checker: CollisionChecker, q: Float[ndarray, "dof"], constraints: PathConstraints | None = None
+) -> Float[ndarray, "dof"] | None:
     """A configuration nearby that the covering spheres call free, down the gradient of the collision cost.
 
     For a start or goal that the exact meshes call free while the spheres, which stick out, do not. None if no
-    free configuration was found within 1 rad. The judge decides on the motion there.
+    free configuration was found within 1 rad, or it does not keep the constraints. The judge decides on the
+    motion there.
     """
     robot, at = checker.robot, q.copy()
     for _ in range(RETREAT_STEPS):
         if checker.free(at[None])[0]:
-            return at
+            return at if constraints is None or constraints.kept(at[None])[0] else None
         gradient = checker.cost_gradients(at[None], margin=0.005)[1][0].astype(np.float64)
         norm = np.linalg.norm(gradient)
         if norm < 1e-9:
@@ -179,6 +195,10 @@ def _usable_goals(call: Call, checker: CollisionChecker) -> Float[ndarray, "k do
         collision = _explained(robot, scene, start)
         if collision is not None:
             return call.fail(Status.INVALID_START, f"the start is in collision: {collision}")
+    constraints = call.judge.constraints
+    wrong = None if constraints is None else constraints.worst(start)
+    if wrong is not None:
+        return call.fail(Status.INVALID_START, f"the start does not keep the constraints: {wrong.message}")
     return _goals(call, call.problem.goal, checker)
 
 
@@ -199,11 +219,21 @@ def _goals(call: Call, goal: Goal, checker: CollisionChecker) -> Float[ndarray, 
 def _free_goals(
     call: Call, goal: JointGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    free = checker.free(goal.positions)
+    positions, constraints = goal.positions, call.judge.constraints
+    if constraints is not None:
+        kept = constraints.kept(positions)
+        if not kept.any():
+            what = "the goal does" if len(kept) == 1 else f"all {len(kept)} goal configurations do"
+            wrong = constraints.worst(positions[0])
+            assert wrong is not None
+            reason = f"{what} not keep the constraints: {wrong.message}"
+            return call.fail(Status.INVALID_GOAL, reason)
+        positions = positions[kept]
+    free = checker.free(positions)
     if free.any():
-        return goal.positions[free]
-    collisions = [_explained(call.problem.robot, call.problem.scene, q) for q in goal.positions]
-    kept = [q for q, collision in zip(goal.positions, collisions, strict=True) if collision is None]
+        return positions[free]
+    collisions = [_explained(call.problem.robot, call.problem.scene, q) for q in positions]
+    kept = [q for q, collision in zip(positions, collisions, strict=True) if collision is None]
     if kept:
         return np.stack(kept)
     what = "the goal is" if len(collisions) == 1 else f"all {len(collisions)} goal configurations are"
@@ -228,6 +258,12 @@ def _pose_goals(
         if not goal.tolerant or call.elapsed > until:
             break
     xyz = ", ".join(f"{value:.3f}" for value in goal.T_base_frame[:3, 3])
+    if not collisions and call.judge.constraints is not None:
+        any_of_it = inverse_kinematics(robot, goal.frame, goal.T_base_frame, 1, rng=call.rng)
+        wrong = call.judge.constraints.worst(any_of_it[0]) if len(any_of_it) else None
+        if wrong is not None:
+            what = f"no configuration was found for the pose of {goal.frame} at ({xyz}) m that keeps the"
+            return call.fail(Status.INVALID_GOAL, f"{what} constraints, e.g. {wrong.message}")
     if not collisions:
         return call.fail(
             Status.UNREACHABLE_GOAL,
@@ -250,7 +286,9 @@ def _reaching(
     call: Call, goal: PoseGoal, accept: Callable[[ndarray], ndarray] | None
 ) -> Float[ndarray, "k dof"]:
     """Configurations that bring the link to the pose; where it has tolerances, to some poses within them."""
-    robot, rng = call.problem.robot, call.rng
+    robot, rng, constraints = call.problem.robot, call.rng, call.judge.constraints
+    if constraints is not None:
+        return _reaching_constrained(call, goal, constraints, accept)
     if not goal.tolerant:
         return inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=accept)
     found = np.zeros((0, robot.dof))
@@ -260,6 +298,43 @@ def _reaching(
             robot, goal.frame, T_base_frame, OF_EACH, rng=rng, accept=accept, settings=SOME_ROUNDS
         )
         found = np.concatenate([found, few])
+        if len(found) >= GOAL_COUNT:
+            break
+    return found[:GOAL_COUNT]
+
+
+def _reaching_constrained(
+    call: Call,
+    goal: PoseGoal,
+    constraints: PathConstraints,
+    accept: Callable[[ndarray], ndarray] | None,
+) -> Float[ndarray, "k dof"]:
+    """The same of configurations that keep the constraints: those of a pose with tolerances are projected
+    onto them, and kept where they are still within."""
+    problem, found = call.problem, np.zeros((0, call.problem.robot.dof))
+
+    def keeps(q: ndarray) -> ndarray:
+        kept = constraints.kept(q)
+        return kept if accept is None else kept & accept(q)
+
+    def reached(T_base_frame: ndarray, count: int, accept: Callable[[ndarray], ndarray] | None) -> ndarray:
+        robot, settings = problem.robot, FEW_ROUNDS
+        return inverse_kinematics(
+            robot, goal.frame, T_base_frame, count, rng=call.rng, accept=accept, settings=settings
+        )
+
+    if not goal.tolerant:
+        return reached(goal.T_base_frame, GOAL_COUNT, keeps)
+    xyz = np.full(3, 0.5 * DEFAULT.goal_distance) if goal.xyz_tolerance is None else goal.xyz_tolerance
+    half = np.maximum(xyz, LEAST_BOX)
+    box = PositionBox(goal.frame, -half, half, goal.T_base_frame)
+    within = PathConstraints(replace(problem, constraints=(*problem.constraints, box)))
+    for i in range(POSES):
+        few = reached(goal.draw(call.rng) if i else goal.T_base_frame, OF_EACH, None)
+        few = np.concatenate([few[constraints.kept(few)], within.projected(few, SHARE_AT_GOAL)])
+        at_goal = [goal_error(problem.robot, goal, q) is None for q in few]
+        few = few[np.array(at_goal, bool)]
+        found = np.concatenate([found, few if accept is None or not len(few) else few[accept(few)]])
         if len(found) >= GOAL_COUNT:
             break
     return found[:GOAL_COUNT]

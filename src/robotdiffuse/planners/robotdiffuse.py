@@ -25,6 +25,7 @@ from robotdiffuse.learning.weights_at_hand import comes_with_package
 from robotdiffuse.planners.aorrtc.planner import AORRTC, STEP, AORRTCSettings
 from robotdiffuse.planners.aorrtc.search import AnytimeSearch, anytime
 from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.constrained.search import plan_constrained
 from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, encode
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.learned import nearest_goals
@@ -81,6 +82,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
         settings, robot = self.settings, call.problem.robot
+        if call.problem.constraints:
+            return plan_constrained(call, ends, settings.search)
         search = AnytimeSearch(call, ends, settings.search, AORRTC.name)
         if settings.weights is not None or comes_with_package(self.network_name, robot):
             batches = _NetworkBatches(self, call, ends, search)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from robotdiffuse.planners.aorrtc.search import SLICE, AnytimeSearch, SearchSettings, anytime
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.constrained.search import plan_constrained
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Count, NotNegative
@@ -29,6 +30,8 @@ class RRTConnect(Planner[RRTConnectSettings]):
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
         settings = self.settings
+        if call.problem.constraints:
+            return plan_constrained(call, ends, settings)
         search = AnytimeSearch(call, ends, settings, self.name, bounded=False)
 
         def pays() -> bool:

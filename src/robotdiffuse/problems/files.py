@@ -3,13 +3,14 @@
 import json
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import yaml
 
 from robotdiffuse.checks import numbers
 from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.problems.constraint_files import constraint_entry, read_constraints
 from robotdiffuse.problems.equipment import (
     equipment_entries,
     equipped,
@@ -42,7 +43,7 @@ from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
 
 FIELDS = ("robot", "scene", "start", "goal")
-OPTIONAL = ("locked", "base", "tool", "attached", "waypoints", "clearance", "views", "unseen")
+OPTIONAL = ("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unseen")
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,6 +140,9 @@ def problem_record(
     if problem.waypoints:
         way = problem.waypoints if T is None else [moved_goal(goal, T) for goal in problem.waypoints]
         record["waypoints"] = as_given([goal_entry(goal) for goal in way])
+    if problem.constraints:
+        kept = [one if T is None else one.moved(T) for one in problem.constraints]
+        record["constraints"] = as_given([constraint_entry(one) for one in kept])
     if problem.clearance is not None:
         record["clearance"] = problem.clearance
     if views:
@@ -284,15 +288,17 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
         unseen = values.get("unseen", OPTIMISTIC)
         if requested and "waypoints" in values:
             raise InputError("waypoints are for goals in the file itself, not beside a request")
+        kept = read_constraints(values.get("constraints", []))
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
-            return _requested(robot, scene, request, clearance, views, unseen)
+            asked = _requested(robot, scene, request, clearance, views, unseen)
+            return replace(asked, constraints=kept) if kept else asked
         goal, notes = read_goal("goal", values["goal"], scene), (*notes, *more)
         asked = robot, scene, values["start"], goal, notes, clearance, views, unseen
         way = read_waypoints(values.get("waypoints", []), scene)
         if base is None:
-            return Problem(*asked, waypoints=way)
-        return Problem.in_world(base, *asked, waypoints=way)
+            return Problem(*asked, waypoints=way, constraints=kept)
+        return Problem.in_world(base, *asked, waypoints=way, constraints=kept)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.checks import LARGEST, numbers
 from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
 from robotdiffuse.problems.goals import Goal, check_pose, moved_goal
 from robotdiffuse.problems.goals import JointGoal as JointGoal
@@ -63,6 +64,8 @@ class Problem:
     frame all the same. `in_world` takes them in the world's. None: the base's frame is the world's."""
     waypoints: tuple[Goal, ...] = ()
     """Where the motion stops on its way, in this order."""
+    constraints: tuple[Constraint, ...] = ()
+    """What holds all along the motion."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
@@ -78,6 +81,9 @@ class Problem:
             raise InputError(f"waypoints is {shown(self.waypoints)}; it must be a list of goals")
         fields = (f"waypoints[{i}]" for i in range(len(self.waypoints)))
         waypoints = tuple(_goal(self.robot, *of, notes) for of in zip(fields, self.waypoints, strict=True))
+        constraints = _constraints(self.robot, self.constraints)
+        if waypoints and any(isinstance(one, CartesianLine) for one in constraints):
+            raise InputError("cartesian_line goes from start to goal: plan from one waypoint to the next")
         views = _views(self.robot, self.views)
         if views and waypoints:
             raise InputError("waypoints cannot be had beside views: plan from one to the next")
@@ -100,6 +106,7 @@ class Problem:
             "views": views,
             "T_world_base": T_world_base,
             "waypoints": waypoints,
+            "constraints": constraints,
         }.items():
             object.__setattr__(self, key, value)
 
@@ -117,6 +124,7 @@ class Problem:
             unseen: str = OPTIMISTIC,
             T_world_base: ArrayLike | None = None,
             waypoints: Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]] = (),
+            constraints: Sequence[Constraint] = (),
         ) -> None: ...
 
     @classmethod
@@ -132,9 +140,10 @@ class Problem:
         views: "Sequence[DepthView]" = (),
         unseen: str = OPTIMISTIC,
         waypoints: "Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]]" = (),
+        constraints: "Sequence[Constraint]" = (),
     ) -> "Problem":
-        """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views and
-        the poses of goals are given.
+        """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views, the
+        poses of goals and constraints are given.
 
         They are moved into the base's frame, where planning is. Raises InputError as the constructor does.
         """
@@ -145,7 +154,9 @@ class Problem:
         if isinstance(scene, Scene):
             scene = scene.moved(T_base_world)
         views = tuple(view.moved(T_base_world) if isinstance(view, DepthView) else view for view in views)
-        return cls(robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints)
+        kinds = tuple(CONSTRAINTS.values())
+        constraints = [one.moved(T_base_world) if isinstance(one, kinds) else one for one in constraints]
+        return cls(robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints, constraints)
 
     def standing(self) -> tuple[Robot, Scene]:
         """Robot and scene as they stand in the world, for pictures and simulators: the robot's base is the
@@ -190,6 +201,25 @@ def _views(robot: Robot, views: object) -> tuple[DepthView, ...]:
     return tuple(views)
 
 
+def _constraints(robot: Robot, constraints: object) -> tuple[Constraint, ...]:
+    kinds = tuple(CONSTRAINTS.values())
+    if not isinstance(constraints, list | tuple) or not all(isinstance(one, kinds) for one in constraints):
+        known = ", ".join(f"rd.{kind.__name__}" for kind in kinds)
+        raise InputError(f"constraints is {shown(constraints)}; it must be a list of {known}")
+    for i, one in enumerate(constraints):
+        _check_moved(robot, f"constraints[{i}].frame", one.frame)
+    return tuple(constraints)
+
+
+def _check_moved(robot: Robot, field: str, frame: str) -> None:
+    """InputError unless a planned joint moves the link."""
+    moved = [link for link in robot.link_names if robot.link_frame(link) > 0]
+    if frame not in robot.link_names:
+        raise unknown_name(f"link in {field}:", frame, moved)
+    if frame not in moved:
+        raise InputError(f"{field} {frame!r} is moved by no planned joint; these are: {', '.join(moved)}")
+
+
 def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
     """The goal as one of its classes, its configurations within limits."""
     if isinstance(goal, list | tuple) and any(isinstance(one, JointGoal | PoseGoal) for one in goal):
@@ -199,13 +229,7 @@ def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
         each = [_goal(robot, *of, notes) for of in zip(fields, goal.goals, strict=True)]
         return AnyGoal(tuple(each))  # type: ignore[arg-type]
     if isinstance(goal, PoseGoal):
-        moved = [link for link in robot.link_names if robot.link_frame(link) > 0]
-        if goal.frame not in robot.link_names:
-            raise unknown_name(f"link in {field}.frame:", goal.frame, moved)
-        if goal.frame not in moved:
-            raise InputError(
-                f"{field}.frame {goal.frame!r} is moved by no planned joint; these are: {', '.join(moved)}"
-            )
+        _check_moved(robot, f"{field}.frame", goal.frame)
         return goal
     rows = goal.positions if isinstance(goal, JointGoal) else JointGoal(goal).positions  # type: ignore[arg-type]
     fields = [field] if len(rows) == 1 else [f"{field}[{i}]" for i in range(len(rows))]

@@ -18,7 +18,7 @@ PROGRESS = 0.5
 
 
 @njit(cache=True)
-def _forward(q, offsets, tool, kinds, frame, T, axes, origins):
+def forward(q, offsets, tool, kinds, frame, T, axes, origins):
     """Axes and origins of the joints before `frame`, and into T the pose of the tool."""
     for i in range(3):
         for k in range(4):
@@ -47,7 +47,7 @@ def _forward(q, offsets, tool, kinds, frame, T, axes, origins):
 
 
 @njit(cache=True)
-def _residual(T, target, rows, rotation_weight, error):
+def pose_error(T, target, rows, rotation_weight, error):
     """Into `error`: position, then weighted rotation vector from T to the target. Its squared norm."""
     for i in range(3):
         error[i] = target[i, 3] - T[i, 3]
@@ -97,7 +97,7 @@ def _jacobian(T, axes, origins, kinds, frame, rows, rotation_weight, J):
 
 
 @njit(cache=True)
-def _step(J, error, damping, rows, frame, held, A, y, step):
+def damped_step(J, error, damping, rows, frame, held, A, y, step):
     """step = J^T (J J^T + damping I)^-1 error over the joints that are not held, by Cholesky."""
     for i in range(rows):
         for k in range(i + 1):
@@ -168,8 +168,8 @@ def solve_seeds(
     for s in range(len(seeds)):
         used = s + 1
         q = seeds[s].copy()
-        _forward(q, offsets, tool, kinds, frame, T, axes, origins)
-        cost = _residual(T, target, rows, rotation_weight, error)
+        forward(q, offsets, tool, kinds, frame, T, axes, origins)
+        cost = pose_error(T, target, rows, rotation_weight, error)
         damping, checked, solved, fresh = FIRST_DAMPING, cost, False, True
         for iteration in range(max_iterations):
             position = np.sqrt(error[0] ** 2 + error[1] ** 2 + error[2] ** 2)
@@ -186,7 +186,7 @@ def solve_seeds(
                 fresh = False
             # Joints that a step would push through their limit are held there, and the rest solved again.
             held[:] = False
-            _step(J, error, damping * cost, rows, frame, held, A, y, step)
+            damped_step(J, error, damping * cost, rows, frame, held, A, y, step)
             again = False
             for j in range(frame):
                 if kinds[j] != CONTINUOUS and (
@@ -194,15 +194,15 @@ def solve_seeds(
                 ):
                     held[j] = again = True
             if again:
-                _step(J, error, damping * cost, rows, frame, held, A, y, step)
+                damped_step(J, error, damping * cost, rows, frame, held, A, y, step)
             for j in range(dof):
                 trial[j] = q[j]
                 if j < frame:
                     trial[j] += step[j]
                     if kinds[j] != CONTINUOUS:
                         trial[j] = min(max(trial[j], lower[j]), upper[j])
-            _forward(trial, offsets, tool, kinds, frame, T, axes, origins)
-            trial_cost = _residual(T, target, rows, rotation_weight, trial_error)
+            forward(trial, offsets, tool, kinds, frame, T, axes, origins)
+            trial_cost = pose_error(T, target, rows, rotation_weight, trial_error)
             if trial_cost < cost:
                 q[:] = trial
                 error[:] = trial_error

@@ -11,6 +11,7 @@ from typing import Annotated
 from robotdiffuse.planners.aorrtc.search import AnytimeSearch, SearchSettings, anytime
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.constrained.search import plan_constrained
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Bound, Natural
@@ -36,6 +37,8 @@ class AORRTC(Planner[AORRTCSettings]):
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
         settings = self.settings
+        if call.problem.constraints:
+            return plan_constrained(call, ends, settings)
         search = AnytimeSearch(call, ends, settings, self.name)
         return anytime(
             call,

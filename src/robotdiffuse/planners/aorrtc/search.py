@@ -140,15 +140,17 @@ class AnytimeSearch:
         settings = self.settings
         path = simplify(self.space, path, settings.smoothings, settings.shortcuts, self._state)
         length = path_length(path)
-        if length >= self.length:
-            return False
+        return bool(length < self.length) and self._take(path, float(length), stage)
+
+    def _take(self, path: Float[ndarray, "n dof"], length: float, stage: str) -> bool:
+        """The path is the best one now."""
         if self.best is None:
             self.first_at = self.call.elapsed
         self.best, self.length, self.stage = path, np.float32(length), stage
         self.history.append((path, stage))
-        self._lengths.append((self.work, float(length)))
+        self._lengths.append((self.work, length))
         self._rounds[0] = None
-        self.call.improved(float(length))
+        self.call.improved(length)
         return True
 
     def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:

@@ -1,0 +1,1 @@
+"""Search under path constraints."""

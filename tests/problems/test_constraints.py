@@ -1,0 +1,201 @@
+"""Path constraints: what is refused, files, and proofs beside dense sampling and finite differences."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from helpers.box_arm import box_arm
+from robotdiffuse.errors import InputError
+from robotdiffuse.problems import constraint_kernel as kernel
+from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
+from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
+from robotdiffuse.problems.path_constraints import PathConstraints
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.transforms import inverse, rotation_about, rotation_angle, transform
+
+PANDA = rd.load_robot("panda")
+START = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
+GOAL = START + np.array([1.2, 0.1, 0.2, -0.2, 0.1, 0.2, 0.3])
+HAND = "panda_hand"
+AT = link_pose(PANDA, START, HAND)[:3, 3]
+EACH: list[Constraint] = [
+    rd.AxisCone(HAND, [0, 0.1, 1], [0, 0, -2], 0.3),
+    rd.PositionBox(
+        HAND, [-0.2, -0.2, -0.3], [0.3, 0.2, 0.3], transform(AT, rotation_about(AT / np.linalg.norm(AT), 0.3))
+    ),
+    rd.OnPlane("panda_link6", [0.1, 0.2, 0.6], [0.1, 0.2, 1.0], 0.05),
+    rd.OnLine(HAND, AT, [0.2, 1, 0.1], 0.04),
+    rd.CartesianLine("panda_link7", 0.05, 0.2, 0.3),
+]
+
+
+def problem(*constraints: Constraint, robot: Robot = PANDA) -> Problem:
+    return Problem(robot, rd.Scene(), START, GOAL, constraints=list(constraints))
+
+
+def true_values(made: Problem, constraint: Constraint, q: np.ndarray) -> list[float]:
+    """By the book: what `PathConstraints.values` says of one constraint at one configuration."""
+    T = link_pose(made.robot, q, constraint.frame)
+    p = T[:3, 3]
+    if isinstance(constraint, rd.AxisCone):
+        return [float(np.arccos(np.clip(T[:3, :3] @ constraint.axis @ constraint.direction, -1, 1)))]
+    if isinstance(constraint, rd.PositionBox):
+        assert constraint.T_base_box is not None
+        x = (inverse(constraint.T_base_box) @ [*p, 1])[:3]
+        beyond = np.maximum(constraint.low - x, x - constraint.high)
+        return [float(np.linalg.norm(np.maximum(beyond, 0)) + min(beyond.max(), 0))]
+    if isinstance(constraint, rd.OnPlane):
+        return [abs(float((p - constraint.point) @ constraint.normal))]
+    if isinstance(constraint, rd.OnLine):
+        return [float(np.linalg.norm(np.cross(p - constraint.point, constraint.direction)))]
+    ends = link_pose(made.robot, START, constraint.frame), link_pose(made.robot, GOAL, constraint.frame)
+    way = ends[1][:3, 3] - ends[0][:3, 3]
+    share = np.clip((p - ends[0][:3, 3]) @ way / (way @ way), 0, 1)
+    turn = ends[1][:3, :3] @ ends[0][:3, :3].T
+    angle = rotation_angle(turn)
+    skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    there = rotation_about(skew / np.linalg.norm(skew), float(share) * angle) @ ends[0][:3, :3]
+    off = float(np.linalg.norm(p - ends[0][:3, 3] - share * way))
+    return [off, rotation_angle(there.T @ T[:3, :3])]
+
+
+@pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
+def test_values_are_those_of_the_book(constraint: Constraint) -> None:
+    made, rng = problem(constraint), np.random.default_rng(0)
+    q = np.concatenate([[START, GOAL], rng.uniform(PANDA.lower, PANDA.upper, (30, 7))])
+    right = [true_values(made, constraint, row) for row in q]
+    np.testing.assert_allclose(PathConstraints(made).values(q), right, atol=1e-7)
+
+
+@pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
+def test_what_is_proved_holds_at_every_sample_and_what_is_not_proved_does_not(constraint: Constraint) -> None:
+    """Limits a hair above and below the greatest of many samples: the proof tells one from the other."""
+    made, rng = problem(constraint), np.random.default_rng(1)
+    ready = PathConstraints(made)
+    for _ in range(20):
+        a, b = rng.uniform(PANDA.lower, PANDA.upper, (2, 7))
+        q = np.stack([a, a + rng.uniform(0.05, 1) * (b - a)])
+        between = q[0] + np.linspace(0, 1, 4001)[:, None] * (q[1] - q[0])
+        sampled = ready.values(between)
+        most = sampled.max(axis=0)
+        if (most > 3.1).any():  # a kink, which samples miss
+            continue
+        ready.rows = ready.rows._replace(limit=most + 2e-5)
+        assert ready.first(q) is None
+        ready.rows = ready.rows._replace(limit=most - 2e-5)
+        found = ready.first(q)
+        assert found is not None and found.excess > 0
+        over = np.flatnonzero((sampled > ready.rows.limit).any(axis=1))
+        assert abs(found.at - over[0] / 4000) < 0.005, "the first place"
+
+
+@pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
+def test_projection_ends_where_the_constraint_is_kept(constraint: Constraint) -> None:
+    ready, rng = PathConstraints(problem(constraint)), np.random.default_rng(2)
+    found = ready.projected(rng.uniform(PANDA.lower, PANDA.upper, (50, 7)), 0.9)
+    assert len(found) >= 20 and ready.kept(found, 0.9).all()
+    assert ((found >= PANDA.lower) & (found <= PANDA.upper)).all()
+
+
+def test_speeds_are_finite_differences() -> None:
+    ready, rng = PathConstraints(problem(rd.CartesianLine(HAND, 0.05, None, 0.3))), np.random.default_rng(3)
+    q, rates = rng.uniform(PANDA.lower, PANDA.upper, (10, 7)), rng.normal(size=(10, 7))
+    at = [np.array([link_pose(PANDA, row, HAND)[:3, 3] for row in q + h * rates]) for h in (-1e-6, 1e-6)]
+    right = np.linalg.norm(at[1] - at[0], axis=1) / 2e-6
+    np.testing.assert_allclose(ready.speeds(q, rates)[:, 0], right, atol=1e-7)
+
+
+def test_levers_are_within_reach() -> None:
+    """At random configurations of an arm of three boxes."""
+    robot = box_arm()
+    frame, rng = robot.tip, np.random.default_rng(4)
+    start, goal = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
+    made = Problem(robot, rd.Scene(), start, goal, constraints=[rd.OnPlane(frame, [0, 0, 0], [0, 0, 1], 1.0)])
+    rows = PathConstraints(made).rows
+    work = kernel.make_work(rows)
+    for q in rng.uniform(robot.lower, robot.upper, (100, robot.dof)):
+        kernel.evaluate(rows, q, 0, work)
+        assert (work.levers[0, 0, : rows.last[0]] <= rows.reach[0, : rows.last[0]] + 1e-12).all()
+
+
+@pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
+def test_constraints_move_with_the_world_and_survive_files(constraint: Constraint, tmp_path: Path) -> None:
+    T = transform(np.array([0.3, -2.0, 0.7]), rotation_about(np.array([0.6, 0.0, 0.8]), 1.0))
+    there = constraint.moved(T)
+    made = Problem.in_world(T, PANDA, rd.Scene(), START, GOAL, constraints=[there])
+    q = np.random.default_rng(5).uniform(PANDA.lower, PANDA.upper, (5, 7))
+    values = PathConstraints(problem(constraint)).values(q)
+    np.testing.assert_allclose(PathConstraints(made).values(q), values, atol=1e-9)
+    for one in (made, problem(constraint)):
+        save_problem(one, tmp_path / "again.yaml")
+        again = load_problem(tmp_path / "again.yaml")
+        assert problem_record(again) == problem_record(problem_from_record(problem_record(one)))
+        np.testing.assert_allclose(PathConstraints(again).values(q), values, atol=1e-9)
+
+
+BAD: list[tuple[Callable[[], object], str]] = [
+    (lambda: rd.AxisCone(HAND, "up", [0, 0, 1], 0.1), "axis_cone.axis is 'up'"),
+    (lambda: rd.AxisCone(HAND, [0, 0, 0], [0, 0, 1], 0.1), "axis_cone.axis .* must not be zero"),
+    (lambda: rd.AxisCone(HAND, [0, 0, 1], [0, 1], 0.1), "axis_cone.direction is .* 3 finite numbers"),
+    (lambda: rd.AxisCone(HAND, [0, 0, 1], [0, 0, 1], 0), "axis_cone.angle is 0; .* 0.001 to 3.14159"),
+    (lambda: rd.AxisCone(HAND, [0, 0, 1], [0, 0, 1], 4.0), "axis_cone.angle is 4.0"),
+    (lambda: rd.AxisCone(HAND, [0, 0, 1], [0, 0, 1], float("nan")), "axis_cone.angle is nan"),
+    (lambda: rd.AxisCone(7, [0, 0, 1], [0, 0, 1], 0.1), "axis_cone.frame is 7"),  # type: ignore[arg-type]
+    (lambda: rd.OnPlane(HAND, [0, 0, 0], [0, 0, 1], -0.1), "on_plane.tolerance is -0.1"),
+    (lambda: rd.OnLine(HAND, [0, 0, 0], [0, 0, 1], "1 mm"), "on_line.tolerance is '1 mm'"),  # type: ignore[arg-type]
+    (lambda: rd.PositionBox(HAND, [0, 0, 1], [1, 1, 0]), "position_box.low is .* must be above its low"),
+    (lambda: rd.CartesianLine(HAND, 0.0), "cartesian_line.tolerance is 0"),
+    (lambda: rd.CartesianLine(HAND, speed=0.0), "cartesian_line.speed is 0"),
+    (lambda: problem(rd.OnPlane("hnd", [0, 0, 0], [0, 0, 1], 0.1)), r"link in constraints\[0\].frame: 'hnd'"),
+    (lambda: problem(rd.OnPlane("panda_link0", [0, 0, 0], [0, 0, 1], 0.1)), "moved by no planned joint"),
+    (lambda: replace(problem(), constraints="upright"), "constraints is 'upright'"),  # type: ignore[arg-type]
+    (lambda: replace(problem(EACH[4]), waypoints=(GOAL,)), "cartesian_line goes from start to goal"),  # type: ignore[arg-type]
+    (lambda: PathConstraints(replace(problem(EACH[4]), goal=[START, GOAL])), "2 configurations .* different"),  # type: ignore[arg-type]
+    (lambda: PathConstraints(replace(problem(EACH[4]), goal=START)), "0 mm from where the goal has it"),  # type: ignore[arg-type]
+    (
+        lambda: PathConstraints(
+            replace(problem(EACH[4]), goal=rd.PoseGoal(HAND, link_pose(PANDA, GOAL, HAND), [0.1, 0, 0]))
+        ),
+        "the goal must say one pose of it, but it leaves room",
+    ),
+]
+
+
+@pytest.mark.parametrize(("make", "message"), BAD)
+def test_bad_input_is_refused_by_one_line(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(InputError, match=message) as error:
+        make()
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"upright": {}}, r"unknown constraint in constraints\[0\]: 'upright'; known: axis_cone, cartesian"),
+        ("upright", r"constraints\[0\] is 'upright'; it must be one constraint"),
+        (
+            {"axis_cone": {"frame": HAND}},
+            r"constraints\[0\].axis_cone has no axis and no direction and no angle",
+        ),
+        ({"axis_cone": {"frame": HAND, "tilt": 1}}, "unknown field of .*axis_cone: 'tilt'"),
+        (
+            {"on_plane": {"frame": HAND, "point": [0, 0, 0], "normal": [0, 0, 1], "tolerance": 0}},
+            r"constraints\[0\].on_plane.tolerance is 0",
+        ),
+    ],
+)
+def test_files_name_the_field(entry: object, message: str) -> None:
+    record: dict[str, Any] = problem_record(problem()) | {"constraints": [entry]}
+    with pytest.raises(InputError, match=message):
+        problem_from_record(record)
+
+
+def test_every_kind_is_tested() -> None:
+    assert {one.kind for one in EACH} == set(CONSTRAINTS)
