@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motion import finer
+from robotdiffuse.errors import InputError
 from robotdiffuse.planners.call import Call, Request
 from robotdiffuse.planners.ends import Ends, usable_ends
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -20,6 +21,10 @@ from robotdiffuse.types import FIRST, SHORT
 Own = TypeVar("Own", bound=Settings)
 WARM_UP, SLIGHT = 1.0, 1e-3
 """Limits of the calls of `warm_up`: easy ones, and the beginning of a search [s]."""
+CONSTRAINTS, CLEARANCE = "path constraints", "a clearance that is asked for"
+"""What not every planner can keep."""
+ABLE = {CONSTRAINTS: "robotdiffuse, aorrtc, rrt_connect", CLEARANCE: "robotdiffuse, aorrtc, rrt_connect"}
+"""The planners that can, for messages."""
 RADIUS = 0.08
 """Of the balls of `warm_up` [m]."""
 
@@ -29,6 +34,9 @@ class Planner(ABC, Generic[Own]):
 
     name: ClassVar[str]
     settings_class: type[Own]
+    keeps: ClassVar[frozenset[str]] = frozenset()
+    """Which of CONSTRAINTS and CLEARANCE it can keep; the others it refuses. All else that a problem and a
+    call may ask for, `plan` sees to for every planner."""
 
     def __init__(self, settings: Own | None = None) -> None:
         self.settings = self.settings_class() if settings is None else settings
@@ -53,17 +61,21 @@ class Planner(ABC, Generic[Own]):
             time runs out; planners that cannot improve a path always end with their first.
         clearance: distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
             and passages allow it [m]; where they do not, less, and a note says so. None: what the problem
-            says, or 1 cm. The other planners have settings for it, or keep what their motions have.
+            says, or 1 cm. The other planners have settings of their own, or keep what their motions have;
+            they refuse one that is asked for.
         velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses.
         jerk: most jerk of any joint of the timed motion [rad/s³]. None: no limit, the fastest motion.
 
         Where the problem has waypoints, the motion stops at each: `planners/legs.py`. Where cameras saw the
-        scene, `problem.unseen` says what the rest is taken for: `planners/unseen.py`.
+        scene, `problem.unseen` says what the rest is taken for: `planners/unseen.py`. Path constraints are
+        for aorrtc, rrt_connect and robotdiffuse: `planners/constrained`.
 
-        Raises InputError for arguments that are none of these, and where `prepare` does.
+        Raises InputError for arguments that are none of these, for what the planner cannot keep, and where
+        `prepare` does.
         """
-        self.prepare(problem.robot)
         request = Request(until, clearance, velocity_scaling, acceleration_scaling, jerk)
+        self._check_keeps(problem, request)
+        self.prepare(problem.robot)
         if problem.waypoints:
             from robotdiffuse.planners.legs import plan_by_waypoints
 
@@ -73,6 +85,13 @@ class Planner(ABC, Generic[Own]):
 
             return plan_beside_unseen(self, problem, time_limit, seed, request)
         return self.attempt(problem, time_limit, seed, request)
+
+    def _check_keeps(self, problem: Problem, request: Request) -> None:
+        """InputError for what is asked for and the planner cannot keep."""
+        clearance = problem.clearance if request.clearance is None else request.clearance
+        for what, asked in ((CONSTRAINTS, bool(problem.constraints)), (CLEARANCE, bool(clearance))):
+            if asked and what not in self.keeps:
+                raise InputError(f"planner {self.name} cannot keep {what}; these can: {ABLE[what]}")
 
     def attempt(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
         """`plan` in the problem's scene as it is."""

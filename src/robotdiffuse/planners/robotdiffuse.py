@@ -24,6 +24,7 @@ from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.weights_at_hand import comes_with_package
 from robotdiffuse.planners.aorrtc.planner import AORRTC, STEP, AORRTCSettings
 from robotdiffuse.planners.aorrtc.search import AnytimeSearch, anytime
+from robotdiffuse.planners.base import CLEARANCE, CONSTRAINTS
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.constrained.search import plan_constrained
 from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, encode
@@ -64,6 +65,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
     name = "robotdiffuse"
     settings_class = RobotDiffuseSettings
+    keeps = frozenset({CONSTRAINTS, CLEARANCE})
 
     def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
         """Raises InputError if the folder that the settings name holds no weights."""

@@ -4,7 +4,7 @@ others."""
 from dataclasses import dataclass
 
 from robotdiffuse.planners.aorrtc.search import SLICE, AnytimeSearch, SearchSettings, anytime
-from robotdiffuse.planners.base import Planner
+from robotdiffuse.planners.base import CLEARANCE, CONSTRAINTS, Planner
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.constrained.search import plan_constrained
 from robotdiffuse.planners.ends import Ends
@@ -26,6 +26,7 @@ class RRTConnect(Planner[RRTConnectSettings]):
 
     name = "rrt_connect"
     settings_class = RRTConnectSettings
+    keeps = frozenset({CONSTRAINTS, CLEARANCE})
 
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""

@@ -10,9 +10,9 @@ A row is a scalar function of the pose of a frame that must not exceed its limit
 What a piece of a motion keeps is proved from the poses at its two ends. Joints move by dq along it at
 constant rates, so the frame's origin p leaves the straight line between its ends by at most an eighth of the
 greatest second derivative, which is at most sum_jk |dq_j dq_k| r_max(j,k), r_k being the distance from the
-axis of joint k to p. Distance to a box is convex with slope 1, hence DISTANCE is at most the greater of its two ends
-and that. The cosine of CONE is linear in the axis, whose second derivative is at most (sum_j |dq_j|)². TURN
-grows no faster than the frame and its reference turn.
+axis of joint k to p. Distance to a box is convex with slope 1, hence DISTANCE is at most the greater of its
+two ends and that. The cosine of CONE is linear in the axis, whose second derivative is at most
+(sum_j |dq_j|)². TURN grows no faster than the frame and its reference turn.
 """
 
 from typing import NamedTuple

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from robotdiffuse.planners.aorrtc.search import AnytimeSearch, SearchSettings, anytime
-from robotdiffuse.planners.base import Planner
+from robotdiffuse.planners.base import CLEARANCE, CONSTRAINTS, Planner
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.constrained.search import plan_constrained
 from robotdiffuse.planners.ends import Ends
@@ -33,6 +33,7 @@ class AORRTC(Planner[AORRTCSettings]):
 
     name = "aorrtc"
     settings_class = AORRTCSettings
+    keeps = frozenset({CONSTRAINTS, CLEARANCE})
 
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
