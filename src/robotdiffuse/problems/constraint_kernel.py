@@ -42,6 +42,8 @@ class Rows(NamedTuple):
     """[m] DISTANCE, CONE or TURN."""
     last: np.ndarray
     """[m] joints that move the frame."""
+    again: np.ndarray
+    """[m] whether the frame is that of the row before."""
     tool: np.ndarray
     """[m, 4, 4] of the frame in that of its last joint."""
     place: np.ndarray
@@ -179,7 +181,8 @@ def evaluate(rows, q, end, work):
     """Values at a configuration into work.values[end], and the distances from the joints' axes to the frame's
     origin into work.levers[end]."""
     for m in range(len(rows.what)):
-        _pose(rows, m, q, work)
+        if not rows.again[m]:
+            _pose(rows, m, q, work)
         work.values[end, m] = _value(rows, m, work)
         if rows.what[m] != CONE:
             for k in range(rows.last[m]):
@@ -309,7 +312,8 @@ def _residuals(rows, limits, q, work):
     into work.J; returns their number."""
     count, dof = 0, len(q)
     for m in range(len(rows.what)):
-        _pose(rows, m, q, work)
+        if not rows.again[m]:
+            _pose(rows, m, q, work)
         value = _value(rows, m, work)
         if value <= limits[m]:
             continue

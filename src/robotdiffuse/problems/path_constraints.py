@@ -1,6 +1,7 @@
 """The path constraints of a problem, made ready: what they say of configurations, and proofs of motions."""
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -249,6 +250,7 @@ def _arrays(robot: Robot, owners: list[Constraint], rows: list[_Row]) -> Rows:
         upper=robot.upper,
         what=np.array([row.what for row in rows]),
         last=np.array(last),
+        again=np.array([False, *(a == b for a, b in pairwise(frames))]),
         tool=np.stack(tools),
         place=np.stack([row.place for row in rows]),
         half=np.stack([row.half for row in rows]),

@@ -29,6 +29,10 @@ DRIFT = 0.85
 """A projected middle is no further from either end than this share of the piece."""
 CLOSER = 0.95
 """A step ends at most at this share of the distance that it began at."""
+LONGER = 2.0
+"""A step is at most so many times as long as the straight line that it replaces."""
+PAYS, PATIENCE = 0.99, 20
+"""A shortcut takes off at least one part in a hundred; after so many that did not, there are no more."""
 LEAST_MOVE = 0.005
 """A corner that smoothing would move less than this stays [rad]."""
 FINE = 0.15
@@ -130,14 +134,17 @@ def _usable(limits, a, b, memory):
 
 
 @njit(cache=True)
-def between(limits, a, b, memory):
+def between(limits, a, b, most, memory):
     """A motion from a to b, both of which keep the constraints: straight pieces, whose ends after a are put
-    into memory.out. Returns their number, 0 if there is no such motion here."""
+    into memory.out. Returns their number, 0 if there is no such motion here or it is longer than `most`."""
     memory.stack[0] = b
     memory.here[:] = a
-    top, count = 1, 0
+    top, count, done = 1, 0, 0.0
     while top > 0:
         target = memory.stack[top - 1]
+        gap = _distance(memory.here, target)
+        if done + gap > most:
+            return 0
         if _straight(limits, memory.here, target, memory):
             if count == MOST_PIECES:
                 return 0
@@ -145,9 +152,8 @@ def between(limits, a, b, memory):
                 return 0
             memory.out[count] = target
             memory.here[:] = target
-            top, count = top - 1, count + 1
+            top, count, done = top - 1, count + 1, done + gap
             continue
-        gap = _distance(memory.here, target)
         if top == DEPTH or gap < LEAST_PIECE:
             return 0
         middle = memory.stack[top]
@@ -165,7 +171,7 @@ def between(limits, a, b, memory):
 def line(limits, a, b):
     """The waypoints [n, dof] of `between`, with a; n = 0 if there is none."""
     memory = _memory(limits)
-    count = between(limits, a, b, memory)
+    count = between(limits, a, b, np.inf, memory)
     out = np.empty((count + 1 if count else 0, len(a)))
     if count:
         out[0] = a
@@ -234,7 +240,7 @@ def _stepped(limits, trees, tree, near, q, longest, memory):
             return -1
     if trees.sizes[tree] + MOST_PIECES > trees.nodes.shape[1]:
         return -1
-    count = between(limits, origin, end, memory)
+    count = between(limits, origin, end, LONGER * min(gap, longest), memory)
     parent = near
     for i in range(count):
         here = trees.sizes[tree]
@@ -268,22 +274,22 @@ def simplify(limits, path, rounds, tries, state):
     """A path between the same ends that is no longer: `tries` shortcuts between random places, then in each
     of the rounds corners smoothed, and waypoints left out where a straight piece keeps the constraints."""
     memory = _memory(limits)
-    points = _finer(path)
+    points, lost = _finer(path), 0
     for _ in range(tries):
         n = len(points)
-        if n < 3:
+        if n < 3 or lost > PATIENCE:
             break
         i = min(int(random(state) * (n - 2)), n - 3)
         k = min(i + 2 + int(random(state) * (n - i - 2)), n - 1)
         before = length(points[i : k + 1])
         if before <= _distance(points[i], points[k]) * 1.0001:
             continue
-        count = between(limits, points[i], points[k], memory)
-        if count == 0:
-            continue
-        found = np.concatenate((points[i : i + 1], memory.out[:count]))
-        if length(found) < 0.999 * before:
+        count = between(limits, points[i], points[k], PAYS * before, memory)
+        lost += 1
+        if count > 0:
+            found = np.concatenate((points[i : i + 1], memory.out[:count]))
             points = np.concatenate((points[:i], _finer(found), points[k + 1 :]))
+            lost = 0
     points = _skipped(limits, points, memory)
     for _ in range(rounds):
         points = _smoothed(limits, points, memory)

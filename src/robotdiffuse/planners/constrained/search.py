@@ -20,7 +20,7 @@ SLICE = 20
 """Iterations between two looks at the clock; they take longer than those without constraints."""
 SHARE, AT_ENDS = 0.95, 1e-6
 """Of the tolerances that the search keeps; where start or goal need more, they and this are kept."""
-SEARCHES = 3
+SEARCHES = 2
 """Until "short": paths found, the shortest of which is the answer."""
 SHORTCUTS = 60
 """Of each path that is found."""
@@ -83,6 +83,7 @@ class ConstrainedSearch(AnytimeSearch):
         for goal in sorted(self.goals, key=lambda goal: float(np.linalg.norm(goal - self.start))):
             path = kernel.line(self.limits, self.start, goal)
             if len(path) and self.offer(path, self.name):
+                self.found += 1
                 return
 
     def _slice(self) -> None:

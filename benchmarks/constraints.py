@@ -1,0 +1,312 @@
+"""Path constraints: a cup held upright, and straight Cartesian lines, beside sscbirrt.
+
+    python benchmarks/constraints.py [--number 200] [--kinds upright,line] [--without-peer]
+
+Problems are drawn in the scenes of the held-out families shelf and table, with a cup in the hand, which points
+down, at random places above the ground. Upright: from one place to another, the cup's axis within 10 degrees
+of the vertical. Line: to a place 15 to 40 cm away in the same orientation, the hand's origin within 2 mm of
+the segment and its orientation within 0.05 rad; drawn again until at nine places of the segment some
+configuration is free. Goals are up to ten configurations, the same ones for both planners.
+
+sscbirrt (PyPI) plans with this project's compiled projection and collision check as its callbacks, in its
+Python core: its native one takes MuJoCo's scenes, analytical inverse kinematics and its own sets. It returns
+waypoints, checked every 0.05 rad; ours are timed motions, proved.
+
+Every motion goes before oracles: Coal on the exact meshes and PyBullet, at most 1 mm of motion of the hand
+apart, and PyBullet's own kinematics for what the constraint says there. Time limits are of processor time.
+"""
+
+import argparse
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import pybullet
+import sscbirrt
+from numpy import ndarray
+from report import header, print_table, progress
+from sscbirrt.testing import PlanarIK
+
+import robotdiffuse as rd
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.planners import call
+from robotdiffuse.problems import constraint_kernel as kernel
+from robotdiffuse.problems.held_out import SEED, held_out_problem
+from robotdiffuse.problems.path_constraints import PathConstraints
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.simulation.oracle import PyBulletOracle
+from robotdiffuse.simulation.world import World
+from robotdiffuse.transforms import rotation_angle, rotation_from_quaternion, rotation_from_rpy, transform
+from robotdiffuse.types import Path
+from robotdiffuse.verify import verifier
+
+SHORT, LONG = 1.0, 10.0
+"""Time limits [s]; the longer one says what can be solved."""
+HAND, CUP = "panda_hand", rd.Cylinder([0, 0, 0.14], 0.03, 0.06, name="cup")
+LOW, HIGH = np.array([0.25, -0.5, 0.25]), np.array([0.7, 0.5, 0.8])
+"""Where the hand is drawn [m]."""
+UPRIGHT, OFF, TURNED = np.radians(10), 0.002, 0.05
+GOALS, PLACES = 10, 9
+APART, TOLERANCE = 0.001, 0.001
+"""Of the hand between two looks of the oracles [m]; PyBullet's own error [m]."""
+ROUNDING = 1e-6
+"""PyBullet's kinematics are taken as known to this [m], [rad]."""
+
+
+class CpuClock:
+    """Time limits are of processor time here, for others share the machine."""
+
+    perf_counter = staticmethod(time.process_time)
+
+
+class Answer(NamedTuple):
+    seconds: float
+    first: float
+    """Until there was a path that the search calls free [s]; for sscbirrt the answer."""
+    positions: ndarray | None
+    """What is executed: rows of the timed motion, or waypoints."""
+    length: float
+    proved: bool
+
+
+class Seen(NamedTuple):
+    """What oracles say of a motion."""
+
+    coal: int
+    bullet: int
+    excess: float
+    """The most beyond the tolerances, as a share of them; negative within."""
+
+
+def drawn(kind: str, number: int) -> Iterator[Problem]:
+    """Held-out problems with a cup in the hand and a constraint."""
+    found, i = 0, 0
+    while found < number:
+        rng = np.random.default_rng([SEED, 2, i])
+        given = held_out_problem(("shelf", "table")[i % 2], i // 2)
+        i += 1
+        robot = given.robot.attach(CUP, HAND)
+        checker = CollisionChecker(robot, given.scene)
+        ends = _ends(kind, robot, checker, rng)
+        if ends is None:
+            continue
+        start, goals = ends
+        constraint = (
+            rd.AxisCone("cup", [0, 0, 1], [0, 0, -1], UPRIGHT)
+            if kind == "upright"
+            else rd.CartesianLine(HAND, OFF, TURNED)
+        )
+        yield Problem(robot, given.scene, start, JointGoal(goals), constraints=[constraint])
+        found += 1
+
+
+def _ends(
+    kind: str, robot: Robot, checker: CollisionChecker, rng: np.random.Generator
+) -> tuple[ndarray, ndarray] | None:
+    """A start, and configurations of a goal."""
+    for _ in range(20):
+        T = _pose(rng)
+        start = inverse_kinematics(robot, HAND, T, 1, rng=rng, accept=checker.free)
+        if not len(start):
+            continue
+        T_goal = _pose(rng)
+        if kind == "line":
+            way = rng.normal(size=3)
+            T_goal = T.copy()
+            T_goal[:3, 3] += rng.uniform(0.15, 0.4) * way / np.linalg.norm(way)
+            shares = np.linspace(0, 1, PLACES)[1:-1]
+            between = [transform((1 - s) * T[:3, 3] + s * T_goal[:3, 3], T[:3, :3]) for s in shares]
+            if not all(_reached(robot, P, 1, checker, rng) is not None for P in between):
+                continue
+        goals = _reached(robot, T_goal, GOALS, checker, rng)
+        if goals is not None:
+            return start[0], goals
+    return None
+
+
+def _pose(rng: np.random.Generator) -> ndarray:
+    """The hand pointing down, at any turn about the vertical."""
+    return transform(rng.uniform(LOW, HIGH), rotation_from_rpy(np.pi, 0.0, float(rng.uniform(-np.pi, np.pi))))
+
+
+def _reached(
+    robot: Robot, T: ndarray, count: int, checker: CollisionChecker, rng: np.random.Generator
+) -> ndarray | None:
+    found = inverse_kinematics(robot, HAND, T, count, rng=rng, accept=checker.free)
+    return found if len(found) else None
+
+
+def ours(problem: Problem, seed: int) -> Answer:
+    """By aorrtc, which plans under constraints by `planners/constrained`."""
+    result = rd.load_planner("aorrtc").plan(problem, time_limit=LONG, seed=seed)
+    if result.path is None or result.trajectory is None:
+        return Answer(result.planning_time, np.inf, None, np.inf, False)
+    first = result.progress[0][0]
+    return Answer(result.planning_time, first, result.trajectory.positions, result.path.length, True)
+
+
+class _Arm:
+    """This project's kinematics and collision check as sscbirrt asks for them."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.robot, self.checker = problem.robot, CollisionChecker(problem.robot, problem.scene)
+        self.dof, self.joint_limits = self.robot.dof, (self.robot.lower, self.robot.upper)
+
+    def forward_kinematics(self, q: ndarray) -> ndarray:
+        return link_pose(self.robot, q, HAND)
+
+    def is_valid(self, q: ndarray) -> bool:
+        return bool(self.checker.free(q[None])[0])
+
+
+class _Set:
+    """This project's projection onto constraints as sscbirrt asks for it."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.ready = PathConstraints(problem)
+        self.rows, self.work = self.ready.rows, kernel.make_work(self.ready.rows)
+        self.kept = self.rows.limit - 0.05 * self.rows.room
+
+    def contains(self, q: ndarray) -> bool:
+        kernel.evaluate(self.rows, q, 0, self.work)
+        return bool((self.work.values[0] <= self.rows.limit).all())
+
+    def project(self, q_previous: ndarray, q_proposed: ndarray) -> ndarray | None:
+        q = q_proposed.copy()
+        return q if kernel.project(self.rows, self.kept, q, self.work) else None
+
+
+def peer(problem: Problem, seed: int) -> Answer:
+    """By sscbirrt, with its own settings."""
+    arm, goal = _Arm(problem), problem.goal
+    assert isinstance(goal, JointGoal)
+    began = time.process_time()
+    config = sscbirrt.CBiRRTConfig(timeout=1e4, abort_fn=lambda: time.process_time() - began > LONG)
+    planner = sscbirrt.CBiRRT(arm, PlanarIK(), arm, config, backend="python")
+    task = sscbirrt.PlanningProblem(
+        space=planner.space,
+        start=sscbirrt.FiniteSet([problem.start], metric=planner.space.distance),
+        goal=sscbirrt.FiniteSet(list(goal.positions), metric=planner.space.distance),
+        validator=arm,
+        path_constraint=_Set(problem),
+    )
+    path = planner.solve(task, seed=seed).path
+    spent = time.process_time() - began
+    if path is None:
+        return Answer(spent, np.inf, None, np.inf, False)
+    rows = np.stack(path)
+    made = Path(problem.robot.joint_names, rows)
+    return Answer(spent, spent, rows, made.length, verifier(problem).path(made).valid)
+
+
+def looked_at(problem: Problem, rows: ndarray) -> Seen:
+    """A motion before Coal and PyBullet."""
+    robot, scene = problem.robot, problem.scene
+    parts = [rows[:1]]
+    for a, b in pairwise(rows):
+        count = max(1, int(np.ceil(np.abs(b - a).sum() / APART)))  # levers are below 1 m
+        parts.append(a + (b - a) * (np.arange(1, count + 1) / count)[:, None])
+    frames = np.concatenate(parts)
+    sparse = frames[:: max(1, len(frames) // 600)]
+    coal = int(ExactCollision(robot, scene).collides(sparse).sum())
+    with PyBulletOracle(robot, scene) as oracle:
+        bullet = int(oracle.check_frames(sparse, TOLERANCE) is not None)
+    return Seen(coal, bullet, _excess(problem, frames))
+
+
+def _excess(problem: Problem, frames: ndarray) -> float:
+    """By PyBullet's kinematics."""
+    [one] = problem.constraints
+    with World(problem.robot, rd.Scene()) as world:
+
+        def pose(q: ndarray) -> ndarray:
+            world.place(q)
+            link = world.links[one.frame]
+            state = pybullet.getLinkState(
+                world.body, link, computeForwardKinematics=1, physicsClientId=world.client
+            )
+            x, y, z, w = state[5]
+            return transform(np.array(state[4]), rotation_from_quaternion(np.array([w, x, y, z])))
+
+        poses = [pose(q) for q in frames]
+    if isinstance(one, rd.AxisCone):
+        cosines = [T[:3, :3] @ one.axis @ one.direction for T in poses]
+        return float((np.arccos(np.clip(cosines, -1, 1)).max() - ROUNDING) / one.angle - 1)
+    assert isinstance(one, rd.CartesianLine)
+    first, last = poses[0], poses[-1]
+    way, p = last[:3, 3] - first[:3, 3], np.array([T[:3, 3] for T in poses])
+    shares = np.clip((p - first[:3, 3]) @ way / (way @ way), 0, 1)
+    off = np.linalg.norm(p - first[:3, 3] - shares[:, None] * way, axis=1).max()
+    turned = max(rotation_angle(first[:3, :3].T @ T[:3, :3]) for T in poses)
+    return float(max((off - ROUNDING) / OFF, (turned - ROUNDING) / TURNED) - 1)
+
+
+def compared(kind: str, number: int, with_peer: bool) -> None:
+    """Plan, show to the oracles, and print."""
+    problems = list(drawn(kind, number))
+    rd.load_planner("aorrtc").warm_up(problems[0])
+    answers = {"ours": [ours(p, i) for i, p in enumerate(progress(problems, f"{kind}, ours"))]}
+    if with_peer:
+        peer(problems[0], 0)
+        answers["sscbirrt"] = [peer(p, i) for i, p in enumerate(progress(problems, f"{kind}, sscbirrt"))]
+    possible = sum(any(a[i].positions is not None for a in answers.values()) for i in range(number))
+    both = [i for i in range(number) if all(a[i].positions is not None for a in answers.values())]
+    columns = []
+    for name, found in answers.items():
+        done = [(problems[i], a) for i, a in enumerate(found) if a.positions is not None]
+        seen = [
+            looked_at(p, a.positions)
+            for p, a in progress(done, f"{kind}, oracles on {name}")
+            if a.positions is not None
+        ]
+        times, firsts = ([1e3 * t for t in each] for each in zip(*(a[:2] for _, a in done), strict=True))
+        columns.append(
+            [
+                f"{sum(a.seconds <= SHORT for _, a in done)} of {possible}",
+                f"{len(done)} of {possible}",
+                f"{np.median(firsts):.0f} / {np.percentile(firsts, 95):.0f} ms",
+                f"{np.median(times):.0f} / {np.percentile(times, 95):.0f} ms",
+                f"{np.median([found[i].length for i in both]):.2f} rad",
+                str(sum(s.coal > 0 for s in seen)),
+                str(sum(s.bullet > 0 for s in seen)),
+                str(sum(s.excess > 0 for s in seen)),
+                f"{100 * (1 + max(s.excess for s in seen)):.1f} %",
+                f"{sum(a.proved for _, a in done)} of {len(done)}",
+            ]
+        )
+    rows = (
+        f"solved in {SHORT:.0f} s, of what any solves",
+        f"solved in {LONG:.0f} s",
+        "CPU time until the first path, median / p95",
+        "CPU time until it answers, median / p95",
+        f"length, median of the {len(both)} that all solve",
+        "motions in collision by Coal",
+        "in collision by PyBullet",
+        "beyond the tolerance at 1 mm steps",
+        "most of the tolerance that any takes",
+        "motions proved by the judge",
+    )
+    table = list(zip(rows, *columns, strict=True))
+    print_table(f"{kind}: {number} problems", ("", *answers), table)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Path constraints: upright cups and straight lines.")
+    parser.add_argument("--number", type=int, default=200, help="of problems of each kind (200)")
+    parser.add_argument("--kinds", default="upright,line", help="(upright,line)")
+    parser.add_argument("--without-peer", action="store_true", help="leave sscbirrt out")
+    arguments = parser.parse_args()
+    call.time = CpuClock  # type: ignore[attr-defined]
+    print(header("numba", "numpy", "coal", "pybullet", "sscbirrt"))
+    for kind in arguments.kinds.split(","):
+        compared(kind, arguments.number, not arguments.without_peer)
+
+
+if __name__ == "__main__":
+    main()
