@@ -2,7 +2,7 @@
 
     python benchmarks/constraints.py [--number 200] [--kinds upright,line] [--without-peer]
 
-Problems are drawn in the scenes of the held-out families shelf and table, with a cup in the hand, which points
+Problems are drawn in the scenes of the held-out families shelf and table, with a cup in the hand that points
 down, at random places above the ground. Upright: from one place to another, the cup's axis within 10 degrees
 of the vertical. Line: to a place 15 to 40 cm away in the same orientation, the hand's origin within 2 mm of
 the segment and its orientation within 0.05 rad; drawn again until at nine places of the segment some
