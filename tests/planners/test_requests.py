@@ -93,6 +93,26 @@ ASKED: dict[str, Asked] = {
 }
 
 
+def _all_of_it() -> Problem:
+    held = _held()
+    cone = rd.AxisCone("parcel", [0, 0, 1], [0, 0, -1], 0.2).moved(T_WORLD_BASE)
+    return Problem.in_world(
+        T_WORLD_BASE,
+        held.robot,
+        SCENE.moved(T_WORLD_BASE),
+        START,
+        GOAL,
+        waypoints=[rd.JointGoal((START + GOAL) / 2)],
+        constraints=[cone],
+    )
+
+
+ASKED["all of it"] = Asked(_all_of_it, {"clearance": 0.02, "jerk": 100.0}, CONSTRAINTS)
+ASKED["views and a cone"] = Asked(
+    lambda: replace(_seen(), constraints=(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2),)), {}, CONSTRAINTS
+)
+
+
 @cache
 def planner_named(name: str) -> Planner:
     return load_planner(name)

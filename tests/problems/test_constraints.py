@@ -10,6 +10,7 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
+from helpers.example_robots import example_robot
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
@@ -94,6 +95,29 @@ def test_what_is_proved_holds_at_every_sample_and_what_is_not_proved_does_not(co
         assert found is not None and found.excess > 0
         over = np.flatnonzero((sampled > ready.rows.limit).any(axis=1))
         assert abs(found.at - over[0] / 4000) < 0.005, "the first place"
+
+
+def test_proofs_hold_for_sliding_and_endless_joints_on_skew_axes() -> None:
+    robot, rng = example_robot("awkward"), np.random.default_rng(6)
+    lower, upper = np.maximum(robot.lower, -6), np.minimum(robot.upper, 6)
+    frame = robot.tip
+    start, goal = rng.uniform(lower, upper, (2, robot.dof))
+    kept = [
+        rd.AxisCone(frame, [0, 0, 1], [1, 0, 0.5], 1.0),
+        rd.OnLine(frame, [0.1, 0, 0.2], [1, 1, 0], 0.1),
+        rd.PositionBox(frame, [-1, -0.2, 0], [1, 0.3, 0.4]),
+        rd.CartesianLine(frame, 0.1, 1.0),
+    ]
+    ready = PathConstraints(Problem(robot, rd.Scene(), start, goal, constraints=kept))
+    for _ in range(30):
+        a, b = rng.uniform(lower, upper, (2, robot.dof))
+        q = np.stack([a, a + rng.uniform(0.02, 1) * (b - a)])
+        sampled = ready.values(q[0] + np.linspace(0, 1, 8001)[:, None] * (q[1] - q[0]))
+        # a proof must fail at limits that samples exceed, and succeed well above all of them
+        ready.rows = ready.rows._replace(limit=sampled.max(axis=0) - 1e-9)
+        assert ready.first(q) is not None
+        ready.rows = ready.rows._replace(limit=sampled.max(axis=0) + 1e-2)
+        assert ready.first(q) is None
 
 
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
