@@ -11,6 +11,7 @@ as a pose of that box with tolerances, and a waypoint; those that start in colli
 Every motion that is returned goes before two oracles: Coal on the exact meshes, every 0.01 rad of the path
 and at every row of the timed motion; and PyBullet, which has robot and tool as a URDF of its own and, where
 the problem has a base, all in the world's frame. PyBullet's own kinematics say where the object ends.
+Path constraints are measured by constraints.py.
 """
 
 import argparse
