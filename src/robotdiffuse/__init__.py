@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from robotdiffuse.results import load_result as load_result
     from robotdiffuse.robots import load_robot as load_robot
     from robotdiffuse.scenes.depth_view import DepthView as DepthView
+    from robotdiffuse.scenes.moving import MovingObstacle as MovingObstacle
     from robotdiffuse.scenes.scene import Scene as Scene
     from robotdiffuse.scenes.shapes import Box as Box
     from robotdiffuse.scenes.shapes import Capsule as Capsule
@@ -52,6 +53,7 @@ _HOME = {
     "load_robot": "robotdiffuse.robots",
     "Scene": "robotdiffuse.scenes.scene",
     "DepthView": "robotdiffuse.scenes.depth_view",
+    "MovingObstacle": "robotdiffuse.scenes.moving",
     "Box": "robotdiffuse.scenes.shapes",
     "Capsule": "robotdiffuse.scenes.shapes",
     "Cylinder": "robotdiffuse.scenes.shapes",

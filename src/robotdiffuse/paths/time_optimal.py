@@ -91,8 +91,9 @@ def _bounds_of_u(first, second, i, width, x, most, acceleration):
 
 
 @njit(cache=True)
-def fastest(first, second, grid, velocity, acceleration):
-    """ṡ [m] at each value of the grid s[m], 0 at both ends, from q'[m, dof] and q''[m, dof] there."""
+def fastest(first, second, grid, velocity, acceleration, begins=0.0):
+    """ṡ [m] at each value of the grid s[m], `begins` at the first and 0 at the last, from q'[m, dof] and
+    q''[m, dof] there; NaN where the end cannot be reached from so fast a beginning."""
     n, dof = first.shape
     x = np.empty(n)  # the most that limits of velocity, and of acceleration where no u helps, allow
     for i in range(n):
@@ -114,7 +115,10 @@ def fastest(first, second, grid, velocity, acceleration):
                 break
             x[i] = min((high - low) / (low_slope - high_slope), x[i])
     speeds = np.zeros(n)
-    now = 0.0
+    now = begins * begins
+    if now > x[0] * (1 + TINY):
+        speeds[:] = np.nan
+        return speeds
     for i in range(n - 1):
         speeds[i] = np.sqrt(now)
         width = grid[i + 1] - grid[i]
@@ -180,5 +184,7 @@ def sampled(line, grid, speeds, sample_time):
             velocities[k, j] = first[j] * speed
             accelerations[k, j] = first[j] * pull + second[j] * speed * speed
     q[0], q[count] = waypoints[0], waypoints[-1]
-    velocities[0] = velocities[count] = 0.0
+    velocities[count] = 0.0
+    if speeds[0] == 0:
+        velocities[0] = 0.0
     return times, q, velocities, accelerations

@@ -5,6 +5,7 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from dataclasses import replace as dataclass_replace
 from typing import TYPE_CHECKING, ClassVar, no_type_check
 
 import numpy as np
@@ -20,6 +21,7 @@ from robotdiffuse.problems.goals import JointGoal as JointGoal
 from robotdiffuse.problems.goals import PoseGoal as PoseGoal
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
+from robotdiffuse.scenes.moving import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.transforms import inverse
 
@@ -63,6 +65,10 @@ class Problem:
     frame all the same. `in_world` takes them in the world's. None: the base's frame is the world's."""
     waypoints: tuple[Goal, ...] = ()
     """Where the motion stops on its way, in this order."""
+    moving: tuple[MovingObstacle, ...] = ()
+    """Obstacles that move, from time 0 of the motion on; `scene` holds those that stand still."""
+    start_velocity: Float[ndarray, "dof"] | None = None
+    """Of the joints when the motion begins [rad/s] or [m/s]; None: it begins at rest."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
@@ -81,6 +87,18 @@ class Problem:
         views = _views(self.robot, self.views)
         if views and waypoints:
             raise InputError("waypoints cannot be had beside views: plan from one to the next")
+        moving = _moving(self.moving, self.scene)
+        start_velocity = _velocity(self.robot, self.start_velocity)
+        beside = {
+            "views": views,
+            "waypoints": waypoints,
+            "moving": moving,
+            "start_velocity": () if start_velocity is None else (start_velocity,),
+        }
+        for one in ("moving", "start_velocity"):
+            others = [name for name, given in beside.items() if name != one and given]
+            if beside[one] and others:
+                raise InputError(f"{one} cannot be had beside {others[0]}")
         check_unseen("unseen", self.unseen)
         T_world_base = self.T_world_base
         if T_world_base is not None:
@@ -100,6 +118,8 @@ class Problem:
             "views": views,
             "T_world_base": T_world_base,
             "waypoints": waypoints,
+            "moving": moving,
+            "start_velocity": start_velocity,
         }.items():
             object.__setattr__(self, key, value)
 
@@ -117,6 +137,8 @@ class Problem:
             unseen: str = OPTIMISTIC,
             T_world_base: ArrayLike | None = None,
             waypoints: Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]] = (),
+            moving: Sequence[MovingObstacle] = (),
+            start_velocity: ArrayLike | None = None,
         ) -> None: ...
 
     @classmethod
@@ -132,9 +154,11 @@ class Problem:
         views: "Sequence[DepthView]" = (),
         unseen: str = OPTIMISTIC,
         waypoints: "Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]]" = (),
+        moving: "Sequence[MovingObstacle]" = (),
+        start_velocity: ArrayLike | None = None,
     ) -> "Problem":
-        """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views and
-        the poses of goals are given.
+        """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views,
+        obstacles that move and the poses of goals are given.
 
         They are moved into the base's frame, where planning is. Raises InputError as the constructor does.
         """
@@ -145,7 +169,9 @@ class Problem:
         if isinstance(scene, Scene):
             scene = scene.moved(T_base_world)
         views = tuple(view.moved(T_base_world) if isinstance(view, DepthView) else view for view in views)
-        return cls(robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints)
+        moving = [one.moved(T_base_world) if isinstance(one, MovingObstacle) else one for one in moving]
+        asked = robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints
+        return cls(*asked, moving, start_velocity)
 
     def standing(self) -> tuple[Robot, Scene]:
         """Robot and scene as they stand in the world, for pictures and simulators: the robot's base is the
@@ -188,6 +214,37 @@ def _views(robot: Robot, views: object) -> tuple[DepthView, ...]:
                 f"{robot.dof} planned joints: {', '.join(robot.joint_names)}"
             )
     return tuple(views)
+
+
+def _moving(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]:
+    """With names that nothing else in the scene has."""
+    if not isinstance(moving, list | tuple) or not all(isinstance(one, MovingObstacle) for one in moving):
+        raise InputError(f"moving is {shown(moving)}; it must be a list of rd.MovingObstacle")
+    shapes = Scene([*scene.shapes, *(one.shape for one in moving)]).shapes[len(scene.shapes) :]
+    return tuple(
+        one if one.shape is shape else dataclass_replace(one, shape=shape)
+        for one, shape in zip(moving, shapes, strict=True)
+    )
+
+
+def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
+    """A velocity within limits, None for rest."""
+    if value is None:
+        return None
+    velocity = numbers(value)
+    names = ", ".join(robot.joint_names)
+    if velocity is None or velocity.shape != (robot.dof,) or not np.isfinite(velocity).all():
+        raise InputError(
+            f"start_velocity is {shown(value)}; it must be {robot.dof} finite numbers [rad/s]: {names}"
+        )
+    beyond = np.flatnonzero((np.abs(velocity) > robot.velocity) & (robot.velocity > 0))
+    if len(beyond):
+        j = int(beyond[0])
+        raise InputError(
+            f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; its velocity limit is "
+            f"{robot.velocity[j]:g}"
+        )
+    return velocity if velocity.any() else None
 
 
 def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
