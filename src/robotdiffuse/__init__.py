@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from robotdiffuse.planners import load_planner as load_planner
     from robotdiffuse.planners import plan as plan
     from robotdiffuse.planners.many import plan_many as plan_many
+    from robotdiffuse.planners.replanner import Replanner as Replanner
+    from robotdiffuse.planners.replanner import ReplannerSettings as ReplannerSettings
     from robotdiffuse.problems.files import load_problem as load_problem
     from robotdiffuse.problems.goals import AnyGoal as AnyGoal
     from robotdiffuse.problems.goals import JointGoal as JointGoal
@@ -45,6 +47,8 @@ _HOME = {
     "load_planner": "robotdiffuse.planners",
     "plan": "robotdiffuse.planners",
     "plan_many": "robotdiffuse.planners.many",
+    "Replanner": "robotdiffuse.planners.replanner",
+    "ReplannerSettings": "robotdiffuse.planners.replanner",
     "AnyGoal": "robotdiffuse.problems.goals",
     "JointGoal": "robotdiffuse.problems.goals",
     "PoseGoal": "robotdiffuse.problems.goals",

@@ -161,11 +161,14 @@ def _checks(
     )
     beside = _padded(change[:1], change, change[-1:])
     low, high = np.minimum(beside[1:], beside[:-1]), np.maximum(beside[1:], beside[:-1])
+    outside = np.maximum(low - a, a - high)
+    if begins.any():
+        outside[0] = 0.0  # nothing is known of the motion before, which may have ended in any acceleration
     yield _Check(
         "rates",
         "acceleration",
         a,
-        np.maximum(low - a, a - high),
+        outside,
         tolerances.agreement * np.where(most > 0, np.minimum(most, own), own),
         lambda i, j: f"by its velocities between {low[i, j]:.6g} and {high[i, j]:.6g}",
     )

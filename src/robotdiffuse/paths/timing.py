@@ -204,7 +204,7 @@ def _can_begin(
     waypoints, deviations = waypoints[: stop + 2], deviations[:stop]
     line = BlendedPolyline(waypoints, half_widths(waypoints, deviations))
     try:
-        _speeds(line, _grid(line, settings), settings.solver, *_limits(robot, settings), start_speed)
+        _speeds(line, timing_grid(line, settings), settings.solver, *_limits(robot, settings), start_speed)
     except TooFastError:
         return False
     return True
@@ -236,7 +236,7 @@ def _timed(
     return Trajectory(path.joint_names, times, positions, velocities, accelerations)
 
 
-def _grid(line: BlendedPolyline, settings: TimingSettings) -> Float[ndarray, "m"]:
+def timing_grid(line: BlendedPolyline, settings: TimingSettings) -> Float[ndarray, "m"]:
     """Values of s: every blend in equal parts, straight parts by length, first and last interval split.
 
     Along a straight line s̈ is piecewise constant, which any grid holds exactly but for the switching
@@ -296,7 +296,7 @@ Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof
 
 def timed_piece(robot: Robot, line: BlendedPolyline, settings: TimingSettings, begins: float = 0.0) -> Rows:
     """A motion from a speed, or rest, to rest; with limited jerk from rest."""
-    grid, limits = _grid(line, settings), _limits(robot, settings)
+    grid, limits = timing_grid(line, settings), _limits(robot, settings)
     if settings.jerk is None:
         speeds = _speeds(line, grid, settings.solver, *limits, begins)
         return sampled(line.arrays, grid, speeds, settings.sample_time)
