@@ -8,6 +8,7 @@ the meshes. Nothing is sampled and hoped for.
 """
 
 from collections.abc import Sequence
+from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -103,6 +104,12 @@ class MovingCollision:
         if hit is not None:
             return TimedSweep(self._contact(times, q, *hit), 0.0)
         return TimedSweep(None, float(certified))
+
+    def wider(self, by: Float[ndarray, "obstacles"]) -> "MovingCollision":
+        """The same with each obstacle larger by so much [m], for `covered_free`."""
+        other = copy(self)
+        other.tracks = self.tracks._replace(rounding=self.tracks.rounding + by)
+        return other
 
     def covered_free(
         self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"], least: float

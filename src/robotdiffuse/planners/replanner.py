@@ -12,6 +12,7 @@ was last seen. Nothing that is promised rests on it.
 """
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -49,6 +50,10 @@ FIRST_TIME = 10.0
 """For the first path [s]."""
 COARSE, COARSE_TIME = 0.05, 0.04
 """No point of the arm moves further between two looks at a guess [m]; time between two rows of one [s]."""
+BERTHS = 1.0, 0.6, 0.3
+"""Shares of the berth that are tried."""
+PERIODS = 1, 6
+"""So long the arm goes on at least before it stops; the longer gets it away from what is near already."""
 LATER = 0.3, 0.0, 0.8
 """After it rests, a search takes the obstacles as they are guessed to be then [s], in turn."""
 DODGE_TIME = 0.2
@@ -60,14 +65,15 @@ RESTING = Speeds(np.zeros(2), np.zeros(2))
 class ReplannerSettings(Settings, name="replanner"):
     period: Annotated[float, Bound(least=1e-3, most=1.0)] = 0.02
     """Time between two steps [s]: what a step returns begins so long after its observation."""
-    clearance: NotNegative = 0.01
+    clearance: NotNegative = 0.005
     """Kept to where the obstacles can be [m], by the covering spheres."""
     horizon: Positive = 2.5
     """How far ahead guesses go [s]."""
     hold: Positive = 1.0
     """Where the arm stops it is to be left alone for so long, by the guess [s]."""
-    berth: NotNegative = 0.04
-    """Given to the guessed obstacles by a path, where that is possible [m]."""
+    berth: NotNegative = 0.2
+    """Guesses keep away from obstacles as far as these can get at their greatest speed in so long [s], where
+    that is possible: nearer to one the arm has hardly any motion that is certified to stop in time."""
     search_time: Positive = 0.004
     """Of one search for a path [s]; at most one a step."""
     dodges: Count = 24
@@ -139,7 +145,7 @@ class Replanner:
             self._left = self._left.rest(begins - self._since)
         self._since = begins
         oldest = min(seen.time for seen in self._seen.values())
-        guess = _Ahead(self._robot, [seen.straight_on(self._now) for seen in self._seen.values()], self._now)
+        guess = self._guess()
         grown = _Ahead(self._robot, [seen.anywhere() for seen in self._seen.values()], oldest)
         clear = self._choose(guess)
         self._change_course()
@@ -175,6 +181,18 @@ class Replanner:
         for name, one in self._seen.items():
             if not np.isfinite(one.time):
                 self._seen[name] = replace(one, time=now)  # until then it is where the problem says
+
+    def _guess(self) -> "_Ahead":
+        """Where the obstacles will be, with as much of the berth as the arm has now."""
+        moving = [seen.straight_on(self._now) for seen in self._seen.values()]
+        speeds = np.array([seen.obstacle.greatest_speed for seen in self._seen.values()])
+        here = self._course.at(float(self._left.s[0]))
+        guess = _Ahead(self._robot, moving, self._now)
+        for share in BERTHS:
+            wide = guess.wider(share * self.settings.berth * speeds)
+            if wide.comes(here, self._now, self.settings.period) is None:
+                return wide
+        return guess
 
     def _choose(self, guess: "_Ahead") -> bool:
         """Look for another course where something is guessed to come in the way of this one; whether
@@ -222,7 +240,7 @@ class Replanner:
         if not usable[0] or not usable[1:].any():
             return None
         chosen = np.array([root for root, free in zip(roots, usable[1:], strict=True) if free])
-        request = Request(clearance=settings.berth)
+        request = Request(clearance=float(guess.berth.min()) + settings.clearance)
         call = Call("replanner", self._still, settings.search_time, self.seed + self._searches, request)
         search = AnytimeSearch(
             call, Ends(checker, start, chosen), SearchSettings(), "replanner", bounded=False
@@ -269,19 +287,16 @@ class Replanner:
         s, speed = float(self._left.s[0]), float(self._left.speeds[0])
         if s >= course.end:
             return False
-        further = course.on_then_rest(s, speed, settings.period)
-        motion = course.rows(further, settings.sample_time)
-        rests = self._since + motion.duration
-        if (
-            not clear
-            and course.to_goal
-            and guess.comes(motion.positions[-1], rests, settings.hold) is not None
-        ):
-            return False
-        if grown.near(motion, self._since, settings.clearance) is not None:
-            return False
-        self._left = further
-        return True
+        for periods in PERIODS:
+            further = course.on_then_rest(s, speed, periods * settings.period)
+            motion = course.rows(further, settings.sample_time)
+            rests = self._since + motion.duration
+            left_alone = clear or guess.comes(motion.positions[-1], rests, settings.hold) is None
+            certified = grown.near(motion, self._since, settings.clearance) is None
+            if certified and (left_alone or not course.to_goal):
+                self._left = further
+                return True
+        return False
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,6 +348,14 @@ class _Ahead:
     def __init__(self, robot: Robot, moving: list[MovingObstacle], since: float) -> None:
         self._moving, self._since = moving, since
         self._collision = MovingCollision(robot, moving, 0.0, 0.0)
+        self.berth = np.zeros(len(moving))
+
+    def wider(self, berth: Float[ndarray, "obstacles"]) -> "_Ahead":
+        """The same, each obstacle larger by so much [m]."""
+        other = copy(self)
+        other.berth = self.berth + berth
+        other._collision = self._collision.wider(berth)
+        return other
 
     def shapes(self, time: float) -> list[Shape]:
         """Where they are."""
