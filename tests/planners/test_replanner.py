@@ -11,8 +11,6 @@ from robotdiffuse.verify import verify_trajectory
 PANDA = rd.load_robot("panda")
 START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
 SPEED, PERIOD = 0.4, 0.02
-SETTINGS = rd.ReplannerSettings(search_time=1.0)
-"""Time enough that no search is cut off by the clock of a busy machine."""
 FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
 
 
@@ -26,9 +24,9 @@ def balls(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     return through - rng.uniform(1.5, 2.5, (count, 1)) * velocities, velocities
 
 
-def loop(places: np.ndarray, settings: rd.ReplannerSettings = SETTINGS) -> rd.Replanner:
+def loop(places: np.ndarray) -> rd.Replanner:
     moving = [rd.MovingObstacle(rd.Sphere(place, 0.1), max_speed=SPEED) for place in places]
-    return rd.Replanner(rd.Problem(PANDA, rd.Scene([FLOOR]), START, END, moving=moving), settings)
+    return rd.Replanner(rd.Problem(PANDA, rd.Scene([FLOOR]), START, END, moving=moving))
 
 
 @pytest.mark.parametrize(("count", "seed"), [(1, 0), (2, 1), (3, 2)])

@@ -121,9 +121,9 @@ class Rests:
         for part in way:
             if isinstance(part, int):
                 q = rows[-1][1][-1:]
-                times, more = np.array([self.step]), (q, 0 * q, 0 * q)
+                times, q, v, a = np.array([self.step]), q, 0 * q, 0 * q
             else:
-                times, *more = (column[1:] for column in part.rows)
-            rows.append((rows[-1][0][-1] + times, *more))
+                times, q, v, a = (column[1:] for column in part.rows)
+            rows.append((rows[-1][0][-1] + times, q, v, a))
         times, *more = (np.concatenate(column) for column in zip(*rows, strict=True))
         return Trajectory(self.joint_names, times, *more)

@@ -74,8 +74,8 @@ class ReplannerSettings(Settings, name="replanner"):
     berth: NotNegative = 0.2
     """Guesses keep away from obstacles as far as these can get at their greatest speed in so long [s], where
     that is possible: nearer to one the arm has hardly any motion that is certified to stop in time."""
-    search_time: Positive = 0.004
-    """Of one search for a path [s]; at most one a step."""
+    iterations: Count = 600
+    """Of a search for a path; there is at most one a step."""
     dodges: Count = 24
     """Directions in which a way out is looked for, when the arm rests where something comes."""
     dodge: Positive = 0.8
@@ -241,11 +241,11 @@ class Replanner:
             return None
         chosen = np.array([root for root, free in zip(roots, usable[1:], strict=True) if free])
         request = Request(clearance=float(guess.berth.min()) + settings.clearance)
-        call = Call("replanner", self._still, settings.search_time, self.seed + self._searches, request)
+        call = Call("replanner", self._still, FIRST_TIME, self.seed + self._searches, request)
         search = AnytimeSearch(
             call, Ends(checker, start, chosen), SearchSettings(), "replanner", bounded=False
         )
-        if not search.first(settings.search_time) or search.best is None:
+        if not search.first(FIRST_TIME, work=settings.iterations) or search.best is None:
             return None
         path = search.ends.complete(search.best)
         end = int(np.abs(np.array(roots) - path[-1]).max(axis=1).argmin())
