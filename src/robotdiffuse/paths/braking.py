@@ -17,10 +17,9 @@ STILL = 1e-12
 
 @njit(cache=True)
 def _pulls(one, two, grid, i, s, x, most, acceleration):
-    """The least and greatest s̈ in interval i from s on, where ṡ² is x, such that it is 0 to `most` at its
+    """The least and greatest s̈ in interval i from s on, where ṡ² is x, such that it is at most `most` at its
     end."""
-    width = grid[i + 1] - s
-    low, high = -x / (2 * width), (most - x) / (2 * width)
+    low, high = -np.inf, (most - x) / (2 * (grid[i + 1] - s))
     for k in range(i, i + 2):
         for j in range(one.shape[1]):
             a = one[k, j] + 2 * (grid[k] - s) * two[k, j]
@@ -45,24 +44,24 @@ def on_then_rest(one, two, grid, most, s, speed, time, acceleration):
         return np.array([s, s]), np.zeros(2)
     x, left, count = speed * speed, time, 0
     out[0, 0], out[1, 0] = s, speed
-    while i < n - 1:
+    while i < n - 1 and (x >= STILL or left > 0):
         low, high = _pulls(one, two, grid, i, s, x, most[i + 1], acceleration)
         pull, width = high if left > 0 else low, grid[i + 1] - s
-        after = max(x + 2 * pull * width, 0.0)
-        both = np.sqrt(x) + np.sqrt(after)
+        beyond = max(x + 2 * pull * width, 0.0)
+        both = np.sqrt(x) + np.sqrt(beyond)
         lasts = 2 * width / both if both > 0 else np.inf
         if 0 < left < lasts:
             s = min(s + (np.sqrt(x) + 0.5 * pull * left) * left, grid[i + 1] - SHORTEST)
             x = max((np.sqrt(x) + pull * left) ** 2, 0.0)
             left = 0.0
+        elif left <= 0 and x + 2 * pull * width < 0:
+            s, x = s - x / (2 * pull), 0.0
         else:
             left -= lasts
-            i, s, x = i + 1, grid[i + 1], after
+            i, s, x = i + 1, grid[i + 1], beyond
         count += 1
         out[0, count], out[1, count] = s, np.sqrt(x)
-        if x < STILL and left <= 0:
-            out[1, count] = 0.0
-            break
+    out[1, count] = 0.0
     return out[0, : count + 1].copy(), out[1, : count + 1].copy()
 
 
