@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from robotdiffuse.planners import load_planner as load_planner
     from robotdiffuse.planners import plan as plan
     from robotdiffuse.planners.many import plan_many as plan_many
+    from robotdiffuse.planners.replanner import Replanner as Replanner
+    from robotdiffuse.planners.replanner import ReplannerSettings as ReplannerSettings
     from robotdiffuse.problems.constraints import AxisCone as AxisCone
     from robotdiffuse.problems.constraints import CartesianLine as CartesianLine
     from robotdiffuse.problems.constraints import OnLine as OnLine
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from robotdiffuse.results import load_result as load_result
     from robotdiffuse.robots import load_robot as load_robot
     from robotdiffuse.scenes.depth_view import DepthView as DepthView
+    from robotdiffuse.scenes.moving import MovingObstacle as MovingObstacle
     from robotdiffuse.scenes.scene import Scene as Scene
     from robotdiffuse.scenes.shapes import Box as Box
     from robotdiffuse.scenes.shapes import Capsule as Capsule
@@ -49,6 +52,8 @@ _HOME = {
     "load_planner": "robotdiffuse.planners",
     "plan": "robotdiffuse.planners",
     "plan_many": "robotdiffuse.planners.many",
+    "Replanner": "robotdiffuse.planners.replanner",
+    "ReplannerSettings": "robotdiffuse.planners.replanner",
     "AnyGoal": "robotdiffuse.problems.goals",
     "JointGoal": "robotdiffuse.problems.goals",
     "PoseGoal": "robotdiffuse.problems.goals",
@@ -62,6 +67,7 @@ _HOME = {
     "load_robot": "robotdiffuse.robots",
     "Scene": "robotdiffuse.scenes.scene",
     "DepthView": "robotdiffuse.scenes.depth_view",
+    "MovingObstacle": "robotdiffuse.scenes.moving",
     "Box": "robotdiffuse.scenes.shapes",
     "Capsule": "robotdiffuse.scenes.shapes",
     "Cylinder": "robotdiffuse.scenes.shapes",

@@ -46,14 +46,21 @@ class WrongRate:
     """Beyond what is allowed, in the rate's unit."""
 
 
-def wrong_rates(robot: Robot, trajectory: Trajectory, tolerances: RateTolerances) -> list[WrongRate]:
-    """What is wrong with the rates of finite rows at increasing times; the first of each kind.
+def wrong_rates(
+    robot: Robot,
+    trajectory: Trajectory,
+    tolerances: RateTolerances,
+    start_velocity: Float[ndarray, "dof"] | None = None,
+) -> list[WrongRate]:
+    """What is wrong with the rates of finite rows at increasing times; the first of each kind. The motion is
+    to begin at rest, or at `start_velocity`.
 
     A limit of 0 stands for one that the robot does not give: there the rates need only agree.
     """
     found: dict[str, WrongRate] = {}
     with np.errstate(over="ignore", invalid="ignore"):
-        checks = list(_checks(robot, trajectory, tolerances))
+        begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
+        checks = list(_checks(robot, trajectory, tolerances, begins))
     for check in checks:
         wrong = ~(check.off <= check.allowed)
         if not wrong.any():
@@ -103,7 +110,9 @@ class _Check(NamedTuple):
     """What would be right, by row and joint."""
 
 
-def _checks(robot: Robot, trajectory: Trajectory, tolerances: RateTolerances) -> Iterator[_Check]:
+def _checks(
+    robot: Robot, trajectory: Trajectory, tolerances: RateTolerances, begins: Float[ndarray, "dof"]
+) -> Iterator[_Check]:
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
     step = np.diff(trajectory.times)[:, None]
     mean, change = np.diff(q, axis=0) / step, np.diff(v, axis=0) / step
@@ -117,15 +126,18 @@ def _checks(robot: Robot, trajectory: Trajectory, tolerances: RateTolerances) ->
         return _Check(kind, what, rates, np.abs(rates), known, lambda _, j: f"its limit {limit[j]:.6g}")
 
     at_ends = np.zeros_like(v)
-    at_ends[[0, -1]] = np.abs(v[[0, -1]])
-    yield _Check("rest", "velocity", v, at_ends, nothing, lambda *_: "but motions begin and end at rest")
+    at_ends[0], at_ends[-1] = np.abs(v[0] - begins), np.abs(v[-1])
+    rule = "but motions begin and end at rest"
+    if begins.any():
+        rule = "but the motion is to begin at the problem's start_velocity and end at rest"
+    yield _Check("rest", "velocity", v, at_ends, nothing, lambda *_: rule)
 
     most, onwards = robot.velocity, "mean velocity from here to the next row"
     yield limited("jump", onwards, mean, most, tolerances.jump * most + blur)
     yield limited("velocity", onwards, mean, most, share * most + blur)
     yield limited("velocity", "velocity", v, most, share * most)
 
-    around, length = _padded(-mean[:1], mean, -mean[-1:]), _padded(step[:1], step, step[-1:])
+    around, length = _padded(2 * begins - mean[:1], mean, -mean[-1:]), _padded(step[:1], step, step[-1:])
     unsure = _padded(blur[:1], blur, blur[-1:])
     apart = (length[1:] + length[:-1]) / 2
     second, unsure = np.diff(around, axis=0) / apart, (unsure[1:] + unsure[:-1]) / apart
@@ -149,11 +161,14 @@ def _checks(robot: Robot, trajectory: Trajectory, tolerances: RateTolerances) ->
     )
     beside = _padded(change[:1], change, change[-1:])
     low, high = np.minimum(beside[1:], beside[:-1]), np.maximum(beside[1:], beside[:-1])
+    outside = np.maximum(low - a, a - high)
+    if begins.any():
+        outside[0] = 0.0  # nothing is known of the motion before, which may have ended in any acceleration
     yield _Check(
         "rates",
         "acceleration",
         a,
-        np.maximum(low - a, a - high),
+        outside,
         tolerances.agreement * np.where(most > 0, np.minimum(most, own), own),
         lambda i, j: f"by its velocities between {low[i, j]:.6g} and {high[i, j]:.6g}",
     )

@@ -17,6 +17,7 @@ from numpy import ndarray
 from robotdiffuse.checks import LARGEST, within
 from robotdiffuse.collision.hulls import describe_contact
 from robotdiffuse.collision.motion import Contact, ContinuousCollision
+from robotdiffuse.collision.moving import MovingCollision, TimedContact
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal
 from robotdiffuse.problems.path_constraints import PathConstraints
@@ -121,13 +122,15 @@ class Report:
 
 
 def verify(problem: Problem, path: Path, settings: VerifySettings = DEFAULT) -> Report:
-    """Judge a path for a problem. Raises InputError if its joints are not those of the robot."""
+    """Judge a path for a problem. It has no times, so obstacles that move are left to `verify_trajectory`.
+    Raises InputError if its joints are not those of the robot."""
     return verifier(problem, settings).path(path)
 
 
 def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
-    """Judge a trajectory with its rates and times. Its velocities and accelerations must be those of its
-    positions, from rest to rest; for what is between the rows see `VerifySettings.chord`."""
+    """Judge a trajectory with its rates and times, and among obstacles that move from its first row to its
+    last. Its velocities and accelerations must be those of its positions, from rest, or the problem's start
+    velocity, to rest; for what is between the rows see `VerifySettings.chord`."""
     return verifier(problem, settings).trajectory(trajectory)
 
 
@@ -166,7 +169,9 @@ class Verifier:
             return self._report(trajectory.positions, trajectory.times, [])
         found = [
             Violation(wrong.kind, wrong.time, wrong.message, wrong.joint, None, wrong.excess)
-            for wrong in wrong_rates(self.robot, trajectory, self._rate_tolerances)
+            for wrong in wrong_rates(
+                self.robot, trajectory, self._rate_tolerances, self.problem.start_velocity
+            )
         ]
         rows = trajectory.times, trajectory.positions
         times, positions = rows if found else between_rows(trajectory, self.settings.chord)
@@ -220,16 +225,22 @@ class Verifier:
         last = len(q) - 1 if first is None else int(np.searchsorted(clock, first.time))
         sweep = self._continuous.sweep(q[: last + 1])
         collision = None
+        moving = None
+        if times is not None and self.problem.moving:
+            moving = self._moving.sweep(times[: last + 1], q[: last + 1])
         if sweep.contact is not None:
             collision = _collision(
                 sweep.contact, float(np.interp(sweep.contact.at, np.arange(len(clock)), clock))
             )
         ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
-        every = [v for v in (first, collision, *ends) if v is not None]
+        hit = None if moving is None or moving.contact is None else _hit(moving.contact)
+        every = [v for v in (first, collision, hit, *ends) if v is not None]
         violation = min(every, key=lambda v: v.time, default=None)
         valid = violation is None
-        scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
-        return Report(valid, violation, scene, itself)
+        if not valid:
+            return Report(False, violation, None, None)
+        scene = sweep.scene_clearance if moving is None else min(sweep.scene_clearance, moving.clearance)
+        return Report(True, None, scene, sweep.self_clearance)
 
     def _start(self, q: ndarray) -> Violation | None:
         difference = np.abs(q[0] - self.problem.start)
@@ -336,6 +347,11 @@ class Verifier:
         settings = self.settings
         return ContinuousCollision(self.robot, self.problem.scene, settings.contact, settings.tightness)
 
+    @cached_property
+    def _moving(self) -> MovingCollision:
+        settings = self.settings
+        return MovingCollision(self.robot, self.problem.moving, settings.contact, settings.tightness)
+
 
 class GoalError(NamedTuple):
     """How far a configuration is off a goal."""
@@ -406,6 +422,12 @@ def _apart(q, step):
 def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
     """The Verifier of a problem; the last few are kept, so that many paths of one problem are judged fast."""
     return Verifier(problem, settings)
+
+
+def _hit(contact: TimedContact) -> Violation:
+    link, other, time = contact.link, contact.obstacle, contact.time
+    message = f"{describe_contact(link, other, contact.depth, False)} at {time:.3f} s"
+    return Violation("scene_collision", time, message, link, other, contact.depth)
 
 
 def _collision(contact: Contact, time: float) -> Violation:

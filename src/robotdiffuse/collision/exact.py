@@ -280,6 +280,17 @@ class ExactCollision:
         """Signed distance of every checked pair of links."""
         return self._all(q, range(len(self.links), len(self.checks)))
 
+    def distance_seen_from(self, link: str, q: Float[ndarray, "dof"], T: Float[ndarray, "4 4"]) -> float:
+        """Signed distance of a link to the nearest obstacle after the arm was moved by T, base and all [m]:
+        that to obstacles which moved the other way."""
+        frames = T @ forward_frames(self.robot, q[None])[0]
+        others = self._obstacles
+        return min(
+            self._signed(piece, other, frames, np.inf, True)
+            for piece in self._pieces[link]
+            for other in others
+        )
+
     def _all(self, q: ndarray, checks: range) -> tuple[Distance, ...]:
         rows = np.tile(q, (len(checks), 1))
         distances, names = self.nearest(rows, np.array(checks, dtype=np.int64), np.full(len(checks), np.inf))

@@ -210,9 +210,9 @@ def _arm(robot: Robot) -> Arm:
 def _checks(robot: Robot) -> Checks:
     """What compiled code reads of the checks. Levers are seen from what the link is checked against."""
     groups, pairs = _groups(robot)
-    covered, parts = _covered(robot), hulls_of(robot)[1]
-    links = [link for link in covered.link_names if link in covered.spheres]
-    radii, checks = motion_radii(covered), checks_of(robot)
+    whole, parts = covered(robot), hulls_of(robot)[1]
+    links = [link for link in whole.link_names if link in whole.spheres]
+    radii, checks = motion_radii(whole), checks_of(robot)
     kind, where, of_parts, base = [], [], [], []
     levers = np.zeros((len(checks), robot.dof))
     for k, (link, other) in enumerate(checks):
@@ -235,7 +235,7 @@ def _checks(robot: Robot) -> Checks:
 
 
 @once_per_robot
-def _covered(robot: Robot) -> Robot:
+def covered(robot: Robot) -> Robot:
     """The robot, with one sphere about the meshes of each link that has meshes but no spheres."""
     added = {}
     for link, meshes in robot.meshes.items():

@@ -91,8 +91,9 @@ def _bounds_of_u(first, second, i, width, x, most, acceleration):
 
 
 @njit(cache=True)
-def fastest(first, second, grid, velocity, acceleration):
-    """ṡ [m] at each value of the grid s[m], 0 at both ends, from q'[m, dof] and q''[m, dof] there."""
+def controllable(first, second, grid, velocity, acceleration):
+    """The greatest ṡ² at each value of the grid s[m] from which the end can be reached at rest within the
+    limits, from q'[m, dof] and q''[m, dof] there."""
     n, dof = first.shape
     x = np.empty(n)  # the most that limits of velocity, and of acceleration where no u helps, allow
     for i in range(n):
@@ -113,8 +114,20 @@ def fastest(first, second, grid, velocity, acceleration):
             if low + low_slope * x[i] <= high + high_slope * x[i] or low_slope <= high_slope:
                 break
             x[i] = min((high - low) / (low_slope - high_slope), x[i])
+    return x
+
+
+@njit(cache=True)
+def fastest(first, second, grid, velocity, acceleration, begins=0.0):
+    """ṡ [m] at each value of the grid s[m], `begins` at the first and 0 at the last, from q'[m, dof] and
+    q''[m, dof] there; NaN where the end cannot be reached from so fast a beginning."""
+    n = len(grid)
+    x = controllable(first, second, grid, velocity, acceleration)
     speeds = np.zeros(n)
-    now = 0.0
+    now = begins * begins
+    if now > x[0] * (1 + TINY):
+        speeds[:] = np.nan
+        return speeds
     for i in range(n - 1):
         speeds[i] = np.sqrt(now)
         width = grid[i + 1] - grid[i]
@@ -179,6 +192,11 @@ def sampled(line, grid, speeds, sample_time):
         for j in range(dof):
             velocities[k, j] = first[j] * speed
             accelerations[k, j] = first[j] * pull + second[j] * speed * speed
-    q[0], q[count] = waypoints[0], waypoints[-1]
-    velocities[0] = velocities[count] = 0.0
+    if grid[0] == 0:
+        q[0] = waypoints[0]
+    if grid[-1] == knots[-1]:
+        q[count] = waypoints[-1]
+    velocities[count] = 0.0
+    if speeds[0] == 0:
+        velocities[0] = 0.0
     return times, q, velocities, accelerations

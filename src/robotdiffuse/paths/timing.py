@@ -28,8 +28,14 @@ GENTLER = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
 """Shares of the acceleration limits of which the fastest motion of limited jerk is taken."""
 BETWEEN = 8
 """Parts of a grid interval between which a pace is looked at."""
+ALMOST = 1e-6
+"""Share by which a motion that begins moving may exceed the limits."""
 SAME = 1e-6
 """Waypoints nearer to each other than this are one [rad]."""
+
+
+class TooFastError(RuntimeError):
+    """A motion that begins moving is too fast for the first corners, or to stop."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,7 @@ def time_parameterize(
     free: Callable[[Path], bool],
     settings: TimingSettings = DEFAULT,
     keeps: Callable[[ndarray], bool] = lambda _: True,
+    start_speed: float = 0.0,
     pace: "Pace | None" = None,
 ) -> Trajectory:
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
@@ -82,7 +89,8 @@ def time_parameterize(
     `keeps` says of configurations [n, dof] along a rounded corner whether they keep what the path does, a
     clearance say; corners that do not are rounded less from the start.
 
-    `pace` bounds further speeds, those of frames.
+    With a start speed [rad/s, joint-space L2] it begins moving along the first straight line, which must be
+    long enough to stop on. `pace` bounds further speeds, those of frames, of motions that begin at rest.
 
     A limit of jerk takes time at both ends of the motion and at each stop, and may cut corners a little more.
 
@@ -95,6 +103,35 @@ def time_parameterize(
     waypoints = _distinct(path.positions)
     if len(waypoints) == 1:
         return _at_rest(path, settings)
+    return _rounded(robot, path, waypoints, valid, free, settings, keeps, start_speed, pace)[1]
+
+
+def rounded_corners(
+    robot: Robot,
+    path: Path,
+    valid: Callable[[Trajectory], bool],
+    free: Callable[[Path], bool],
+    settings: TimingSettings = DEFAULT,
+) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "corners"]]:
+    """The waypoints of a path that differ, two at least, and how far `time_parameterize` would round each
+    corner."""
+    _check_limits(robot)
+    waypoints = _distinct(path.positions)
+    return waypoints, _rounded(robot, path, waypoints, valid, free, settings, lambda _: True, 0.0)[0]
+
+
+def _rounded(
+    robot: Robot,
+    path: Path,
+    waypoints: Float[ndarray, "n dof"],
+    valid: Callable[[Trajectory], bool],
+    free: Callable[[Path], bool],
+    settings: TimingSettings,
+    keeps: Callable[[ndarray], bool],
+    start_speed: float,
+    pace: "Pace | None" = None,
+) -> tuple[Float[ndarray, "corners"], Trajectory]:
+    """How far each corner is rounded, and the motion then; see `time_parameterize`."""
     deviations = np.full(len(waypoints) - 2, settings.corner_deviation)
     for shrink in SHRINKS:
         corners = zip(deviations, _corners(waypoints, deviations), strict=True)
@@ -103,15 +140,20 @@ def time_parameterize(
             break
         deviations = np.where(bad, shrink * deviations, deviations)
     for shrink in SHRINKS:
-        trajectory = _timed(robot, path, waypoints, deviations, settings, pace)
+        if not start_speed or _can_begin(robot, waypoints, deviations, settings, start_speed):
+            break
+        deviations[:1] *= shrink
+    for shrink in SHRINKS:
+        trajectory = _timed(robot, path, waypoints, deviations, settings, start_speed, pace)
         if not deviations.any() or valid(trajectory):
-            return trajectory
+            return deviations, trajectory
         bad = _bad_corners(path, waypoints, deviations, free)
         deviations = np.where(bad, shrink * deviations, deviations)
-    trajectory = _timed(robot, path, waypoints, deviations, settings, pace)
+    trajectory = _timed(robot, path, waypoints, deviations, settings, start_speed, pace)
     if not deviations.any() or valid(trajectory):
-        return trajectory
-    return _timed(robot, path, waypoints, np.zeros(len(waypoints) - 2), settings, pace)
+        return deviations, trajectory
+    deviations = np.zeros(len(waypoints) - 2)
+    return deviations, _timed(robot, path, waypoints, deviations, settings, start_speed, pace)
 
 
 def _check_limits(robot: Robot) -> None:
@@ -162,13 +204,32 @@ def _bad_corners(
     return bad if bad.any() else np.ones(len(bad), dtype=bool)
 
 
+def _can_begin(
+    robot: Robot,
+    waypoints: Float[ndarray, "n dof"],
+    deviations: Float[ndarray, "corners"],
+    settings: TimingSettings,
+    start_speed: float,
+) -> bool:
+    """Whether a motion that begins so fast can go round the corners until it stops."""
+    stop = np.append(np.flatnonzero(deviations == 0), len(deviations))[0]
+    waypoints, deviations = waypoints[: stop + 2], deviations[:stop]
+    line = BlendedPolyline(waypoints, half_widths(waypoints, deviations))
+    try:
+        _speeds(line, timing_grid(line, settings), settings.solver, *_limits(robot, settings), start_speed)
+    except TooFastError:
+        return False
+    return True
+
+
 def _timed(
     robot: Robot,
     path: Path,
     waypoints: Float[ndarray, "n dof"],
     deviations: Float[ndarray, "corners"],
     settings: TimingSettings,
-    pace: Pace | None,
+    start_speed: float,
+    pace: "Pace | None" = None,
 ) -> Trajectory:
     """Pieces between stops, one after the other. The motion stops where the deviation is zero."""
     stops = [0, *(np.flatnonzero(deviations == 0) + 1), len(waypoints) - 1]
@@ -176,7 +237,7 @@ def _timed(
     for a, b in pairwise(stops):
         part = waypoints[a : b + 1]
         line = BlendedPolyline(part, half_widths(part, deviations[a : b - 1]))
-        pieces.append(_piece(robot, line, settings, pace))
+        pieces.append(timed_piece(robot, line, settings, 0.0 if pieces else start_speed, pace))
     start, rows = 0.0, []
     for k, (times, positions, velocities, accelerations) in enumerate(pieces):
         first = 0 if k == 0 else 1
@@ -188,7 +249,7 @@ def _timed(
     return Trajectory(path.joint_names, times, positions, velocities, accelerations)
 
 
-def _grid(line: BlendedPolyline, settings: TimingSettings) -> Float[ndarray, "m"]:
+def timing_grid(line: BlendedPolyline, settings: TimingSettings) -> Float[ndarray, "m"]:
     """Values of s: every blend in equal parts, straight parts by length, first and last interval split.
 
     Along a straight line s̈ is piecewise constant, which any grid holds exactly but for the switching
@@ -214,8 +275,9 @@ def _speeds_by_toppra(
     grid: Float[ndarray, "m"],
     velocity: Float[ndarray, "dof"],
     acceleration: Float[ndarray, "dof"],
+    begins: float,
 ) -> Float[ndarray, "m"]:
-    """ṡ at each value of s in the grid; zero at both ends."""
+    """ṡ at each value of s in the grid; `begins` at the first, zero at the last."""
     import toppra
 
     class Geometry(toppra.interpolator.AbstractGeometricPath):
@@ -237,7 +299,7 @@ def _speeds_by_toppra(
         ),
     ]
     algorithm = toppra.algorithm.TOPPRA(constraints, Geometry(), gridpoints=grid, solver_wrapper="seidel")
-    speeds = algorithm.compute_parameterization(0.0, 0.0)[1]
+    speeds = algorithm.compute_parameterization(begins, 0.0)[1]
     return np.full(len(grid), np.nan) if speeds is None else speeds
 
 
@@ -245,18 +307,24 @@ Rows = tuple[Float[ndarray, "n"], Float[ndarray, "n dof"], Float[ndarray, "n dof
 """Times, positions, velocities and accelerations."""
 
 
-def _piece(robot: Robot, line: BlendedPolyline, settings: TimingSettings, pace: Pace | None) -> Rows:
-    """A motion from rest to rest."""
-    grid, limits = _grid(line, settings), _limits(robot, settings)
+def timed_piece(
+    robot: Robot,
+    line: BlendedPolyline,
+    settings: TimingSettings,
+    begins: float = 0.0,
+    pace: "Pace | None" = None,
+) -> Rows:
+    """A motion from a speed, or rest, to rest; with limited jerk from rest."""
+    grid, limits = timing_grid(line, settings), _limits(robot, settings)
     if settings.jerk is None:
-        speeds = _paced(line, grid, _speeds(line, grid, settings.solver, *limits, pace), pace)
+        speeds = _paced(line, grid, _speeds(line, grid, settings.solver, *limits, begins, pace), pace)
         return sampled(line.arrays, grid, speeds, settings.sample_time)
     every = max(round(settings.sample_time / FINE), 1)
     step, found = settings.sample_time / every, list[tuple[float, ndarray, int]]()
     for share in GENTLER:
         velocity, acceleration = limits[0], share * limits[1]
         window = max(int(np.ceil(2 * acceleration.max() / settings.jerk / step)), 1)
-        speeds = _speeds(line, grid, settings.solver, velocity, acceleration, pace)
+        speeds = _speeds(line, grid, settings.solver, velocity, acceleration, pace=pace)
         speeds = _paced(line, grid, speeds, pace)
         lasts = float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
         slower = np.ceil(lasts / step) * step / lasts  # whole steps
@@ -272,23 +340,45 @@ def _speeds(
     solver: str,
     velocity: Float[ndarray, "dof"],
     acceleration: Float[ndarray, "dof"],
-    pace: Pace | None,
+    begins: float = 0.0,
+    pace: "Pace | None" = None,
 ) -> Float[ndarray, "m"]:
     """ṡ at each value of s in the grid, such that the limits are kept in between too."""
+    share = 1.0
+    while True:
+        limits = share * velocity, share**2 * acceleration
+        if solver == TOPPRA:
+            speeds = _speeds_by_toppra(line, grid, *limits, begins)
+        else:
+            speeds = fastest(*_rates(line, grid, *limits, pace), begins)
+        if begins and np.isnan(speeds).any():
+            raise TooFastError(f"the motion cannot stop along the path from {begins:.3g} rad/s")
+        if not (speeds[1:-1] > 0).all():
+            raise RuntimeError("no timing was found; every path has one, so this is a numerical failure")
+        slower = slowdown(line.arrays, grid, speeds, velocity, acceleration)
+        if begins == 0:
+            return speeds / slower
+        if slower <= 1 + ALMOST:
+            return speeds
+        share /= slower  # the speed at the beginning is given
+
+
+def _rates(
+    line: BlendedPolyline,
+    grid: Float[ndarray, "m"],
+    velocity: Float[ndarray, "dof"],
+    acceleration: Float[ndarray, "dof"],
+    pace: "Pace | None",
+) -> tuple[ndarray, ndarray, ndarray, ndarray, ndarray]:
+    """q' and q'' along the path, its grid, and the limits; speeds of frames stand among those of joints, as
+    of joints without limits of acceleration."""
     first, second = line(grid, 1), line(grid, 2)
-    if solver == TOPPRA:
-        speeds = _speeds_by_toppra(line, grid, velocity, acceleration)
-    elif pace is None:
-        speeds = fastest(first, second, grid, velocity, acceleration)
-    else:  # as joints without limits of acceleration
-        more = pace.speeds(line(grid, 0), first)
-        first, second = np.column_stack([first, more]), np.column_stack([second, np.zeros_like(more)])
-        without = np.full(len(pace.most), np.inf)
-        limits = np.append(velocity, pace.most), np.append(acceleration, without)
-        speeds = fastest(first, second, grid, *limits)
-    if not (speeds[1:-1] > 0).all():
-        raise RuntimeError("no timing was found; every path has one, so this is a numerical failure")
-    return speeds / slowdown(line.arrays, grid, speeds, velocity, acceleration)
+    if pace is None:
+        return first, second, grid, velocity, acceleration
+    more = pace.speeds(line(grid, 0), first)
+    first, second = np.column_stack([first, more]), np.column_stack([second, np.zeros_like(more)])
+    limits = np.append(velocity, pace.most), np.append(acceleration, np.full(len(pace.most), np.inf))
+    return first, second, grid, *limits
 
 
 def _paced(

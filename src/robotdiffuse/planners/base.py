@@ -66,9 +66,11 @@ class Planner(ABC, Generic[Own]):
         velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses.
         jerk: most jerk of any joint of the timed motion [rad/s³]. None: no limit, the fastest motion.
 
-        Where the problem has waypoints, the motion stops at each: `planners/legs.py`. Where cameras saw the
-        scene, `problem.unseen` says what the rest is taken for: `planners/unseen.py`. Path constraints are
-        for aorrtc, rrt_connect and robotdiffuse: `planners/constrained`.
+        Where the problem has waypoints, the motion stops at each: `planners/legs.py`. Where obstacles move,
+        it waits, goes slower or draws back on its path: `planners/moving.py`. Where the problem has a start
+        velocity, it begins moving: `planners/in_motion.py`. Where cameras saw the scene, `problem.unseen`
+        says what the rest is taken for: `planners/unseen.py`. Path constraints are for aorrtc, rrt_connect
+        and robotdiffuse: `planners/constrained`.
 
         Raises InputError for arguments that are none of these, for what the planner cannot keep, and where
         `prepare` does.
@@ -80,6 +82,14 @@ class Planner(ABC, Generic[Own]):
             from robotdiffuse.planners.legs import plan_by_waypoints
 
             return plan_by_waypoints(self, problem, time_limit, seed, request)
+        if problem.moving:
+            from robotdiffuse.planners.moving import plan_among_moving
+
+            return plan_among_moving(self, problem, time_limit, seed, request)
+        if problem.start_velocity is not None:
+            from robotdiffuse.planners.in_motion import plan_in_motion
+
+            return plan_in_motion(self, problem, time_limit, seed, request)
         if problem.views:
             from robotdiffuse.planners.unseen import plan_beside_unseen
 
@@ -110,7 +120,7 @@ class Planner(ABC, Generic[Own]):
         first = goal.positions[:1] if isinstance(goal, JointGoal) else []
         ways = [start + share * (end - start) for end in first for share in (0.5, 0.35)]
         balls = [Sphere(link_pose(robot, q, robot.tip)[:3, 3], RADIUS) for q in ways]
-        problem = replace(problem, waypoints=())
+        problem = replace(problem, waypoints=(), moving=(), start_velocity=None)
         easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]
         calls = [*((easier, WARM_UP) for easier in easy), (problem, SLIGHT)]
         return [self.plan(task, seconds, until=until) for task, seconds in calls]

@@ -65,7 +65,7 @@ class Call:
         wanted = (request.clearance, problem.clearance, CLEARANCE)
         self.clearance = next(value for value in wanted if value is not None)
         """Distance to obstacles that is to be kept where it can be [m]."""
-        self._timing = TimingSettings(
+        self.timing = TimingSettings(
             sample_time=CLOSE_ROWS if problem.constraints else DEFAULT.sample_time,
             velocity_scale=request.velocity_scaling,
             acceleration_scale=request.acceleration_scaling,
@@ -176,7 +176,14 @@ class Call:
         planning_time = self.elapsed
         motion = _TimedMotion(self.judge)
         trajectory = time_parameterize(
-            problem.robot, path, motion.valid, self.judge.collision_free, self._timing, keeps, self._pace
+            problem.robot,
+            path,
+            motion.valid,
+            self.judge.collision_free,
+            self.timing,
+            keeps,
+            0.0 if problem.start_velocity is None else float(np.linalg.norm(problem.start_velocity)),
+            self._pace,
         )
         timed = motion.report(trajectory)
         if timed.violation is not None:

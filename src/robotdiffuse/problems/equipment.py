@@ -66,7 +66,7 @@ def equipped(robot: Robot, tool: object, attached: object, folder: Path) -> tupl
             )
         shape = {key: value for key, value in entry.items() if key not in ("link", "touch_links")}
         try:
-            [held], more = _one_shape(where, shape, folder)
+            [held], more = one_shape(where, shape, folder)
             notes += more
             touch = _names(f"{where}.touch_links", entry.get("touch_links", []))
             robot = robot.attach(held, _text(f"{where}.link", entry["link"]), touch)
@@ -99,7 +99,8 @@ def rounded(value: Any) -> Any:
     return {key: rounded(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
-def _one_shape(where: str, entry: dict[str, Any], folder: Path) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
+def one_shape(where: str, entry: dict[str, Any], folder: Path) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
+    """The one shape of an entry such as {box: {...}}, as a tuple, and notes; InputError names the field."""
     try:
         scene, notes = read_scene([entry], folder, where)
     except InputError as error:

@@ -26,6 +26,7 @@ from robotdiffuse.problems.moveit import (
     moveit_request,
     moveit_scene,
 )
+from robotdiffuse.problems.moving_files import moving_entry, read_moving
 from robotdiffuse.problems.problem import (
     OPTIMISTIC,
     JointGoal,
@@ -43,7 +44,10 @@ from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
 
 FIELDS = ("robot", "scene", "start", "goal")
-OPTIONAL = ("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unseen")
+OPTIONAL = (
+    *("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unseen"),
+    *("moving", "start_velocity"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +147,11 @@ def problem_record(
     if problem.constraints:
         kept = [one if T is None else one.moved(T) for one in problem.constraints]
         record["constraints"] = as_given([constraint_entry(one) for one in kept])
+    if problem.moving:
+        moving = problem.moving if T is None else [one.moved(T) for one in problem.moving]
+        record["moving"] = as_given([moving_entry(one, folder) for one in moving])
+    if problem.start_velocity is not None:
+        record["start_velocity"] = problem.start_velocity.tolist()
     if problem.clearance is not None:
         record["clearance"] = problem.clearance
     if views:
@@ -286,8 +295,9 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
             notes += more
         views, more = read_views(values.get("views", []), folder)
         unseen = values.get("unseen", OPTIMISTIC)
-        if requested and "waypoints" in values:
-            raise InputError("waypoints are for goals in the file itself, not beside a request")
+        for name in ("waypoints", "moving", "start_velocity"):
+            if requested and name in values:
+                raise InputError(f"{name} is for problems with start and goal in the file, not a request")
         kept = read_constraints(values.get("constraints", []))
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
@@ -295,10 +305,15 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
             return replace(asked, constraints=kept) if kept else asked
         goal, notes = read_goal("goal", values["goal"], scene), (*notes, *more)
         asked = robot, scene, values["start"], goal, notes, clearance, views, unseen
-        way = read_waypoints(values.get("waypoints", []), scene)
+        more = {
+            "waypoints": read_waypoints(values.get("waypoints", []), scene),
+            "constraints": kept,
+            "moving": read_moving(values.get("moving", []), folder),
+            "start_velocity": values.get("start_velocity"),
+        }
         if base is None:
-            return Problem(*asked, waypoints=way, constraints=kept)
-        return Problem.in_world(base, *asked, waypoints=way, constraints=kept)
+            return Problem(*asked, **more)
+        return Problem.in_world(base, *asked, **more)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 

@@ -5,6 +5,7 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from dataclasses import replace as dataclass_replace
 from typing import TYPE_CHECKING, ClassVar, no_type_check
 
 import numpy as np
@@ -21,6 +22,7 @@ from robotdiffuse.problems.goals import JointGoal as JointGoal
 from robotdiffuse.problems.goals import PoseGoal as PoseGoal
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
+from robotdiffuse.scenes.moving import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.transforms import inverse
 
@@ -66,6 +68,10 @@ class Problem:
     """Where the motion stops on its way, in this order."""
     constraints: tuple[Constraint, ...] = ()
     """What holds all along the motion."""
+    moving: tuple[MovingObstacle, ...] = ()
+    """Obstacles that move, from time 0 of the motion on; `scene` holds those that stand still."""
+    start_velocity: Float[ndarray, "dof"] | None = None
+    """Of the joints when the motion begins [rad/s] or [m/s]; None: it begins at rest."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
@@ -87,6 +93,19 @@ class Problem:
         views = _views(self.robot, self.views)
         if views and waypoints:
             raise InputError("waypoints cannot be had beside views: plan from one to the next")
+        moving = _moving(self.moving, self.scene)
+        start_velocity = _velocity(self.robot, self.start_velocity)
+        beside = {
+            "views": views,
+            "waypoints": waypoints,
+            "constraints": constraints,
+            "moving": moving,
+            "start_velocity": () if start_velocity is None else (start_velocity,),
+        }
+        for one in ("moving", "start_velocity"):
+            others = [name for name, given in beside.items() if name != one and given]
+            if beside[one] and others:
+                raise InputError(f"{one} cannot be had beside {others[0]}")
         check_unseen("unseen", self.unseen)
         T_world_base = self.T_world_base
         if T_world_base is not None:
@@ -107,6 +126,8 @@ class Problem:
             "T_world_base": T_world_base,
             "waypoints": waypoints,
             "constraints": constraints,
+            "moving": moving,
+            "start_velocity": start_velocity,
         }.items():
             object.__setattr__(self, key, value)
 
@@ -125,6 +146,8 @@ class Problem:
             T_world_base: ArrayLike | None = None,
             waypoints: Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]] = (),
             constraints: Sequence[Constraint] = (),
+            moving: Sequence[MovingObstacle] = (),
+            start_velocity: ArrayLike | None = None,
         ) -> None: ...
 
     @classmethod
@@ -141,9 +164,11 @@ class Problem:
         unseen: str = OPTIMISTIC,
         waypoints: "Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]]" = (),
         constraints: "Sequence[Constraint]" = (),
+        moving: "Sequence[MovingObstacle]" = (),
+        start_velocity: ArrayLike | None = None,
     ) -> "Problem":
-        """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views, the
-        poses of goals and constraints are given.
+        """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views,
+        obstacles that move, constraints and the poses of goals are given.
 
         They are moved into the base's frame, where planning is. Raises InputError as the constructor does.
         """
@@ -156,7 +181,9 @@ class Problem:
         views = tuple(view.moved(T_base_world) if isinstance(view, DepthView) else view for view in views)
         kinds = tuple(CONSTRAINTS.values())
         constraints = [one.moved(T_base_world) if isinstance(one, kinds) else one for one in constraints]
-        return cls(robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints, constraints)
+        moving = [one.moved(T_base_world) if isinstance(one, MovingObstacle) else one for one in moving]
+        asked = robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints
+        return cls(*asked, constraints, moving, start_velocity)
 
     def standing(self) -> tuple[Robot, Scene]:
         """Robot and scene as they stand in the world, for pictures and simulators: the robot's base is the
@@ -218,6 +245,37 @@ def _check_moved(robot: Robot, field: str, frame: str) -> None:
         raise unknown_name(f"link in {field}:", frame, moved)
     if frame not in moved:
         raise InputError(f"{field} {frame!r} is moved by no planned joint; these are: {', '.join(moved)}")
+
+
+def _moving(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]:
+    """With names that nothing else in the scene has."""
+    if not isinstance(moving, list | tuple) or not all(isinstance(one, MovingObstacle) for one in moving):
+        raise InputError(f"moving is {shown(moving)}; it must be a list of rd.MovingObstacle")
+    shapes = Scene([*scene.shapes, *(one.shape for one in moving)]).shapes[len(scene.shapes) :]
+    return tuple(
+        one if one.shape is shape else dataclass_replace(one, shape=shape)
+        for one, shape in zip(moving, shapes, strict=True)
+    )
+
+
+def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
+    """A velocity within limits, None for rest."""
+    if value is None:
+        return None
+    velocity = numbers(value)
+    names = ", ".join(robot.joint_names)
+    if velocity is None or velocity.shape != (robot.dof,) or not np.isfinite(velocity).all():
+        raise InputError(
+            f"start_velocity is {shown(value)}; it must be {robot.dof} finite numbers [rad/s]: {names}"
+        )
+    beyond = np.flatnonzero((np.abs(velocity) > robot.velocity) & (robot.velocity > 0))
+    if len(beyond):
+        j = int(beyond[0])
+        raise InputError(
+            f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; its velocity limit is "
+            f"{robot.velocity[j]:g}"
+        )
+    return velocity if velocity.any() else None
 
 
 def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:

@@ -107,13 +107,15 @@ class AnytimeSearch:
         straight = np.linalg.norm(self.goals - self.start, axis=1).min()
         return bool(self.length <= straight * (1 + NO_SHORTER))
 
-    def first(self, until: float, help_out: Callable[[], None] | None = None) -> bool:
-        """Search until there is a path, or `until` [s since the call]; whether there is one.
+    def first(self, until: float, help_out: Callable[[], None] | None = None, work: float = np.inf) -> bool:
+        """Search until there is a path, or `until` [s since the call], or for so many more iterations;
+        whether there is one.
 
         `help_out` is called each time that no clearance gave one.
         """
         self._straight()
-        while self.best is None and self.call.elapsed < until:
+        enough = self.work + work
+        while self.best is None and self.call.elapsed < until and self.work < enough:
             self._slice()
             if self.best is None and self._tried >= FIRST_TRIES:
                 self._lower(help_out)
