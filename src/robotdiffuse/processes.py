@@ -14,9 +14,9 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -91,27 +91,42 @@ class LoneWorker:
     def call(self, call: Callable[..., Any], *arguments: Any) -> Any:
         """The result of `call(*arguments)` there; what it raises is raised here. Raises BrokenProcessPool if
         the process dies or was closed."""
+        return self.submit(call, *arguments).result()
+
+    def submit(self, call: Callable[..., Any], *arguments: Any) -> "Future[Any]":
+        """The same, to be waited for."""
         if self._closed:
             raise BrokenProcessPool("closed")
-        if self._pool is None:
+        with interrupts_not_passed_on():
+            if self._pool is not None:
+                with suppress(BrokenProcessPool):
+                    return self._pool.submit(call, *arguments)
             context = multiprocessing.get_context("spawn")
             given = added(), self._prepare, self._arguments
             self._pool = ProcessPoolExecutor(1, context, _prepare_lone, given)
-        try:
-            with interrupts_not_passed_on():
-                job = self._pool.submit(call, *arguments)
-            return job.result()
-        except BrokenProcessPool:
-            self._pool = None
-            raise
+            return self._pool.submit(call, *arguments)
 
-    def close(self) -> None:
-        """End the process, whatever another thread waits for."""
-        self._closed, pool = True, self._pool
+    def send(self, by: signal.Signals) -> None:
+        """A signal to the process, if there is one."""
+        for process in self._processes():
+            with suppress(ProcessLookupError):
+                os.kill(process.pid or 0, by)
+
+    def end(self, by: signal.Signals = signal.SIGTERM) -> None:
+        """End the process, whatever anybody waits for; the next call has a new one."""
+        pool, processes = self._pool, self._processes()
+        self._pool = None
         if pool is not None:
-            processes = list((pool._processes or {}).values())
             pool.shutdown(wait=False, cancel_futures=True)
-            end(processes, signal.SIGTERM, PATIENCE)
+            end(processes, by, PATIENCE)
+
+    def close(self, by: signal.Signals = signal.SIGTERM) -> None:
+        """End the process for good."""
+        self._closed = True
+        self.end(by)
+
+    def _processes(self) -> list[BaseProcess]:
+        return list((self._pool._processes or {}).values()) if self._pool is not None else []
 
 
 def _prepare_lone(entries: Added, prepare: Callable[..., None], arguments: tuple) -> None:
