@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.checks import LARGEST
 from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.timing import TimingSettings, time_parameterize
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
-from robotdiffuse.settings import Bound, NotNegative, OneOf, Positive, Settings
+from robotdiffuse.settings import Bound, OneOf, Positive, Settings
 from robotdiffuse.types import SHORT, UNTIL, Path, Status, Trajectory
 from robotdiffuse.verify import Report, Verifier, Violation, verifier
 
@@ -35,7 +36,7 @@ class Request(Settings):
     """What a call may ask for beyond its time limit and seed; see `planners.base.Planner.plan`."""
 
     until: Annotated[str, OneOf(UNTIL)] = SHORT
-    clearance: NotNegative | None = None
+    clearance: Annotated[float, Bound(least=0.0, most=LARGEST)] | None = None
     velocity_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
     acceleration_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
     jerk: Positive | None = None

@@ -14,6 +14,8 @@ from robotdiffuse.serve.app import make_app
 from robotdiffuse.serve.pool import Pool
 from robotdiffuse.serve.settings import GRACE, ServeSettings
 
+BACKLOG = 128
+"""Connections that wait to be taken."""
 SIGNALS = signal.SIGINT, signal.SIGTERM
 
 
@@ -53,6 +55,7 @@ def serve(robots: dict[str, Robot], settings: ServeSettings, say: Callable[[str]
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((settings.host, settings.port))
+            listener.listen(BACKLOG)
         except (OSError, OverflowError) as error:
             why = getattr(error, "strerror", None) or str(error)
             raise InputError(f"cannot listen at {settings.host}, port {settings.port}: {why}") from None

@@ -79,11 +79,16 @@ _warm: set[tuple[str, str]] = set()
 
 
 def prepare(robots: dict[str, Robot], longest: float, shared: Shared) -> None:
-    """What is done once in a process; see `_State`."""
-    global _state
-    _state = _State(robots, longest, shared)
+    """What is done once in a process."""
+    accept(robots, longest, shared)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the server says when to end: services signal all
     signal.signal(CANCEL, _leave)
+
+
+def accept(robots: dict[str, Robot], longest: float, shared: Shared) -> None:
+    """Take requests from now on; see `_State`."""
+    global _state
+    _state = _State(robots, longest, shared)
 
 
 def _leave(*_: object) -> None:
