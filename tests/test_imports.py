@@ -13,6 +13,7 @@ MODULES = sorted(SOURCE.rglob("*.py"))
 
 CHAIN = (
     "compile_cache",
+    "deadline",
     "errors",
     "reading",
     "checks",

@@ -11,6 +11,7 @@ from numpy import ndarray
 
 from robotdiffuse.checks import LARGEST
 from robotdiffuse.collision.kernels.compiled import compile_seconds
+from robotdiffuse.deadline import OutOfTimeError
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.timing import TimingSettings, time_parameterize
 from robotdiffuse.problems.problem import Problem
@@ -75,7 +76,7 @@ class Call:
         self.notes = list(problem.notes)
         """What the result will say was changed or ignored; planners may add to it."""
         self._progress: list[tuple[float, float]] = []
-        self._refused = ""
+        self._refused = self._no_time_for = ""
 
     def improved(self, length: float) -> None:
         """Note that a path of this joint-space length [rad] was just found; longer ones are passed over."""
@@ -111,8 +112,8 @@ class Call:
 
     @property
     def remaining(self) -> float:
-        """Wall time left for searching [s]; negative when it has run out."""
-        return self.search_until - self.elapsed
+        """Wall time left for searching [s]; negative when it has run out, or is too short for the judge."""
+        return -1.0 if self._no_time_for else self.search_until - self.elapsed
 
     def fail(self, status: Status, reason: str) -> PlanResult:
         """A result without a motion."""
@@ -129,6 +130,8 @@ class Call:
 
     def unsolved(self, reason: str = "") -> PlanResult:
         """A result without a path: TIMEOUT if time has run out, else NO_PATH, for a search that ended."""
+        if self._no_time_for:
+            return self.out_of_time(self._no_time_for)
         if self.remaining <= 0:
             tried = (
                 f"no path was found in {self.elapsed:.2f} s; a longer time limit or another seed may find one"
@@ -136,6 +139,11 @@ class Call:
             return self.fail(Status.TIMEOUT, reason or tried)
         ended = f"the search ended after {self.elapsed:.2f} s without a path; another seed may find one"
         return self.fail(Status.NO_PATH, reason or ended)
+
+    def out_of_time(self, step: str) -> PlanResult:
+        """A result for a scene whose preparation takes longer than the call may."""
+        limit = f"the time limit of {self.time_limit:g} s is too short to prepare the scene"
+        return self.fail(Status.TIMEOUT, f"{limit}: there was no time for {step}")
 
     def finish(
         self,
@@ -151,7 +159,11 @@ class Call:
         `keeps` as in `time_parameterize`.
         """
         began = self.elapsed
-        result = self._finished(waypoints, stage, reason, notes, keeps)
+        try:
+            result = self._finished(waypoints, stage, reason, notes, keeps)
+        except OutOfTimeError as error:
+            self._no_time_for = str(error)
+            return None
         took = self.elapsed - began
         before = _finishing.get(self.problem.robot.name, took)
         _finishing[self.problem.robot.name] = before + 0.5 * (took - before)
