@@ -4,6 +4,7 @@ Ctrl-C is for the process that a person started: it ends the others. They end wi
 killed.
 """
 
+import fcntl
 import logging
 import multiprocessing
 import os
@@ -212,14 +213,24 @@ def prepare_worker(entries: Added) -> None:
     """A worker has what its parent has `added` to the tables, and ends with it, even where that is killed."""
     take_over(entries)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
-        parent.join()
-        os._exit(1)
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+        _end_by_signal_with(parent)
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
+
+
+def _end_by_signal_with(parent: BaseProcess) -> None:
+    """Linux ends this process when the pipe from its parent closes, by SIGIO, which nothing here waits for:
+    a thread has to wait until compiled code and imports let go of the interpreter."""
+    pipe = parent.sentinel
+    with suppress(OSError, AttributeError):  # systems that cannot have the thread
+        fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())
+        fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)
 
 
 def end(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -> None:
