@@ -58,14 +58,14 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
 
     def judged() -> ndarray:
         rows = np.linspace(left, left + np.eye(7)[0] * 0.2, 5)
-        report = Verifier(problem).path(rd.Path(robot.joint_names, rows))
+        short = rd.Problem(robot, problem.scene, left, rows[-1])
+        report = Verifier(short).path(rd.Path(robot.joint_names, rows))
+        assert report.valid
         return np.array([report.scene_clearance, report.self_clearance], np.float64)
 
     def reached() -> ndarray:
-        found = inverse_kinematics(
-            robot, link_pose(robot, left, robot.tip), robot.tip, np.random.default_rng(0)
-        )
-        return np.asarray(getattr(found, "positions", found), np.float64)
+        goal = link_pose(robot, left, robot.tip)
+        return np.asarray(inverse_kinematics(robot, robot.tip, goal, rng=np.random.default_rng(0)))
 
     arm = compile_robot(robot)
     return {
