@@ -3,12 +3,14 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -18,7 +20,9 @@ import pytest
 import robotdiffuse as rd
 from helpers.faulty_planner import DIES, HANGS, RAISES
 from helpers.serving import serving
+from robotdiffuse.cli.serve import served_robots
 from robotdiffuse.problems.files import problem_from_record
+from robotdiffuse.robots import DATA, ROBOTS
 
 pytest.importorskip("fastapi")
 
@@ -228,6 +232,13 @@ def test_a_full_queue_says_when_to_come_again(server: httpx.Client) -> None:
     assert server.post("/plan", json=asked(3)).status_code == 200
 
 
+def test_a_worker_that_holds_too_much_is_replaced_between_requests() -> None:
+    with serving("--workers", "1", "--memory", "1") as (client, _):
+        for _ in range(2):
+            assert client.post("/plan", json=asked(3)).json()["status"] == "solved"
+        assert gauge(client, "workers_renewed_total") == 2 and gauge(client, "workers_lost_total") == 0
+
+
 def test_it_stops_gracefully_and_leaves_no_worker() -> None:
     with serving("--workers", "1") as (client, process), ThreadPoolExecutor(2) as threads:
         workers = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout
@@ -261,3 +272,14 @@ def test_an_address_that_is_taken_is_one_line(server: httpx.Client) -> None:
     arguments = [sys.executable, "-m", "robotdiffuse", "serve", "--port", port]
     refused = subprocess.run(arguments, capture_output=True, text=True)
     assert refused.returncode == 2 and "cannot listen at 127.0.0.1" in refused.stderr
+
+
+def test_robots_that_are_named_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path))
+    shutil.copytree(DATA / "panda", tmp_path / "mine")
+    assert set(served_robots(["mine"])) == {*ROBOTS, "mine"}
+    for name in ("panda", str(tmp_path / "mine")):  # the folder's robot is called panda, too
+        with pytest.raises(rd.InputError, match="would be called panda, which another robot is"):
+            served_robots([name])
+    with pytest.raises(rd.InputError, match="unknown robot 'yours'"):
+        served_robots(["yours"])

@@ -2,8 +2,13 @@
 
 import argparse
 import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import count, natural, positive
+
+if TYPE_CHECKING:
+    from robotdiffuse.robots.robot import Robot
 
 TOKEN = "ROBOTDIFFUSE_TOKEN"
 
@@ -50,13 +55,19 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar="MB",
         help="size that a request may have (default: 8 MB)",
     )
+    parser.add_argument(
+        "--memory",
+        type=count,
+        default=2048,
+        metavar="MB",
+        help="what a worker may hold after an answer; one that holds more is replaced (default: 2048 MB)",
+    )
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.errors import InputError, shown
     from robotdiffuse.reading import MEGABYTE
-    from robotdiffuse.robots import ROBOTS, load_robot
 
     try:
         from robotdiffuse.serve.server import serve
@@ -64,13 +75,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError('serve needs fastapi and uvicorn: pip install "robotdiffuse[serve]"') from None
     from robotdiffuse.serve.settings import ServeSettings
 
-    robots = {name: load_robot(name) for name in ROBOTS}
-    for name in arguments.robot:
-        robot = load_robot(name)
-        named = name if robot.source == name else robot.name
-        if named in robots:
-            raise InputError(f"robot {shown(name)} is called {named}, and so is another")
-        robots[named] = robot
     settings = ServeSettings(
         host=arguments.host,
         port=arguments.port,
@@ -78,9 +82,28 @@ def run(arguments: argparse.Namespace) -> int:
         queue=arguments.queue,
         longest=arguments.longest,
         largest=arguments.largest * MEGABYTE,
+        memory=arguments.memory * MEGABYTE,
         token=os.environ.get(TOKEN, ""),
     )
     if not settings.on_loopback and not settings.token:
         raise InputError(f"host is {shown(settings.host)}, where others can connect: set a token in {TOKEN}")
-    serve(robots, settings, lambda line: print(line, flush=True))
+    serve(served_robots(arguments.robot), settings, lambda line: print(line, flush=True))
     return 0
+
+
+def served_robots(names: Sequence[str]) -> "dict[str, Robot]":
+    """The bundled robots and those named, by the names that requests use: a URDF's robot by its own.
+
+    Raises InputError where two would have one name.
+    """
+    from robotdiffuse.errors import InputError, shown
+    from robotdiffuse.robots import ROBOTS, known_robots, load_robot
+
+    robots = {name: load_robot(name) for name in ROBOTS}
+    for name in names:
+        robot = load_robot(name)
+        known = name if name in known_robots() else robot.name
+        if known in robots:
+            raise InputError(f"robot {shown(name)} would be called {known}, which another robot is")
+        robots[known] = robot
+    return robots

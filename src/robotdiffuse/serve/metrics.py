@@ -18,7 +18,7 @@ class Metrics:
         """By what was asked, and the code of the answer."""
         self.results: Counter[tuple[str, str]] = Counter()
         """By what was asked, and the status of the result."""
-        self.lost_workers = 0
+        self.lost_workers = self.renewed_workers = 0
         self._buckets = [0] * len(BUCKETS)
         self._seconds, self._count = 0.0, 0
 
@@ -49,6 +49,12 @@ class Metrics:
                 "counter",
                 "Workers that died or were killed.",
                 [("", {}, self.lost_workers)],
+            ),
+            *_lines(
+                "workers_renewed_total",
+                "counter",
+                "Workers replaced for what they held.",
+                [("", {}, self.renewed_workers)],
             ),
             *_lines("request_seconds", "histogram", "From the request to its answer.", seconds),
         ]

@@ -127,7 +127,11 @@ class Pool:
             raise
         finally:
             self.busy -= 1
-        self._free(seat)
+        if answer.memory > self.settings.memory:
+            self.metrics.renewed_workers += 1
+            self._later(self._renew(seat))
+        else:
+            self._free(seat)
         self._typical += 0.1 * (time.monotonic() - began - self._typical)
         return answer
 
@@ -202,8 +206,12 @@ class Pool:
         self._free(seat)
 
     async def _lost(self, seat: _Seat) -> None:
-        self.ready -= 1
         self.metrics.lost_workers += 1
+        await self._renew(seat)
+
+    async def _renew(self, seat: _Seat) -> None:
+        """Another worker in this one's place."""
+        self.ready -= 1
         seat.process.end(signal.SIGKILL)
         await self._replace(seat)
 
@@ -217,7 +225,10 @@ class Pool:
                 await asyncio.sleep(AGAIN)
 
     async def _prepared(self, seat: _Seat) -> None:
-        await asyncio.wrap_future(seat.process.submit(worker.warm_up))
+        """One that compiled makes place for one that loads: so all give the same numbers, bit for bit."""
+        if await asyncio.wrap_future(seat.process.submit(worker.warm_up)):
+            seat.process.end(signal.SIGKILL)
+            await asyncio.wrap_future(seat.process.submit(worker.warm_up))
         self.ready += 1
         self._free(seat)
 

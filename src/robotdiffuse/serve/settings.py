@@ -34,6 +34,8 @@ class ServeSettings(Settings):
     """Bytes that a request may have."""
     batch: Count = 1000
     """Lines that a batch may have."""
+    memory: Count = 2 * 2**30
+    """Bytes that a worker may hold after an answer; one that holds more is replaced before the next."""
     token: str = ""
     """That requests must bring; "" for none."""
 

@@ -1,6 +1,7 @@
 """What the worker processes of a server do: bytes of a request in, bytes of an answer out."""
 
 import json
+import os
 import signal
 import sys
 import time
@@ -8,10 +9,12 @@ import traceback
 from ctypes import Structure, c_double, c_int64
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import orjson
 
+from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planners.base import Planner
@@ -45,6 +48,8 @@ class Answer(NamedTuple):
     body: bytes
     status: str
     """Of the result; valid or invalid; "" for an error."""
+    memory: int = 0
+    """What the worker's process holds [bytes]."""
 
 
 class Shared(Structure):
@@ -96,13 +101,14 @@ def _leave(*_: object) -> None:
         raise Cancelled
 
 
-def warm_up() -> None:
-    """Load, or compile, what most requests need."""
+def warm_up() -> bool:
+    """Load, or compile, what most requests need; whether anything was compiled."""
     assert _state is not None
     name, robot = next(iter(_state.robots.items()))
     middle = (robot.lower + robot.upper) / 2
     far = Scene([Box([2.0, 2.0, 2.0], [0.1, 0.1, 0.1])])
     _warmed(_planner(DEFAULT_PLANNER), Problem(robot, far, middle, middle + 0.1), name)
+    return compile_seconds() > 0
 
 
 def respond(number: int, what: str, body: bytes) -> Answer:
@@ -110,7 +116,8 @@ def respond(number: int, what: str, body: bytes) -> Answer:
     assert _state is not None
     try:
         _state.call = number
-        return (_plan if what == PLAN else _judge)(_state, body)
+        answer = (_plan if what == PLAN else _judge)(_state, body)
+        return answer._replace(memory=_memory())
     except InputError as error:
         return failed(400, str(error))
     except Exception as error:
@@ -118,6 +125,15 @@ def respond(number: int, what: str, body: bytes) -> Answer:
         return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
     finally:
         _state.call = 0
+
+
+def _memory() -> int:
+    """What this process holds [bytes]; 0 where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def failed(code: int, message: str) -> Answer:
