@@ -491,6 +491,38 @@ def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return read
 
 
+def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Bodies of requests, read and answered as a worker of `robotdiffuse serve` does."""
+    from robotdiffuse.errors import InputError
+    from robotdiffuse.robots import load_robot
+    from robotdiffuse.serve import worker
+
+    rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
+    problem = (
+        PROBLEM | {"scene": PROBLEM["scene"][: rng.integers(7)]} | (EQUIPPED if rng.random() < 0.1 else {})
+    )
+    plan = {"problem": problem, "planner": "rrt_connect", "time_limit": 0.05, "seed": 1, "until": "first"}
+    plan |= {"velocity_scaling": 0.5, "acceleration_scaling": 0.5, "clearance": 0.01}
+    motion = {"joint_names": JOINTS, "positions": rows}
+    rates = {"velocities": [[0.0] * 7] * 3, "accelerations": [[0.0] * 7] * 3}
+    judged = {
+        "problem": problem,
+        "path": motion,
+        "trajectory": motion | {"times": [0.0, 1.0, 2.0]} | rates,
+    }
+    what = worker.VERIFY if rng.random() < 0.5 else worker.PLAN
+    body = text_of(rng, judged if what == worker.VERIFY else plan, ".json")
+
+    def ask() -> None:
+        worker.accept({"panda": load_robot("panda")}, 0.1, worker.Shared())
+        answer = worker.respond(1, what, body)
+        if answer.code == 400:
+            raise InputError(json.loads(answer.body)["error"])
+        assert answer.code == 200, answer.body.decode()
+
+    return ask
+
+
 KINDS: dict[str, Make] = {
     "problem": _problem,
     "moveit": _moveit,
@@ -499,6 +531,7 @@ KINDS: dict[str, Make] = {
     "urdf": _urdf,
     "result": _result,
     "bundle": _bundle,
+    "http": _http,
 }
 
 

@@ -22,6 +22,7 @@ COUNTS = {
     "urdf": 400,
     "result": 400,
     "bundle": 100,
+    "http": 300,
 }
 
 

@@ -13,6 +13,7 @@ MODULES = sorted(SOURCE.rglob("*.py"))
 
 CHAIN = (
     "compile_cache",
+    "deadline",
     "errors",
     "reading",
     "checks",
@@ -37,6 +38,7 @@ BELOW["learning"] = {*BELOW["data"], "learning"}
 BELOW["planners"] = {*CHAIN, "data", "learning", "planners"}
 BELOW["simulation"] = {*CHAIN, "simulation"}
 BELOW["viewer"] = {*CHAIN, "viewer"}
+BELOW["serve"] = {*CHAIN, "planners", "serve"}
 BELOW["generation"] = {*CHAIN, "data", "learning", "planners", "generation"}
 BELOW["evaluation"] = {*CHAIN, "data", "learning", "planners", "simulation", "generation", "evaluation"}
 
@@ -49,6 +51,10 @@ EXTRAS = {
     "zarr": {"data"},
     "accelerate": {"learning"},
     "viser": {"viewer"},
+    "fastapi": {"serve"},
+    "starlette": {"serve"},
+    "uvicorn": {"serve"},
+    "orjson": {"serve"},
     "matplotlib": {"evaluation"},
     "pinocchio": set(),
     "example_robot_data": set(),

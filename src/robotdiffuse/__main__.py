@@ -1,8 +1,17 @@
-"""python -m robotdiffuse, and so torchrun -m robotdiffuse"""
+"""The command line from its first import on: `python -m robotdiffuse`, and the script of that name."""
 
 import sys
 
-from robotdiffuse.cli import main
+
+def main() -> int:
+    """As `cli.main`; Ctrl-C is one line while that is still imported, too."""
+    try:
+        from robotdiffuse import cli
+    except KeyboardInterrupt:
+        print("robotdiffuse: stopped", file=sys.stderr)
+        return 130
+    return cli.main()
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -4,6 +4,7 @@ Ctrl-C is for the process that a person started: it ends the others. They end wi
 killed.
 """
 
+import fcntl
 import logging
 import multiprocessing
 import os
@@ -14,9 +15,9 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -91,27 +92,42 @@ class LoneWorker:
     def call(self, call: Callable[..., Any], *arguments: Any) -> Any:
         """The result of `call(*arguments)` there; what it raises is raised here. Raises BrokenProcessPool if
         the process dies or was closed."""
+        return self.submit(call, *arguments).result()
+
+    def submit(self, call: Callable[..., Any], *arguments: Any) -> "Future[Any]":
+        """The same, to be waited for."""
         if self._closed:
             raise BrokenProcessPool("closed")
-        if self._pool is None:
+        with interrupts_not_passed_on():
+            if self._pool is not None:
+                with suppress(BrokenProcessPool):
+                    return self._pool.submit(call, *arguments)
             context = multiprocessing.get_context("spawn")
             given = added(), self._prepare, self._arguments
             self._pool = ProcessPoolExecutor(1, context, _prepare_lone, given)
-        try:
-            with interrupts_not_passed_on():
-                job = self._pool.submit(call, *arguments)
-            return job.result()
-        except BrokenProcessPool:
-            self._pool = None
-            raise
+            return self._pool.submit(call, *arguments)
 
-    def close(self) -> None:
-        """End the process, whatever another thread waits for."""
-        self._closed, pool = True, self._pool
+    def send(self, by: signal.Signals) -> None:
+        """A signal to the process, if there is one."""
+        for process in self._processes():
+            with suppress(ProcessLookupError):
+                os.kill(process.pid or 0, by)
+
+    def end(self, by: signal.Signals = signal.SIGTERM) -> None:
+        """End the process, whatever anybody waits for; the next call has a new one."""
+        pool, processes = self._pool, self._processes()
+        self._pool = None
         if pool is not None:
-            processes = list((pool._processes or {}).values())
             pool.shutdown(wait=False, cancel_futures=True)
-            end(processes, signal.SIGTERM, PATIENCE)
+            end(processes, by, PATIENCE)
+
+    def close(self, by: signal.Signals = signal.SIGTERM) -> None:
+        """End the process for good."""
+        self._closed = True
+        self.end(by)
+
+    def _processes(self) -> list[BaseProcess]:
+        return list((self._pool._processes or {}).values()) if self._pool is not None else []
 
 
 def _prepare_lone(entries: Added, prepare: Callable[..., None], arguments: tuple) -> None:
@@ -197,14 +213,24 @@ def prepare_worker(entries: Added) -> None:
     """A worker has what its parent has `added` to the tables, and ends with it, even where that is killed."""
     take_over(entries)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent is not None:
-        parent.join()
-        os._exit(1)
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+        _end_by_signal_with(parent)
+
+
+def _end_with(parent: BaseProcess) -> None:
+    parent.join()
+    os._exit(1)
+
+
+def _end_by_signal_with(parent: BaseProcess) -> None:
+    """Linux ends this process when the pipe from its parent closes, by SIGIO, which nothing here waits for:
+    a thread has to wait until compiled code and imports let go of the interpreter."""
+    pipe = parent.sentinel
+    with suppress(OSError, AttributeError):  # systems that cannot have the thread
+        fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())
+        fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)
 
 
 def end(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -> None:

@@ -12,6 +12,9 @@ import re
 import stat
 import xml.etree.ElementTree as ET
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -39,12 +42,23 @@ LONGEST_INTEGER = 30
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 _STRING = re.compile(r'"(?:[^"\\]|\\.)*"?')
+_closed: ContextVar[bool] = ContextVar("closed", default=False)
+
+
+@contextmanager
+def no_files() -> Iterator[None]:
+    """No file is read while this lasts, nor said whether there is one: for data that came from elsewhere."""
+    before = _closed.set(True)
+    try:
+        yield
+    finally:
+        _closed.reset(before)
 
 
 def is_file(file: str | Path) -> bool:
     """Whether there is a regular file of this name that may be looked at; False also for impossible names."""
     try:
-        return stat.S_ISREG(os.stat(file).st_mode)
+        return not _closed.get() and stat.S_ISREG(os.stat(file).st_mode)
     except (OSError, ValueError):
         return False
 
@@ -57,6 +71,8 @@ def input_file(file: str | Path, what: str = "", largest: int = LARGEST_FILE) ->
     """
     text = str(file)
     named = f"{what} {text if len(text) <= LONGEST_NAME else shortened(text)}".strip()
+    if _closed.get():
+        raise InputError(f"{named} is a file, and none is read here: give what it holds instead")
     try:
         found = os.stat(file)
         permitted = os.access(file, os.R_OK)

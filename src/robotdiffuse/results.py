@@ -74,11 +74,15 @@ class PlanResult:
         """
         path = check_output(file, (".json", ".csv"))
         if path.suffix.lower() == ".json":
-            write_atomically(path, json.dumps(_record(self, problem), allow_nan=False) + "\n")
+            write_atomically(path, json.dumps(self.record(problem), allow_nan=False) + "\n")
         elif self.trajectory is None:
             raise InputError(f"{path}: there is no trajectory to write ({self.status.value}); use .json")
         else:
             self.trajectory.save(path)
+
+    def record(self, problem: dict[str, Any] | None = None) -> dict[str, Any]:
+        """What a result file holds, for JSON; `problem` as in a problem file."""
+        return _record(self, problem)
 
 
 @dataclass(frozen=True, eq=False)

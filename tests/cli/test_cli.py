@@ -443,3 +443,18 @@ def test_output_that_leads_nowhere(command: str, status: int, said: str) -> None
     line = command.format(f"{sys.executable} -m robotdiffuse robot info panda")
     ended = subprocess.run(["bash", "-c", line], capture_output=True, text=True)
     assert (ended.returncode, ended.stderr.strip()) == (status, f"robotdiffuse: {said}" if said else "")
+
+
+def test_ctrl_c_while_the_command_line_is_imported_is_one_line() -> None:
+    code = """
+import sys
+class Interrupted:
+    def find_spec(self, name, *_):
+        if name == "robotdiffuse.cli":
+            raise KeyboardInterrupt
+sys.meta_path.insert(0, Interrupted())
+from robotdiffuse.__main__ import main
+sys.exit(main())
+"""
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "", "robotdiffuse: stopped\n")

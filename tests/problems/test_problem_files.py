@@ -414,3 +414,42 @@ def test_moveit_files_in_a_problem(tmp_path: Path) -> None:
     assert isinstance(loaded.goal, JointGoal) and loaded.goal.positions[0, 0] == 1.2
     with pytest.raises(InputError, match=r"unknown field of problem: '(start|goal)'"):
         load_problem(written(tmp_path, GOOD | {"request": request}))
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"scene": "scene.yaml"},
+        {"scene": [{"mesh": {"file": "shelf.stl"}}]},
+        {"scene": [{"point_cloud": {"file": "/etc/passwd.csv"}}]},
+        {"tool": {"link": "panda_hand", "shapes": [{"mesh": {"file": "tool.stl"}}]}},
+        {"attached": [{"link": "panda_hand", "mesh": {"file": "cup.stl"}}]},
+        {
+            "views": [
+                {
+                    "depth": "a.png",
+                    "intrinsics": [1, 1, 0, 0],
+                    "camera": {"xyz": [0] * 3, "wxyz": [1, 0, 0, 0]},
+                }
+            ]
+        },
+        {"views": [{"cloud": "a.ply", "camera": {"xyz": [0] * 3, "wxyz": [1, 0, 0, 0]}}]},
+    ],
+)
+def test_records_of_others_name_no_files_that_are_read(changed: dict[str, Any]) -> None:
+    record = {"robot": "panda", "scene": [], "start": READY, "goal": {"joints": READY}} | changed
+    with pytest.raises(InputError, match="is a file, and none is read here"):
+        problem_from_record(record, {"panda": load_robot("panda")})
+
+
+@pytest.mark.parametrize("robot", ["ur5", "panda/robot.json", "../panda", "/etc/passwd", "a.urdf", 1, None])
+def test_records_of_others_have_the_robots_that_are_given(robot: object) -> None:
+    record = {"robot": robot, "scene": [], "start": READY, "goal": {"joints": READY}}
+    with pytest.raises(InputError, match=r"unknown robot .*; known: panda$"):
+        problem_from_record(record, {"panda": load_robot("panda")})
+
+
+def test_a_request_of_others_is_a_file_too() -> None:
+    record = {"robot": "panda", "scene": [], "request": "/etc/passwd"}
+    with pytest.raises(InputError, match="none is read here"):
+        problem_from_record(record, {"panda": load_robot("panda")})

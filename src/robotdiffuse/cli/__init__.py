@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli import bench, data, plan, planners, robot, simulate, train, view
+from robotdiffuse.cli import bench, data, plan, planners, robot, serve, simulate, train, view
 from robotdiffuse.errors import InputError
 
 SOLVED, NO_PLAN, BAD_INPUT, UNWRITTEN, STOPPED = 0, 1, 2, 3, 130
@@ -26,6 +26,7 @@ COMMANDS = (
     data.add,
     train.add,
     bench.add,
+    serve.add,
 )
 """Each adds one command to the parser and sets its function as `run`."""
 

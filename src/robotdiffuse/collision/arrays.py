@@ -12,6 +12,7 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.simd import W, by_sixteen
 from robotdiffuse.collision.near_pairs import no_tables, tabulate
 from robotdiffuse.collision.points import EMPTY, PointGrid, build_grid, cover, thin
+from robotdiffuse.deadline import check_time
 from robotdiffuse.robots.lever_arms import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
@@ -181,6 +182,10 @@ def _bounding_sphere(spheres: ndarray) -> ndarray:
     return np.append(centre, reach.max() + 1e-6)
 
 
+GRID_SECONDS = 7e-7
+"""That a point of meshes and clouds takes, about [s]."""
+
+
 @lru_cache(maxsize=8)
 def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
     """The arrays of a scene as far as the robot can get near it; those of the last few scenes are kept, since
@@ -237,13 +242,17 @@ def _solids(
 @lru_cache(maxsize=8)
 def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, radius: float) -> PointGrid:
     """The grid of point clouds and meshes; the same ones in another scene have the same."""
-    clouds = [
-        thin(shape.points, shape.point_radius, reach)
-        if isinstance(shape, PointCloud)
-        else cover(shape.mesh.world_vertices[shape.mesh.faces], reach)
-        for shape in shapes
-    ]
-    return build_grid(np.concatenate(clouds) if clouds else EMPTY, radius)
+    clouds: list[ndarray] = []
+    for i, shape in enumerate(shapes):
+        points = sum(map(len, clouds))
+        check_time(f"{len(shapes) - i} of {len(shapes)} meshes and clouds after {points:,} points")
+        if isinstance(shape, PointCloud):
+            clouds.append(thin(shape.points, shape.point_radius, reach))
+        else:
+            clouds.append(cover(shape.mesh.world_vertices[shape.mesh.faces], reach))
+    cloud = np.concatenate(clouds) if clouds else EMPTY
+    check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS * len(cloud))
+    return build_grid(cloud, radius)
 
 
 def _oriented(shape: Box | Cylinder | Capsule, half: ndarray, axes: tuple[int, ...], reach: float) -> ndarray:

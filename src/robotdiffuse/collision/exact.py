@@ -27,9 +27,10 @@ from robotdiffuse.collision.hulls import (
     solids_of,
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
+from robotdiffuse.deadline import check_time
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 from robotdiffuse.transforms import transform
 
 CHUNK = 8192
@@ -55,6 +56,10 @@ class _Piece(NamedTuple):
     frame: int
     T_frame_piece: Float[ndarray, "4 4"] | None
     """None: the geometry is in frame coordinates already."""
+
+
+TREE_SECONDS = 4e-6
+"""That a point or a triangle takes in Coal's tree, about [s]."""
 
 
 class _Obstacle(NamedTuple):
@@ -144,7 +149,22 @@ def _obstacle(solid: Solid) -> _Obstacle:
 @lru_cache(maxsize=16)
 def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
     """Kept for a few scenes: the tree over 100,000 points takes half a second."""
-    return tuple(map(_obstacle, solids_of(scene)))
+    obstacles: list[_Obstacle] = []
+    for solid in solids_of(scene):
+        count, what = _surfaces(solid.shape)
+        if count:
+            check_time(
+                f"the judge's tree over the {count:,} {what} of {solid.shape.name}", TREE_SECONDS * count
+            )
+        obstacles.append(_obstacle(solid))
+    return tuple(obstacles)
+
+
+def _surfaces(shape: Shape) -> tuple[int, str]:
+    """How many surfaces Coal sorts into a tree, and what they are."""
+    if isinstance(shape, PointCloud):
+        return len(shape.points), "points"
+    return (len(shape.mesh.faces), "triangles") if isinstance(shape, Triangulated) else (0, "")
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motion import finer
+from robotdiffuse.deadline import OutOfTimeError, deadline
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners.call import Call, Request
 from robotdiffuse.planners.ends import Ends, usable_ends
@@ -14,12 +15,12 @@ from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.settings import Settings
 from robotdiffuse.types import FIRST, SHORT
 
 Own = TypeVar("Own", bound=Settings)
-WARM_UP, SLIGHT = 1.0, 1e-3
+WARM_UP, SLIGHT = 1.0, 0.02
 """Limits of the calls of `warm_up`: easy ones, and the beginning of a search [s]."""
 CONSTRAINTS, CLEARANCE = "path constraints", "a clearance that is asked for"
 """What not every planner can keep."""
@@ -106,23 +107,30 @@ class Planner(ABC, Generic[Own]):
     def attempt(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
         """`plan` in the problem's scene as it is."""
         call = Call(self.name, problem, time_limit, seed, request)
-        ends = usable_ends(call)
-        return ends if isinstance(ends, PlanResult) else self.solve(call, ends)
+        with deadline(lambda: call.time_limit - call.elapsed):
+            try:
+                ends = usable_ends(call)
+                return ends if isinstance(ends, PlanResult) else self.solve(call, ends)
+            except OutOfTimeError as error:
+                return call.out_of_time(str(error))
 
     def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
         """Load the compiled code that calls on such a problem need, or compile it on a new machine, which
         takes about a minute; else the first call's time limit would have to do.
 
-        The results are of calls with nothing in the way, and with balls where the straight line is; the
-        problem itself is called on for a moment, for its kinds of obstacles.
+        The results are of calls with nothing in the way, and with balls where the straight line is, and of
+        a moment's with one small obstacle of each of the problem's kinds: its own scene is prepared within
+        the time of its own call.
         """
         robot, start, goal = problem.robot, problem.start, problem.goal
         first = goal.positions[:1] if isinstance(goal, JointGoal) else []
         ways = [start + share * (end - start) for end in first for share in (0.5, 0.35)]
         balls = [Sphere(link_pose(robot, q, robot.tip)[:3, 3], RADIUS) for q in ways]
-        problem = replace(problem, waypoints=(), moving=(), start_velocity=None)
+        kinds = replace(problem, waypoints=(), moving=(), start_velocity=None)
+        if not problem.views:
+            kinds = replace(kinds, scene=one_of_each(problem.scene))
         easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]
-        calls = [*((easier, WARM_UP) for easier in easy), (problem, SLIGHT)]
+        calls = [*((easier, WARM_UP) for easier in easy), (kinds, SLIGHT)]
         return [self.plan(task, seconds, until=until) for task, seconds in calls]
 
     def prepare(self, robot: Robot) -> None:
@@ -142,3 +150,15 @@ def ever_finer(call: Call, settings: Own) -> Iterator[tuple[Own, int]]:
         yield settings, attempt
         settings = replace(settings, resolution=finer(settings.resolution))  # type: ignore
         attempt += 1
+
+
+def one_of_each(scene: Scene) -> Scene:
+    """The first shape of each kind; of meshes and clouds a single triangle or point."""
+    shapes: dict[str, Shape] = {}
+    for shape in scene.shapes:
+        if isinstance(shape, Mesh):
+            shape = Mesh(shape.vertices[shape.faces[0]], [[0, 1, 2]], shape.xyz, shape.wxyz)
+        elif isinstance(shape, PointCloud):
+            shape = PointCloud(shape.points[:1], shape.point_radius)
+        shapes.setdefault(shape.kind, shape)
+    return Scene(list(shapes.values()))

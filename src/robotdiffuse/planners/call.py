@@ -9,12 +9,14 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.checks import LARGEST
 from robotdiffuse.collision.kernels.compiled import compile_seconds
+from robotdiffuse.deadline import OutOfTimeError
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.timing import DEFAULT, Pace, TimingSettings, time_parameterize
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
-from robotdiffuse.settings import Bound, NotNegative, OneOf, Positive, Settings
+from robotdiffuse.settings import Bound, OneOf, Positive, Settings
 from robotdiffuse.types import SHORT, UNTIL, Path, Status, Trajectory
 from robotdiffuse.verify import Report, Verifier, Violation, verifier
 
@@ -37,7 +39,7 @@ class Request(Settings):
     """What a call may ask for beyond its time limit and seed; see `planners.base.Planner.plan`."""
 
     until: Annotated[str, OneOf(UNTIL)] = SHORT
-    clearance: NotNegative | None = None
+    clearance: Annotated[float, Bound(least=0.0, most=LARGEST)] | None = None
     velocity_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
     acceleration_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
     jerk: Positive | None = None
@@ -77,7 +79,7 @@ class Call:
         self.notes = list(problem.notes)
         """What the result will say was changed or ignored; planners may add to it."""
         self._progress: list[tuple[float, float]] = []
-        self._refused = ""
+        self._refused = self._no_time_for = ""
 
     def improved(self, length: float) -> None:
         """Note that a path of this joint-space length [rad] was just found; longer ones are passed over."""
@@ -113,8 +115,8 @@ class Call:
 
     @property
     def remaining(self) -> float:
-        """Wall time left for searching [s]; negative when it has run out."""
-        return self.search_until - self.elapsed
+        """Wall time left for searching [s]; negative when it has run out, or is too short for the judge."""
+        return -1.0 if self._no_time_for else self.search_until - self.elapsed
 
     def fail(self, status: Status, reason: str) -> PlanResult:
         """A result without a motion."""
@@ -131,6 +133,8 @@ class Call:
 
     def unsolved(self, reason: str = "") -> PlanResult:
         """A result without a path: TIMEOUT if time has run out, else NO_PATH, for a search that ended."""
+        if self._no_time_for:
+            return self.out_of_time(self._no_time_for)
         if self.remaining <= 0:
             tried = (
                 f"no path was found in {self.elapsed:.2f} s; a longer time limit or another seed may find one"
@@ -138,6 +142,11 @@ class Call:
             return self.fail(Status.TIMEOUT, reason or tried)
         ended = f"the search ended after {self.elapsed:.2f} s without a path; another seed may find one"
         return self.fail(Status.NO_PATH, reason or ended)
+
+    def out_of_time(self, step: str) -> PlanResult:
+        """A result for a scene whose preparation takes longer than the call may."""
+        limit = f"the time limit of {self.time_limit:g} s is too short to prepare the scene"
+        return self.fail(Status.TIMEOUT, f"{limit}: there was no time for {step}")
 
     def finish(
         self,
@@ -153,7 +162,11 @@ class Call:
         `keeps` as in `time_parameterize`.
         """
         began = self.elapsed
-        result = self._finished(waypoints, stage, reason, notes, keeps)
+        try:
+            result = self._finished(waypoints, stage, reason, notes, keeps)
+        except OutOfTimeError as error:
+            self._no_time_for = str(error)
+            return None
         took = self.elapsed - began
         before = _finishing.get(self.problem.robot.name, took)
         _finishing[self.problem.robot.name] = before + 0.5 * (took - before)

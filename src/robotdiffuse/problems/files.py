@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from robotdiffuse.problems.problem import (
     check_clearance,
     moved_goal,
 )
-from robotdiffuse.reading import parse_json, parse_yaml, read_text, read_yaml
+from robotdiffuse.reading import no_files, parse_json, parse_yaml, read_text, read_yaml
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.depth_view import DepthView
@@ -161,9 +161,16 @@ def problem_record(
     return record
 
 
-def problem_from_record(record: object) -> Problem:
-    """The problem of `problem_record`; InputError as in `load_problem`."""
-    return _problem("problem", record, Path())
+def problem_from_record(record: object, robots: Mapping[str, Robot] | None = None) -> Problem:
+    """The problem of `problem_record`; InputError as in `load_problem`.
+
+    With `robots`, by their names, it may have no other robot, and no file that it names is read: for records
+    of people who may not read files here.
+    """
+    if robots is None:
+        return _problem("problem", record, Path())
+    with no_files():
+        return _problem("problem", record, Path(), robots)
 
 
 def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -> None:
@@ -270,13 +277,13 @@ def _requested(
     return Problem(robot, scene, start, JointGoal(goals), (), clearance, views, unseen)
 
 
-def _problem(where: str, data: object, folder: Path) -> Problem:
+def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot] | None = None) -> Problem:
     try:
         requested = isinstance(data, dict) and "request" in data
         values = check_fields(
             "problem", data, ("robot", "scene", "request") if requested else FIELDS, OPTIONAL
         )
-        robot = _robot(values["robot"], values.get("locked", {}), folder)
+        robot = _robot(values["robot"], values.get("locked", {}), folder, robots)
         robot, notes = equipped(robot, values.get("tool"), values.get("attached"), folder)
         base = read_pose("base", values["base"]) if "base" in values else None
         if base is not None and (requested or isinstance(values["scene"], str)):
@@ -318,7 +325,9 @@ def _problem(where: str, data: object, folder: Path) -> Problem:
         raise InputError(f"{where}: {error}") from None
 
 
-def _robot(name: object, locked: object, folder: Path) -> Robot:
+def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robot] | None = None) -> Robot:
+    if robots is not None and (not isinstance(name, str) or name not in robots):
+        raise unknown_name("robot", name, robots)
     if not isinstance(name, str) or not name:
         raise InputError(
             f"robot is {shown(name)}; it must be a bundled name ({', '.join(ROBOTS)}) or a URDF file"
@@ -333,4 +342,4 @@ def _robot(name: object, locked: object, folder: Path) -> Robot:
         if not isinstance(joint, str) or array is None or array.ndim != 0:
             raise InputError(f"locked: {shown(joint)} is {shown(value)}; it must be a number")
         values[joint] = float(array)
-    return load_robot(name, locked=values)
+    return load_robot(name, locked=values) if robots is None else robots[name].with_locked(values)

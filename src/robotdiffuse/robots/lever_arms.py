@@ -1,5 +1,7 @@
 """Lever arms: how far a link can be from the axis of a joint, for bounds on motions."""
 
+from functools import lru_cache
+
 import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
@@ -94,10 +96,15 @@ def _carry(robot: Robot, j: int) -> _Carry:
     return _interpolation(_directions() @ robot.frame_offsets[j][:3, :3])
 
 
-@once_per_robot
 def _carried(robot: Robot) -> tuple[_Carry, ...]:
-    """Of all joints; kept only of arms that hold something, for each new object asks for them (1 MB each)."""
-    return tuple(_carry(robot, j) for j in range(robot.dof))
+    """Of all joints; kept only of arms that hold something, for each new object asks for them."""
+    return tuple(_kept_carry(robot.frame_offsets[j][:3, :3].tobytes()) for j in range(robot.dof))
+
+
+@lru_cache(maxsize=64)
+def _kept_carry(rotation: bytes) -> _Carry:
+    """1 MB; the same for an arm however its fingers are locked."""
+    return _interpolation(_directions() @ np.frombuffer(rotation).reshape(3, 3))
 
 
 def _turned(

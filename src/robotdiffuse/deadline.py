@@ -1,0 +1,34 @@
+"""The time that a call has left, for steps far below it that may take longer: the preparation of a scene."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+LONG = 0.2
+"""Steps that are shorter are begun with any time that is left [s]."""
+_left: ContextVar[Callable[[], float] | None] = ContextVar("left", default=None)
+
+
+class OutOfTimeError(Exception):
+    """Which step there was no time for, in words."""
+
+
+@contextmanager
+def deadline(left: Callable[[], float]) -> Iterator[None]:
+    """`check_time` holds by what `left` says [s] while this lasts."""
+    before = _left.set(left)
+    try:
+        yield
+    finally:
+        _left.reset(before)
+
+
+def check_time(step: str, seconds: float = 0.0) -> None:
+    """Raises OutOfTimeError where the time of a deadline has run out before a step, or will before the end of
+    one that is long: it takes about so many seconds."""
+    left = _left.get()
+    remaining = float("inf") if left is None else left()
+    if remaining <= 0:
+        raise OutOfTimeError(step)
+    if seconds > max(LONG, remaining):
+        raise OutOfTimeError(f"{step}, which takes about {seconds:.1f} s")

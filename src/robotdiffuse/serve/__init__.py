@@ -1,0 +1,1 @@
+"""Planning over HTTP: `robotdiffuse serve`. Worker processes plan, one process listens."""

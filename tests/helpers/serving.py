@@ -1,0 +1,45 @@
+"""`robotdiffuse serve` in a process of its own, which knows a planner that fails in every way."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+
+ROOT = Path(__file__).parents[2]
+
+
+@contextmanager
+def serving(*arguments: str, **environment: str) -> Iterator[tuple[httpx.Client, subprocess.Popen]]:
+    """A client of a server that is ready, and its process, which ends afterwards."""
+    paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "helpers.serving", "serve", "--port", "0", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env=os.environ | {"PYTHONPATH": paths} | environment,
+    )
+    try:
+        assert process.stdout is not None
+        found = re.search(r"http://[^;]+", process.stdout.readline())
+        assert found is not None and "ready" in process.stdout.readline()
+        with httpx.Client(base_url=found.group(), timeout=60.0) as client:
+            yield client, process
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+
+
+if __name__ == "__main__":
+    from helpers.faulty_planner import ENTRY
+    from robotdiffuse.cli import main
+    from robotdiffuse.planners import PLANNERS
+
+    PLANNERS["faulty"] = ENTRY
+    sys.exit(main())

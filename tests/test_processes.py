@@ -1,0 +1,62 @@
+"""Processes that plan for another: a new one for one that died, and none that outlives it."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+import pytest
+
+from robotdiffuse.processes import LoneWorker
+
+ROOT = Path(__file__).parents[1]
+HELD = 60
+"""Longer than a worker may outlive its parent [s]."""
+
+
+def nothing() -> None:
+    pass
+
+
+def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
+    worker = LoneWorker(nothing, ())
+    try:
+        first = worker.call(os.getpid)
+        with pytest.raises(BrokenProcessPool):
+            worker.call(os.kill, first, signal.SIGKILL)
+        second = worker.call(os.getpid)
+        worker.end(signal.SIGKILL)
+        third = worker.call(os.getpid)
+        assert len({first, second, third, os.getpid()}) == 4
+        sent = worker.submit(time.sleep, HELD)
+        worker.send(signal.SIGTERM)
+        with pytest.raises(BrokenProcessPool):
+            sent.result(HELD)
+    finally:
+        worker.close()
+    with pytest.raises(BrokenProcessPool, match="closed"):
+        worker.call(os.getpid)
+
+
+@pytest.mark.skipif(not hasattr(os, "O_ASYNC"), reason="the system cannot tell of a pipe that closes")
+def test_a_worker_in_compiled_code_does_not_outlive_a_parent_that_is_killed() -> None:
+    paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
+    with subprocess.Popen(
+        [sys.executable, "-m", "helpers.deaf_worker", str(HELD)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": paths},
+    ) as parent:
+        assert parent.stdout is not None
+        worker = Path("/proc", parent.stdout.readline().strip())
+        assert parent.stdout.readline() == "begun\n" and worker.exists()
+        time.sleep(0.5)  # for the call to begin
+        parent.kill()
+        until = time.monotonic() + HELD / 4
+        while worker.exists():
+            assert time.monotonic() < until, "it lives as long as its call"
+            time.sleep(0.02)
