@@ -32,6 +32,8 @@ CHAIN = (
     "paths",
 )
 BELOW: dict[str, set[str]] = {room: set(CHAIN[: i + 1]) for i, room in enumerate(CHAIN)}
+BELOW["certificates"] = {*CHAIN, "certificates"}
+BELOW["handover"] = {*CHAIN, "certificates", "handover"}
 BELOW["data"] = {*CHAIN[: CHAIN.index("problems") + 1], "data"}
 BELOW["learning"] = {*BELOW["data"], "learning"}
 BELOW["planners"] = {*CHAIN, "data", "learning", "planners"}

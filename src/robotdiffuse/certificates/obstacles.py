@@ -1,0 +1,160 @@
+"""Distances of points to obstacles, and how far obstacles reach in a direction: the checker's own."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
+from robotdiffuse.transforms import rotation_from_quaternion
+
+CAP = 1.0
+"""Clearances are not told apart beyond this [m]."""
+MOST = 1_000_000
+"""Numbers in an array at a time."""
+
+
+class Rounded(NamedTuple):
+    """The sum of a box, a disc about its z axis and a ball: a sphere, box, cylinder or capsule."""
+
+    center: Float[ndarray, "3"]
+    R: Float[ndarray, "3 3"]
+    half: Float[ndarray, "3"]
+    disc: float
+    rounding: float
+
+    def reach(self, n: Float[ndarray, "k 3"]) -> Float[ndarray, "k"]:
+        """The greatest n x of its points x, for unit vectors n."""
+        local = n @ self.R
+        across = np.hypot(local[:, 0], local[:, 1])
+        return n @ self.center + np.abs(local) @ self.half + self.disc * across + self.rounding
+
+
+class Surface(NamedTuple):
+    """Triangles, or points, each with a ball of a radius about all its points."""
+
+    corners: Float[ndarray, "m 1|3 3"]
+    radius: float
+
+    def reach(self, n: Float[ndarray, "k 3"]) -> Float[ndarray, "m k"]:
+        """The same of each of its elements."""
+        return (self.corners @ n.T).max(axis=1) + self.radius
+
+
+class Obstacles:
+    """The obstacles of a scene."""
+
+    def __init__(self, scene: Scene) -> None:
+        """Raises InputError for a shape that certificates do not know."""
+        shapes = [s for s in scene.shapes if not (isinstance(s, PointCloud) and len(s.points) == 0)]
+        self.names = tuple(shape.name for shape in shapes)
+        self.bodies: tuple[Rounded | Surface, ...] = tuple(map(_body, shapes))
+        rounded = [(i, body) for i, body in enumerate(self.bodies) if isinstance(body, Rounded)]
+        self._at = np.array([i for i, _ in rounded], int)
+        self._centers = np.array([body.center for _, body in rounded]).reshape(-1, 3)
+        self._R = np.array([body.R for _, body in rounded]).reshape(-1, 3, 3)
+        self._half = np.array([body.half for _, body in rounded]).reshape(-1, 3)
+        self._disc = np.array([body.disc for _, body in rounded])
+        self._rounding = np.array([body.rounding for _, body in rounded])
+        self._nearest = {i: _nearest(body) for i, body in enumerate(self.bodies) if isinstance(body, Surface)}
+
+    def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n obstacles"]:
+        """How far points are from each obstacle [m], at most CAP; 0 or less inside."""
+        found = np.full((len(points), len(self.bodies)), CAP)
+        step = max(MOST // max(3 * len(self._at), 1), 1)
+        for first in range(0, len(points), step):
+            some = slice(first, first + step)
+            found[some, self._at] = np.minimum(self._to_rounded(points[some]), CAP)
+        for i, nearest in self._nearest.items():
+            found[:, i] = nearest(points)
+        return found
+
+    def _to_rounded(self, points: ndarray) -> ndarray:
+        local = np.abs(np.einsum("nod,ode->noe", points[:, None] - self._centers, self._R))
+        out = np.maximum(local - self._half, 0.0)
+        # a disc: what is beyond the box across the axis, less its radius
+        across = np.maximum(np.hypot(out[..., 0], out[..., 1]) - self._disc, 0.0)
+        return np.hypot(across, out[..., 2]) - self._rounding
+
+
+def _body(shape: Shape) -> Rounded | Surface:
+    zero, eye = np.zeros(3), np.eye(3)
+    match shape:
+        case Sphere():
+            return Rounded(shape.center, eye, zero, 0.0, shape.radius)
+        case Box():
+            return Rounded(shape.center, rotation_from_quaternion(shape.wxyz), shape.size / 2, 0.0, 0.0)
+        case Cylinder() | Capsule():
+            half, R = np.array([0.0, 0.0, shape.height / 2]), rotation_from_quaternion(shape.wxyz)
+            round_ends = isinstance(shape, Capsule)
+            disc, rounding = (0.0, shape.radius) if round_ends else (shape.radius, 0.0)
+            return Rounded(shape.center, R, half, disc, rounding)
+        case PointCloud():
+            return Surface(shape.points[:, None], shape.point_radius)
+        case Triangulated():
+            mesh = shape.mesh
+            vertices = mesh.vertices @ rotation_from_quaternion(mesh.wxyz).T + mesh.xyz
+            return Surface(vertices[mesh.faces], 0.0)
+        case _:
+            raise InputError(f"{shape.name}: a {type(shape).__name__} cannot be certified")
+
+
+def _nearest(surface: Surface) -> Callable[[ndarray], ndarray]:
+    from scipy.spatial import KDTree  # half of what importing the checker takes
+
+    if surface.corners.shape[1] == 1:
+        tree = KDTree(surface.corners[:, 0])
+        return lambda points: np.minimum(
+            tree.query(points, distance_upper_bound=CAP + surface.radius)[0] - surface.radius, CAP
+        )
+    classes = tuple((KDTree(middles), of, size) for middles, of, size in _by_size(surface.corners))
+
+    def nearest(points: ndarray) -> ndarray:
+        """To the next triangle: no further than the next middle of one."""
+        far = np.full(len(points), CAP)
+        for tree, _, _ in classes:
+            far = np.minimum(far, tree.query(points)[0])
+        found = far.copy()
+        for tree, triangles, size in classes:
+            near = tree.query_ball_point(points, far + size)
+            counts = np.array([len(rows) for rows in near], int)
+            if not counts.any():
+                continue
+            rows, which = np.repeat(np.arange(len(points)), counts), np.concatenate(near).astype(int)
+            for first in range(0, len(rows), MOST // 9):
+                some = slice(first, first + MOST // 9)
+                np.minimum.at(found, rows[some], _to_triangles(points[rows[some]], triangles[which[some]]))
+        return found
+
+    return nearest
+
+
+def _by_size(triangles: Float[ndarray, "m 3 3"]) -> Iterator[tuple[ndarray, ndarray, float]]:
+    """Triangles of about one size: their middles, they themselves, and the radius of balls about the middles
+    that hold them."""
+    middles = triangles.mean(axis=1)
+    sizes = np.sqrt(((triangles - middles[:, None]) ** 2).sum(axis=-1)).max(axis=1)
+    octaves = np.ceil(np.log2(np.maximum(sizes, 1e-6))).astype(int)
+    for octave in np.unique(octaves):
+        of = octaves == octave
+        yield middles[of], triangles[of], float(sizes[of].max())
+
+
+def _to_triangles(p: Float[ndarray, "n 3"], triangles: Float[ndarray, "n 3 3"]) -> Float[ndarray, "n"]:
+    """From each point to its triangle: to the plane if the foot is within, else to an edge."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal = np.cross(b - a, c - a)
+    area = np.sqrt((normal**2).sum(axis=1))
+    within, distance = area > 0, np.full(len(p), np.inf)
+    for start, stop in ((a, b), (b, c), (c, a)):
+        edge, out = stop - start, p - start
+        within &= (np.cross(edge, out) * normal).sum(axis=1) >= 0
+        length2 = np.maximum((edge**2).sum(axis=1), 1e-300)
+        share = np.clip((edge * out).sum(axis=1) / length2, 0.0, 1.0)
+        distance = np.minimum(distance, np.sqrt(((out - share[:, None] * edge) ** 2).sum(axis=1)))
+    height = np.abs(((p - a) * normal).sum(axis=1)) / np.where(area > 0, area, 1.0)
+    return np.where(within, np.minimum(height, distance), distance)
