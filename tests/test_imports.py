@@ -52,6 +52,12 @@ EXTRAS = {
     "accelerate": {"learning"},
     "viser": {"viewer"},
     "matplotlib": {"evaluation"},
+    "foxglove_schemas_protobuf": {"handover"},
+    "mcap": {"handover"},
+    "mcap_protobuf": {"handover"},
+    "rerun": {"handover"},
+    "rosbags": {"handover"},
+    "roslibpy": {"handover"},
     "pinocchio": set(),
     "example_robot_data": set(),
 }

@@ -107,6 +107,8 @@ class Report:
     motion, at most 1 m. None for an invalid motion."""
     self_clearance: float | None
     """The same to the links that it is checked against."""
+    found: tuple[Violation, ...] = ()
+    """All that was seen to be wrong, the first of its kind; see `violations` for every contact."""
 
     @property
     def min_clearance(self) -> float | None:
@@ -204,7 +206,7 @@ class Verifier:
         sweep = self._continuous.sweep(q[: last + 1])
         collision = None
         if sweep.contact is not None:
-            collision = _collision(
+            collision = collision_violation(
                 sweep.contact, float(np.interp(sweep.contact.at, np.arange(len(clock)), clock))
             )
         ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
@@ -212,7 +214,7 @@ class Verifier:
         violation = min(every, key=lambda v: v.time, default=None)
         valid = violation is None
         scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
-        return Report(valid, violation, scene, itself)
+        return Report(valid, violation, scene, itself, tuple(dict.fromkeys((*found, *every))))
 
     def _start(self, q: ndarray) -> Violation | None:
         difference = np.abs(q[0] - self.problem.start)
@@ -357,7 +359,8 @@ def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
     return Verifier(problem, settings)
 
 
-def _collision(contact: Contact, time: float) -> Violation:
+def collision_violation(contact: Contact, time: float) -> Violation:
+    """A contact as a violation at a time."""
     (link, pair), other = contact.check, contact.other
     kind = "scene_collision" if pair is None else "self_collision"
     message = describe_contact(link, other, contact.depth, pair is not None)
