@@ -29,6 +29,7 @@ CHAIN = (
     "problems",
     "rates",
     "verify",
+    "violations",
     "paths",
 )
 BELOW: dict[str, set[str]] = {room: set(CHAIN[: i + 1]) for i, room in enumerate(CHAIN)}

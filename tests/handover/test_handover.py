@@ -125,11 +125,16 @@ def test_joint_states_are_a_motion_too(planned: tuple[Problem, Trajectory], tmp_
 
 
 def test_rerun_recordings_hold_the_joints(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
-    from rerun.experimental import RrdReader
+    from rerun.chunk import RrdReader
 
-    write_motion(*planned, tmp_path / "m.rrd")
-    assert (tmp_path / "m.rrd").read_bytes()[:3] == b"RRF"
-    del RrdReader
+    problem, trajectory = planned
+    write_motion(problem, trajectory, tmp_path / "m.rrd")
+    chunks = {str(chunk.entity_path): chunk for chunk in RrdReader(tmp_path / "m.rrd").stream().to_chunks()}
+    assert {"/scene/ball", "/scene/capsule", "/scene/mesh", "/robot/panda_link5"} <= chunks.keys()
+    for j, name in enumerate(trajectory.joint_names):
+        batch = chunks[f"/joints/{name}/positions"].to_record_batch()
+        values = [row[0] for row in batch.column("Scalars:scalars").to_pylist()]
+        np.testing.assert_array_equal(values, trajectory.positions[:, j])
 
 
 def panda_record(**changes: Any) -> dict[str, Any]:
