@@ -19,7 +19,7 @@ robot, exact = problem.robot, ExactCollision(problem.robot, problem.scene)
 
 
 def plan(seed: int) -> rd.Path:
-    """By OMPL's RRT-Connect, with motions checked at states 3 % of the space's extent apart (default: 1 %)."""
+    """By RRT-Connect of OMPL; motions are checked every 3 % of the space's extent (by default 1 %)."""
     ou.RNG.setSeed(seed + 1)
     space = ob.RealVectorStateSpace(robot.dof)
     bounds = ob.RealVectorBounds(robot.dof)
