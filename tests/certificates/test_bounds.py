@@ -128,6 +128,32 @@ def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
         assert np.linalg.norm(centers[1:] - centers[0], axis=-1).max() <= displacement + 1e-12
 
 
+@given(st.integers(0, 10_000))
+def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> None:
+    """Vertices of the hand along a bent path, seen from the base and from a link between."""
+    rng = np.random.default_rng(seed)
+    robot = load_robot("panda")
+    linkage, link = Linkage(robot), "panda_hand"
+    middle = rng.uniform(robot.lower, robot.upper)
+    steps = rng.normal(0, 0.1, (4, robot.dof)) * rng.integers(0, 2, robot.dof)
+    normals = rng.normal(size=(2, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    share = rng.uniform(0, 1, (40, 1))
+    at = middle + np.concatenate([share * steps[0], steps[0] + share * (steps[1] - steps[0]), steps])
+    places = linkage.place(np.concatenate([middle[None], at]))
+    k = linkage.links.index(link)
+    [mesh, *_] = robot.meshes[link]
+    for base in (0, linkage.links.index("panda_link4")):
+        # where the hand comes to stand, as seen from where the base stands in the middle
+        T = places.T[0, base] @ np.linalg.inv(places.T[:, base]) @ places.T[:, k]
+        points = mesh.vertices @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        moved_by = range(int(linkage.levels[base]), int(linkage.levels[k]))
+        origins, axes = places.origins[0], places.axes[0]
+        bound = linkage.approach(origins, axes, points[0], moved_by, steps, normals)
+        went = (points[0] - points) @ normals.T
+        assert (bound + 1e-12 >= went.max(axis=0).T).all()
+
+
 def test_sphere_clearances_are_distances_of_the_placed_spheres() -> None:
     robot, scene = load_robot("panda"), Scene([Sphere([0.5, 0.2, 0.5], 0.1)])
     q = np.zeros((1, robot.dof)) + (robot.lower + robot.upper) / 2

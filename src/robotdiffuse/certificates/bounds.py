@@ -143,7 +143,9 @@ class Prover:
                 clearance[rows], displacement[rows] = found
         marked = np.flatnonzero(by_planes)
         if len(marked):
-            clearance[marked] = self._by_planes(stretches, marked, planes, postures, which)
+            ways = [_steps(self, *ends[k]) for k in which[marked]]
+            found = self._by_planes(stretches, marked, planes, postures, which, ways, displacement[marked])
+            clearance[marked], displacement[marked] = found
         return Bounds(clearance, displacement)
 
     def _expand(self, links: ndarray) -> tuple[ndarray, ndarray, ndarray]:
@@ -189,14 +191,21 @@ class Prover:
         return found
 
     def _by_planes(
-        self, stretches: Stretches, marked: ndarray, planes: list[Plane], postures: Postures, which: ndarray
-    ) -> Float[ndarray, "marked"]:
+        self,
+        stretches: Stretches,
+        marked: ndarray,
+        planes: list[Plane],
+        postures: Postures,
+        which: ndarray,
+        ways: list[ndarray],
+        displacement: ndarray,
+    ) -> tuple[ndarray, ndarray]:
         """Of each part to each obstacle, or part of the other link, the clearance of the balls about them, or
-        the widest gap that a plane shows; of these the least."""
+        the widest gap that a plane shows, and what is left of it along the stretch; of these the least."""
         normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
         for plane in planes:
             normals.setdefault(plane[:3], []).append(plane.normal)
-        least = np.full(len(marked), CAP)
+        least, left = np.full(len(marked), CAP), np.full(len(marked), CAP)
         places = [(self.claims[stretches.claim[i]], postures.T[which[i]]) for i in marked]
         standing = [placed(self.parts[claim.link], T[self._of[claim.link]]) for claim, T in places]
         in_scene = [k for k, (claim, _) in enumerate(places) if claim.against == SCENE]
@@ -204,21 +213,30 @@ class Prover:
         to_scene = iter(self.obstacles.distances(np.array(centers).reshape(-1, 3)))
         for k, (claim, T) in enumerate(places):
             bodies = self.others(claim, T)
+            base = 0 if claim.against == SCENE else int(self._levels[self._of[claim.against]])
+            moved_by = range(base, int(self._levels[self._of[claim.link]]))
+            at = which[marked[k]]
             for p, part in enumerate(standing[k]):
                 if claim.against == SCENE:
                     apart = next(to_scene) - part.radius
                 else:
                     apart = self.balls_apart(part, bodies)
-                apart = apart.copy()
+                apart, along = apart.copy(), apart - displacement[k]
                 for o, body in enumerate(bodies):
                     shown = normals.get((int(marked[k]), p, o))
                     if shown is not None:
                         n = np.array(shown)
                         n /= np.sqrt((n**2).sum(axis=1, keepdims=True))
+                        nearer = self.linkage.approach(
+                            postures.origins[at], postures.axes[at], part.vertices, moved_by, ways[k], n
+                        )
                         widest = gaps(part, body, n).max(axis=-1)
+                        remaining = gaps(part, body, n, nearer).max(axis=-1)
+                        along[o] = np.maximum(along[o], remaining).min()
                         apart[o] = np.maximum(apart[o], widest).min()
                 least[k] = min(least[k], apart.min(initial=CAP))
-        return least
+                left[k] = min(left[k], along.min(initial=CAP))
+        return least, least - left
 
     def others(self, claim: Claim, T: ndarray) -> Sequence[Rounded | Surface | Part]:
         """What a link is checked against."""
@@ -235,11 +253,23 @@ class Prover:
         return np.sqrt(((part.center - centers) ** 2).sum(axis=1)) - part.radius - radii
 
 
+def _steps(prover: Prover, start: float, stop: float) -> Float[ndarray, "rows dof"]:
+    """Where a stretch begins, turns and ends, from its middle."""
+    inner = np.arange(int(np.floor(start)) + 1, int(np.ceil(stop)))
+    ends = prover.at(np.array([start, (start + stop) / 2, stop]))
+    return np.concatenate([ends[[0, 2]], prover.q[inner]]) - ends[1]
+
+
 def gaps(
-    part: Part, body: Rounded | Surface | Part, normals: Float[ndarray, "k 3"]
+    part: Part,
+    body: Rounded | Surface | Part,
+    normals: Float[ndarray, "k 3"],
+    nearer: Float[ndarray, "k v"] | None = None,
 ) -> Float[ndarray, "*elements k"]:
-    """How far unit vectors part them [m]; of a surface, each of its elements."""
-    nearest = (part.vertices @ normals.T).min(axis=0) - part.rounding
+    """How far unit vectors part them [m]; of a surface, each of its elements. With `nearer`, when the part's
+    vertices have gone so far against them."""
+    heights = normals @ part.vertices.T
+    nearest = (heights if nearer is None else heights - nearer).min(axis=1) - part.rounding
     if isinstance(body, Part):
         return nearest - (body.vertices @ normals.T).max(axis=0) - body.rounding
     return nearest - body.reach(normals)

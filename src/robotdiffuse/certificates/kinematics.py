@@ -84,6 +84,36 @@ class Linkage:
             went += np.where((seen_from <= j) & (j < levels), spans[rows, j] * arm, 0.0)
         return went
 
+    def approach(
+        self,
+        origins: Float[ndarray, "dof 3"],
+        axes: Float[ndarray, "dof 3"],
+        points: Float[ndarray, "v 3"],
+        moved_by: range,
+        steps: Float[ndarray, "rows dof"],
+        normals: Float[ndarray, "k 3"],
+    ) -> Float[ndarray, "k v"]:
+        """How far points go against unit vectors at most [m], when joints leave their posture for anything on
+        the straight lines through `steps` from it; only the joints `moved_by` count.
+
+        To first order a point goes along the normal as a linear function of the joints, whose least value is
+        at one of the steps. The rest is at most sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), where the joints'
+        second derivatives of the point, by j <= k, are at most its greatest distance L_k from axis k.
+        """
+        which, spans = list(moved_by), np.abs(steps).max(axis=0)
+        rates = np.cross(axes[which, None], points[None] - origins[which, None])
+        rates[self.slides[which]] = axes[which, None][self.slides[which]]
+        lengths = np.sqrt((rates**2).sum(axis=2))
+        along = np.moveaxis(rates @ normals.T, 2, 1).reshape(len(which), -1)
+        towards = -(steps[:, which] @ along).min(axis=0).reshape(len(normals), len(points))
+        went, rest = np.zeros(len(points)), np.zeros(len(points))
+        for i in reversed(range(len(which))):
+            j = which[i]
+            arm = lengths[i] if self.slides[j] else lengths[i] + went
+            went = went + spans[j] * arm
+            rest += spans[j] * arm * (spans[j] / 2 + spans[which[:i]].sum())
+        return np.minimum(np.maximum(towards, 0.0) + rest, went)
+
 
 def _motion(kind: str, axis: Float[ndarray, "3"], q: Float[ndarray, "n"]) -> Float[ndarray, "n 4 4"]:
     T = np.tile(np.eye(4), (len(q), 1, 1))

@@ -55,8 +55,9 @@ class Obstacles:
         self.bodies: tuple[Rounded | Surface, ...] = tuple(map(_body, shapes))
         rounded = [(i, body) for i, body in enumerate(self.bodies) if isinstance(body, Rounded)]
         self._at = np.array([i for i, _ in rounded], int)
-        self._centers = np.array([body.center for _, body in rounded]).reshape(-1, 3)
-        self._R = np.array([body.R for _, body in rounded]).reshape(-1, 3, 3)
+        # into the frames of all bodies at once
+        self._turns = np.concatenate([np.zeros((3, 0)), *(body.R for _, body in rounded)], axis=1)
+        self._shifts = np.concatenate([np.zeros(0), *(body.center @ body.R for _, body in rounded)])
         self._half = np.array([body.half for _, body in rounded]).reshape(-1, 3)
         self._disc = np.array([body.disc for _, body in rounded])
         self._rounding = np.array([body.rounding for _, body in rounded])
@@ -74,8 +75,8 @@ class Obstacles:
         return found
 
     def _to_rounded(self, points: ndarray) -> ndarray:
-        local = np.abs(np.einsum("nod,ode->noe", points[:, None] - self._centers, self._R))
-        out = np.maximum(local - self._half, 0.0)
+        local = (points @ self._turns - self._shifts).reshape(len(points), -1, 3)
+        out = np.maximum(np.abs(local) - self._half, 0.0)
         # a disc: what is beyond the box across the axis, less its radius
         across = np.maximum(np.hypot(out[..., 0], out[..., 1]) - self._disc, 0.0)
         return np.hypot(across, out[..., 2]) - self._rounding

@@ -28,7 +28,7 @@ MOST_PARTS = 8
 """A stretch is cut into at most this many at a time."""
 PLANES_BELOW = 0.02
 """Sphere clearance [m] below which planes are looked for: spheres stick out by about as much."""
-DISPLACED = 0.03
+DISPLACED = 0.1
 """Longest displacement of stretches that planes are looked for [m]."""
 SPARE = 2e-6
 """What is left over at least, for rounding [m]."""
@@ -121,9 +121,11 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
         if close.any():
             rows = np.flatnonzero(close)
             planes = tools.planes(todo, rows, displacement[rows] + target[rows])
-            better = _down(prover.bounds(todo, close, planes).clearance)
-            clearance = np.where(close, np.maximum(better, clearance), clearance)
-            by_planes = close & (better >= clearance)
+            again = prover.bounds(todo.some(rows), np.ones(len(rows), bool), _renumbered(planes, rows))
+            better, less = _down(again.clearance), _up(again.displacement)
+            by_planes[rows] = better - less > clearance[rows] - displacement[rows]
+            chosen = by_planes[rows]
+            clearance[rows[chosen]], displacement[rows[chosen]] = better[chosen], less[chosen]
         proved = clearance - displacement >= target
         done.append(_kept(todo, proved, by_planes, clearance, displacement, planes))
         total += n
@@ -131,6 +133,11 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
             raise InputError(f"no proof of less than {MOST_STRETCHES:,} stretches was found for the motion")
         todo = _cut(todo, clearance, displacement, target, ~proved)
     return _joined(prover, done)
+
+
+def _renumbered(planes: list[Plane], rows: ndarray) -> list[Plane]:
+    number = {row: k for k, row in enumerate(rows.tolist())}
+    return [plane._replace(stretch=number[plane.stretch]) for plane in planes]
 
 
 def _kept(
@@ -155,7 +162,9 @@ def _cut(
 ) -> Stretches:
     """Those that are not proved, in as many parts as their displacement asks for."""
     spare = np.maximum(clearance - target, displacement / MOST_PARTS)
-    parts = np.clip(np.ceil(1.2 * displacement / spare), 2, MOST_PARTS).astype(int)
+    # where spheres are too near, until planes may help
+    asked = np.where(clearance < PLANES_BELOW, displacement / DISPLACED, 1.2 * displacement / spare)
+    parts = np.clip(np.ceil(asked), 2, MOST_PARTS).astype(int)
     claims, starts, stops = [], [], []
     for i in np.flatnonzero(which).tolist():
         low, high, n = float(todo.start[i]), float(todo.stop[i]), int(parts[i])
