@@ -22,6 +22,8 @@ COUNTS = {
     "urdf": 400,
     "result": 400,
     "bundle": 100,
+    "motion": 120,
+    "certificate": 250,
 }
 
 

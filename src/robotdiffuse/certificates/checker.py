@@ -20,12 +20,6 @@ from robotdiffuse.types import Path, Trajectory
 
 AGREEMENT = 1e-6
 """Bounds may be this far from what a certificate says [m]: they are rounded there."""
-NOT_PROVED = (
-    "that velocities and accelerations are those of the positions to more than their limits",
-    "stops at waypoints",
-    "the absence of twitching",
-)
-"""What the judge looks at and certificates leave to it."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +38,8 @@ def check(certificate: Certificate, problem: Problem | None = None) -> Findings:
     """Re-check a certificate for a problem, by default the one that it holds.
 
     Robot, scene and motion must be those that were certified, by content; the motion must keep the limits,
-    begin at the start and end at the goal; and every stretch must be proved. Raises InputError for a
+    begin at the start and end at the goal; and every stretch must be proved. Stops at waypoints, twitching,
+    and whether rates agree with positions beyond their limits are left to the judge. Raises InputError for a
     certificate without a problem where none is given, and for shapes that certificates do not know.
     """
     if problem is None:

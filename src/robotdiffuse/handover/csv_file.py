@@ -1,7 +1,6 @@
 """CSV: a column for each joint, and time."""
 
 import csv
-import io
 from pathlib import Path
 
 from robotdiffuse.errors import InputError, shown
@@ -23,7 +22,10 @@ def read(file: Path, topic: str | None = None) -> Recorded:
 
 
 def _read(text: str) -> Recorded:
-    rows = [row for row in csv.reader(io.StringIO(text)) if any(cell.strip() for cell in row)]
+    try:
+        rows = [row for row in csv.reader(text.splitlines()) if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise InputError(f"it is not valid CSV: {error}") from None
     if not rows:
         raise InputError("it is empty; it must have a header and rows of numbers")
     header = [cell.strip() for cell in rows[0]]

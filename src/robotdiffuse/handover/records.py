@@ -80,7 +80,7 @@ def _joint_trajectory(record: Mapping[str, Any]) -> Recorded:
 
 
 def _list(value: Any) -> list[Any]:
-    return [] if value is None else list(value) if not isinstance(value, str | Mapping) else [value]
+    return [] if value is None else list(value) if isinstance(value, list | tuple) else [value]
 
 
 def _seconds(where: str, value: Any) -> float:
