@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -12,7 +12,7 @@ import trimesh
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from robotdiffuse.certificates.certificate import Certificate, load_certificate
+from robotdiffuse.certificates.certificate import Certificate, Tolerances, load_certificate
 from robotdiffuse.certificates.writer import NotValidError, certify
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.errors import InputError
@@ -21,7 +21,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.types import Path
-from robotdiffuse.verify import verify
+from robotdiffuse.verify import VerifySettings, verify
 
 SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3], [0.6, 0.9, 0.3]])
 
@@ -178,8 +178,12 @@ def claimed_nothing(record: dict[str, Any]) -> None:
     record["self_clearance"] = 0.0
 
 
-def looser(record: dict[str, Any]) -> None:
+def tighter(record: dict[str, Any]) -> None:
     record["tolerances"]["chord"] = 1e-9
+
+
+def looser(record: dict[str, Any]) -> None:
+    record["tolerances"]["goal_tolerance"] = 0.5
 
 
 TAMPERED = {
@@ -195,7 +199,8 @@ TAMPERED = {
     removed_claim: r"proof: nothing is said of \w+ against",
     claimed_more: r"proof: \w+ against the scene from row [\d.]+ to row [\d.]+ is clear by [\d.]+ m, not by",
     claimed_nothing: "proof: a self clearance of 0 m is none",
-    looser: "motion: its cubics leave the straight lines that were certified",
+    looser: "tolerances: goal_tolerance is 0.5, looser than 0.0001",
+    tighter: "motion: its cubics leave the straight lines that were certified",
 }
 
 
@@ -250,6 +255,13 @@ def test_rates_are_checked_anew(planned: tuple[Problem, rd.PlanResult]) -> None:
     )
     found = certificate.check(replace(problem, robot=slower)).differences
     assert any("exceeds its limit of velocity" in line for line in found)
+
+
+def test_tolerances_are_those_of_the_judge() -> None:
+    """The checker does not import the judge."""
+    settings = VerifySettings()
+    for name, value in asdict(Tolerances()).items():
+        assert getattr(settings, name) == value
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.certificates.kinematics import Linkage, Postures
-from robotdiffuse.certificates.obstacles import CAP, MOST, Obstacles, Rounded, Surface
+from robotdiffuse.certificates.obstacles import BEYOND, CAP, MOST, Obstacles, Rounded, Surface
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -212,11 +212,11 @@ class Prover:
         centers = [part.center for k in in_scene for part in standing[k]]
         to_scene = iter(self.obstacles.distances(np.array(centers).reshape(-1, 3)))
         for k, (claim, T) in enumerate(places):
-            bodies = self.others(claim, T)
             base = 0 if claim.against == SCENE else int(self._levels[self._of[claim.against]])
             moved_by = range(base, int(self._levels[self._of[claim.link]]))
             at = which[marked[k]]
             for p, part in enumerate(standing[k]):
+                bodies = self.others(claim, T, part)
                 if claim.against == SCENE:
                     apart = next(to_scene) - part.radius
                 else:
@@ -232,16 +232,18 @@ class Prover:
                         )
                         widest = gaps(part, body, n).max(axis=-1)
                         remaining = gaps(part, body, n, nearer).max(axis=-1)
-                        along[o] = np.maximum(along[o], remaining).min()
-                        apart[o] = np.maximum(apart[o], widest).min()
+                        least_of, left_of = np.maximum(apart[o], widest), np.maximum(along[o], remaining)
+                        beyond = BEYOND if isinstance(body, Surface) else CAP
+                        apart[o] = max(apart[o], least_of.min(initial=beyond))
+                        along[o] = max(along[o], left_of.min(initial=beyond - displacement[k]))
                 least[k] = min(least[k], apart.min(initial=CAP))
                 left[k] = min(left[k], along.min(initial=CAP))
         return least, least - left
 
-    def others(self, claim: Claim, T: ndarray) -> Sequence[Rounded | Surface | Part]:
-        """What a link is checked against."""
+    def others(self, claim: Claim, T: ndarray, part: Part) -> Sequence[Rounded | Surface | Part]:
+        """What a part of a link is checked against; of surfaces, what is near."""
         if claim.against == SCENE:
-            return self.obstacles.bodies
+            return self.obstacles.near(part.center, part.radius)
         return placed(self.parts[claim.against], T[self._of[claim.against]])
 
     def balls_apart(self, part: Part, bodies: Sequence[Rounded | Surface | Part]) -> Float[ndarray, "bodies"]:

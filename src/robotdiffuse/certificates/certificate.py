@@ -30,21 +30,22 @@ FIELDS = ("claims", "start", "stop", "by_planes", "clearance", "displacement", "
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How exactly the motion was judged, as of `VerifySettings`; rates are shares of the robot's limits."""
+    """How exactly a motion was judged, as of `VerifySettings`, whose defaults these are."""
 
-    limit_slack: float
+    limit_slack: float = 1e-6
     """[rad] or [m]"""
-    start_tolerance: float
-    goal_tolerance: float
-    goal_distance: float
+    start_tolerance: float = 1e-6
+    goal_tolerance: float = 1e-4
+    goal_distance: float = 0.01
     """[m]"""
-    goal_angle: float
+    goal_angle: float = float(np.radians(15))
     """[rad]"""
-    goal_slack: float
-    rest: float
+    goal_slack: float = 1e-5
+    rest: float = 1e-6
     """[rad/s]"""
-    rate_slack: float
-    chord: float
+    rate_slack: float = 0.01
+    """Share of the robot's limits."""
+    chord: float = 1e-3
     """How far the cubics through the rows may leave the straight lines that were certified [rad] or [m]."""
 
 
@@ -86,11 +87,12 @@ class Certificate:
     problem: dict[str, Any] | None = None
     """As in a problem file, if the robot can be found again."""
 
-    def check(self, problem: "Problem | None" = None) -> "Findings":
-        """Re-check everything for a problem, by default the one that is in here. See `checker.check`."""
+    def check(self, problem: "Problem | None" = None, at_most: Tolerances | None = None) -> "Findings":
+        """Re-check everything for a problem, by default the one that is in here, with tolerances of at most
+        these, by default the judge's. See `checker.check`."""
         from robotdiffuse.certificates.checker import check
 
-        return check(self, problem)
+        return check(self, problem, at_most or Tolerances())
 
     def save(self, file: str | FilePath) -> None:
         """Write .json. Raises InputError for another ending or a file that cannot be written."""
@@ -109,7 +111,7 @@ def load_certificate(file: str | FilePath) -> Certificate:
         return _certificate(record)
     except InputError as error:
         raise InputError(f"{file}: {error}") from None
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise InputError(f"{file} is damaged: {type(error).__name__} {shown(str(error))}") from None
 
 
@@ -211,6 +213,8 @@ def _proof(record: list[dict[str, Any]]) -> Proof:
         for name, values in (("claim", np.full(count, k)), ("by_planes", marked), *found.items()):
             columns[name].append(values)
         for stretch, part, other, *normal in entry["planes"]:
+            if not 0 <= int(stretch) < count:
+                raise InputError(f"proof of {claims[-1].link}: there is no stretch {shown(stretch)}")
             plane = Plane(begin + int(stretch), int(part), int(other), tuple(map(float, normal)))  # type: ignore[arg-type]
             if len(normal) != 3 or not 0 < np.linalg.norm(normal) < np.inf:
                 raise InputError(f"proof of {claims[-1].link}: {shown(normal)} is no normal of a plane")

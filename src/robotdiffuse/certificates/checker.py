@@ -6,18 +6,19 @@ leave something over. So a certificate that passes is a proof, whoever wrote it.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
 from robotdiffuse.certificates.bounds import CAP, SCENE, Claim, Prover
-from robotdiffuse.certificates.certificate import Certificate
+from robotdiffuse.certificates.certificate import Certificate, Tolerances
 from robotdiffuse.certificates.content import differences, motion_hash, robot_parts, scene_parts
 from robotdiffuse.certificates.requests import configurations, wrong
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.types import Path, Trajectory
 
+JUDGE = Tolerances()
 AGREEMENT = 1e-6
 """Bounds may be this far from what a certificate says [m]: they are rounded there."""
 
@@ -34,8 +35,9 @@ class Findings:
         return not self.differences
 
 
-def check(certificate: Certificate, problem: Problem | None = None) -> Findings:
-    """Re-check a certificate for a problem, by default the one that it holds.
+def check(certificate: Certificate, problem: Problem | None = None, at_most: Tolerances = JUDGE) -> Findings:
+    """Re-check a certificate for a problem, by default the one that it holds, made with tolerances of at most
+    these.
 
     Robot, scene and motion must be those that were certified, by content; the motion must keep the limits,
     begin at the start and end at the goal; and every stretch must be proved. Stops at waypoints, twitching,
@@ -52,6 +54,10 @@ def check(certificate: Certificate, problem: Problem | None = None) -> Findings:
         *differences("robot", certificate.robot_parts, robot_parts(problem.robot)),
         *differences("scene", certificate.scene_parts, scene_parts(problem.scene)),
     ]
+    for name, most in asdict(at_most).items():
+        if getattr(certificate.tolerances, name) > most:
+            said = getattr(certificate.tolerances, name)
+            found.append(f"tolerances: {name} is {said:g}, looser than {most:g}")
     if certificate.motion_hash != hash_of(certificate.motion):
         found.append("motion: it is not the one that was certified: its hash differs")
     found += wrong(problem, certificate)

@@ -1,6 +1,6 @@
 """Distances of points to obstacles, and how far obstacles reach in a direction: the checker's own."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,10 @@ from robotdiffuse.transforms import rotation_from_quaternion
 
 CAP = 1.0
 """Clearances are not told apart beyond this [m]."""
+BEYOND = 0.2
+"""Elements of surfaces further from a part's ball than this [m] count as being there, and need no planes."""
+NEAR = 4.0
+"""Triangles further away than this many times their size count as balls."""
 MOST = 1_000_000
 """Numbers in an array at a time."""
 
@@ -61,7 +65,7 @@ class Obstacles:
         self._half = np.array([body.half for _, body in rounded]).reshape(-1, 3)
         self._disc = np.array([body.disc for _, body in rounded])
         self._rounding = np.array([body.rounding for _, body in rounded])
-        self._nearest = {i: _nearest(body) for i, body in enumerate(self.bodies) if isinstance(body, Surface)}
+        self._indices = {i: _Index(body) for i, body in enumerate(self.bodies) if isinstance(body, Surface)}
 
     def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n obstacles"]:
         """How far points are from each obstacle [m], at most CAP; 0 or less inside."""
@@ -70,9 +74,16 @@ class Obstacles:
         for first in range(0, len(points), step):
             some = slice(first, first + step)
             found[some, self._at] = np.minimum(self._to_rounded(points[some]), CAP)
-        for i, nearest in self._nearest.items():
-            found[:, i] = nearest(points)
+        for i, index in self._indices.items():
+            found[:, i] = index.distances(points)
         return found
+
+    def near(self, center: Float[ndarray, "3"], radius: float) -> tuple[Rounded | Surface, ...]:
+        """The bodies; of surfaces, at least the elements that come within BEYOND of a ball."""
+        return tuple(
+            self._indices[i].near(center, radius + BEYOND) if isinstance(body, Surface) else body
+            for i, body in enumerate(self.bodies)
+        )
 
     def _to_rounded(self, points: ndarray) -> ndarray:
         local = (points @ self._turns - self._shifts).reshape(len(points), -1, 3)
@@ -104,45 +115,50 @@ def _body(shape: Shape) -> Rounded | Surface:
             raise InputError(f"{shape.name}: a {type(shape).__name__} cannot be certified")
 
 
-def _nearest(surface: Surface) -> Callable[[ndarray], ndarray]:
-    from scipy.spatial import KDTree  # half of what importing the checker takes
+class _Index:
+    """The elements of a surface by where they are."""
 
-    if surface.corners.shape[1] == 1:
-        tree = KDTree(surface.corners[:, 0])
-        return lambda points: np.minimum(
-            tree.query(points, distance_upper_bound=CAP + surface.radius)[0] - surface.radius, CAP
-        )
-    classes = tuple((KDTree(middles), of, size) for middles, of, size in _by_size(surface.corners))
+    def __init__(self, surface: Surface) -> None:
+        from scipy.spatial import KDTree  # half of what importing the checker takes
 
-    def nearest(points: ndarray) -> ndarray:
-        """To the next triangle: no further than the next middle of one."""
-        far = np.full(len(points), CAP)
-        for tree, _, _ in classes:
-            far = np.minimum(far, tree.query(points)[0])
-        found = far.copy()
-        for tree, triangles, size in classes:
-            near = tree.query_ball_point(points, far + size)
-            counts = np.array([len(rows) for rows in near], int)
-            if not counts.any():
-                continue
-            rows, which = np.repeat(np.arange(len(points)), counts), np.concatenate(near).astype(int)
-            for first in range(0, len(rows), MOST // 9):
-                some = slice(first, first + MOST // 9)
-                np.minimum.at(found, rows[some], _to_triangles(points[rows[some]], triangles[which[some]]))
-        return found
+        self.surface = surface
+        self._classes = [(KDTree(middles), rows, size) for middles, rows, size in _by_size(surface.corners)]
 
-    return nearest
+    def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+        """To the nearest element [m], at most CAP: exactly where that is near, else to the ball around it."""
+        found = np.full(len(points), CAP)
+        for tree, rows, size in self._classes:
+            to_middle = tree.query(points)[0]
+            near = (to_middle <= NEAR * size) & (to_middle - size < found)
+            if len(self.surface.corners[0]) == 1:
+                near[:] = False
+            found = np.where(near, found, np.minimum(found, to_middle - size))
+            which = np.flatnonzero(near)
+            within = tree.query_ball_point(points[which], to_middle[which] + size)
+            counts = np.array([len(some) for some in within], int)
+            for some in np.array_split(np.arange(len(which)), counts.sum() * 9 // MOST + 1):
+                if len(some):
+                    of = np.repeat(which[some], counts[some])
+                    triangles = self.surface.corners[rows[np.concatenate(within[some]).astype(int)]]
+                    np.minimum.at(found, of, _to_triangles(points[of], triangles))
+        return np.minimum(found - self.surface.radius, CAP)
+
+    def near(self, center: Float[ndarray, "3"], reach: float) -> Surface:
+        """Those that come within a distance of a point, and perhaps more."""
+        reach += self.surface.radius
+        found = [rows[tree.query_ball_point(center, reach + size)] for tree, rows, size in self._classes]
+        return self.surface._replace(corners=self.surface.corners[np.sort(np.concatenate(found).astype(int))])
 
 
-def _by_size(triangles: Float[ndarray, "m 3 3"]) -> Iterator[tuple[ndarray, ndarray, float]]:
-    """Triangles of about one size: their middles, they themselves, and the radius of balls about the middles
-    that hold them."""
-    middles = triangles.mean(axis=1)
-    sizes = np.sqrt(((triangles - middles[:, None]) ** 2).sum(axis=-1)).max(axis=1)
+def _by_size(corners: Float[ndarray, "m c 3"]) -> Iterator[tuple[ndarray, ndarray, float]]:
+    """Elements of about one size: their middles, their rows, and the radius of balls about the middles that
+    hold them."""
+    middles = corners.mean(axis=1)
+    sizes = np.sqrt(((corners - middles[:, None]) ** 2).sum(axis=-1)).max(axis=1)
     octaves = np.ceil(np.log2(np.maximum(sizes, 1e-6))).astype(int)
     for octave in np.unique(octaves):
-        of = octaves == octave
-        yield middles[of], triangles[of], float(sizes[of].max())
+        rows = np.flatnonzero(octaves == octave)
+        yield middles[rows], rows, float(sizes[rows].max())
 
 
 def _to_triangles(p: Float[ndarray, "n 3"], triangles: Float[ndarray, "n 3 3"]) -> Float[ndarray, "n"]:

@@ -52,8 +52,9 @@ class PlaneFinder:
 
     def _of(self, claim: Claim, T: ndarray, needed: float) -> Iterator[tuple[int, int, Normal]]:
         prover, links = self.prover, self.prover.linkage.links
-        bodies, T_base_link = prover.others(claim, T), T[links.index(claim.link)]
+        T_base_link = T[links.index(claim.link)]
         for p, part in enumerate(placed(prover.parts[claim.link], T_base_link)):
+            bodies = prover.others(claim, T, part)
             apart = prover.balls_apart(part, bodies)
             first = self._parts[claim.link][p]
             first = first._replace(T=T_base_link @ first.T)
