@@ -86,7 +86,9 @@ def test_distances_are_those_of_coal() -> None:
                 coal.distance(ball, place, piece, coal.Transform3s(R, t), request, coal.DistanceResult())
                 for piece, t in zip(pieces, at, strict=True)
             )
-            if right - less > 1e-3:
+            if isinstance(body, Surface) and count == 3 and right > 0.1:  # of triangles far away, their balls
+                assert 0.6 * min(right, CAP) <= distance <= right + 1e-5
+            elif right - less > 1e-3:
                 assert distance == pytest.approx(min(right - less, CAP), abs=2e-5)
             else:
                 assert distance < 2e-3
