@@ -66,6 +66,8 @@ def test_anybodys_motion(planned: Path, capsys: pytest.CaptureFixture[str]) -> N
         assert run("verify", planned / file, "--problem", planned / "problem.json") == 0
         assert "trajectory: valid" in capsys.readouterr().out
     assert run("verify", planned / "m.yaml", "--scene", planned / "scene.yaml", "--robot", "panda") == 0
+    assert run("export", planned / "r.json", "--out", "m.mcap") == 0
+    assert run("verify", "m.mcap") == 0  # the problem is in it
     assert run("verify", planned / "m.yaml") == 2
     assert "holds no problem; give --problem FILE, or --scene FILE" in capsys.readouterr().err
     assert run("verify", planned / "m.yaml", "--scene", planned / "scene.yaml") == 2

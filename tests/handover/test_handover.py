@@ -4,6 +4,7 @@ import json
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +89,28 @@ def test_mcap_holds_scene_urdf_frames_and_joint_states(
     assert {entity.frame_id for entity in scene.entities} <= frames | {"panda_link0"}
     again = json.loads(attached["problem.json"])
     assert again["start"] == START
+
+
+def test_mcap_knows_where_the_base_stands(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    from robotdiffuse.handover.mcap_file import problem_in
+
+    problem, trajectory = planned
+    T = np.eye(4)
+    T[:3, 3] = [1.0, 2.0, 3.0]
+    raised = replace(problem, T_world_base=T)
+    write_motion(raised, trajectory, tmp_path / "m.mcap")
+    with (tmp_path / "m.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        first = next(found for *_, found in reader.iter_decoded_messages(topics=["/tf"]))
+    [base] = [found for found in first.transforms if found.parent_frame_id == "world"]
+    assert base.child_frame_id == "panda_link0"
+    assert (base.translation.x, base.translation.y, base.translation.z) == (1.0, 2.0, 3.0)
+    again = problem_in(tmp_path / "m.mcap")
+    assert again is not None
+    assert verify_trajectory(again, trajectory).valid
 
 
 def test_a_urdf_goes_along(tmp_path: Path) -> None:

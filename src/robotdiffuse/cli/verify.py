@@ -1,6 +1,7 @@
 """robotdiffuse verify, robotdiffuse certificate check"""
 
 import argparse
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import natural
@@ -8,8 +9,8 @@ from robotdiffuse.cli.console import clearances
 from robotdiffuse.errors import InputError
 
 if TYPE_CHECKING:
+    from robotdiffuse import types
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.types import Path, Trajectory
 
 HELD, NOT_HELD = 0, 1
 
@@ -27,7 +28,9 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
     )
     where = parser.add_mutually_exclusive_group()
     where.add_argument(
-        "--problem", metavar="FILE", help="problem file (default: the one that a result holds)"
+        "--problem",
+        metavar="FILE",
+        help="problem file (default: the one that a result or an .mcap of ours holds)",
     )
     where.add_argument(
         "--scene",
@@ -103,7 +106,7 @@ def run_check(arguments: argparse.Namespace) -> int:
     return NOT_HELD if found else HELD
 
 
-def _judged(problem: "Problem", what: str, motion: "Path | Trajectory", everything: bool) -> bool:
+def _judged(problem: "Problem", what: str, motion: "types.Path | types.Trajectory", everything: bool) -> bool:
     from robotdiffuse.types import Trajectory
     from robotdiffuse.verify import verify, verify_trajectory
 
@@ -122,9 +125,21 @@ def _judged(problem: "Problem", what: str, motion: "Path | Trajectory", everythi
     return False
 
 
+def _along(file: str) -> "Problem":
+    """The problem in a file of ours; InputError if it has none."""
+    problem = None
+    if file.lower().endswith(".mcap"):
+        from robotdiffuse.handover.mcap_file import problem_in
+
+        problem = problem_in(Path(file))
+    if problem is None:
+        raise InputError(f"{file} holds no problem; give --problem FILE, or --scene FILE and --robot NAME")
+    return problem
+
+
 def _asked(
     arguments: argparse.Namespace,
-) -> "tuple[Problem, dict[str, Path | Trajectory], tuple[str, ...]]":
+) -> "tuple[Problem, dict[str, types.Path | types.Trajectory], tuple[str, ...]]":
     """The problem, the motions to judge, and what was changed to read them."""
     from robotdiffuse.handover import read_motion
     from robotdiffuse.handover.recorded import fitted, own_problem
@@ -133,18 +148,17 @@ def _asked(
 
     if (arguments.scene is None) != (arguments.robot is None):
         raise InputError("--scene and --robot belong together: a planning scene does not say which robot")
-    if arguments.problem is None and arguments.scene is None:
+    alone = arguments.problem is None and arguments.scene is None
+    if alone and arguments.motion.lower().endswith(".json"):
         from robotdiffuse.cli.view import read
 
-        if not arguments.motion.lower().endswith(".json"):
-            raise InputError(
-                f"{arguments.motion} holds no problem; give --problem FILE, or --scene FILE and --robot NAME"
-            )
         result, problem = read(arguments.motion)
         both = {"path": result.path, "trajectory": result.trajectory}
         return problem, {what: motion for what, motion in both.items() if motion is not None}, ()
     recorded = read_motion(arguments.motion, arguments.topic)
-    if arguments.problem is not None:
+    if alone:
+        problem = _along(arguments.motion)
+    elif arguments.problem is not None:
         problem = load_problem(arguments.problem, arguments.index)
     else:
         from robotdiffuse.problems.moveit import read_moveit_scene

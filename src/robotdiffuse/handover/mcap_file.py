@@ -41,9 +41,9 @@ from robotdiffuse.handover.scene_parts import (
     arm,
     obstacles,
 )
-from robotdiffuse.problems.files import problem_record
+from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.reading import input_file
+from robotdiffuse.reading import input_file, parse_json
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.transforms import quaternion_from_rotation
 from robotdiffuse.types import Trajectory
@@ -61,7 +61,8 @@ except ImportError:
 
 FLOAT32 = 7
 """foxglove.PackedElementField.FLOAT32"""
-MIME = "application/json"
+PROBLEM = "problem.json"
+"""Name of the attachment."""
 
 
 class _File:
@@ -105,7 +106,7 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
         out.writer.add_attachment(0, 0, "robot.urdf", "application/xml", urdf)
     try:
         content = json.dumps(problem_record(problem)).encode()
-        out.writer.add_attachment(0, 0, "problem.json", MIME, content)
+        out.writer.add_attachment(0, 0, PROBLEM, "application/json", content)
     except InputError:
         pass  # a robot that only this program has
     names = [*trajectory.joint_names, *robot.locked]
@@ -186,17 +187,35 @@ def _clouds(problem: Problem) -> Iterator[tuple[str, PointCloud]]:
 
 def _transforms(problem: Problem, q: Float[ndarray, "dof"], at: int) -> FrameTransforms:
     update, robot = FrameTransforms(), problem.robot
-    for link in robot.link_names:
-        if link == robot.base:
-            continue
-        T = link_pose(robot, q, link)
-        transform = update.transforms.add(parent_frame_id=robot.base, child_frame_id=link)
+    frames = {
+        link: (robot.base, link_pose(robot, q, link)) for link in robot.link_names if link != robot.base
+    }
+    if problem.T_world_base is not None:
+        frames[robot.base] = ("world", problem.T_world_base)
+    for link, (parent, T) in frames.items():
+        transform = update.transforms.add(parent_frame_id=parent, child_frame_id=link)
         transform.timestamp.FromNanoseconds(at)
         transform.translation.x, transform.translation.y, transform.translation.z = T[:3, 3].tolist()
         w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
         turn = transform.rotation
         turn.w, turn.x, turn.y, turn.z = w, x, y, z
     return update
+
+
+def problem_in(file: Path) -> Problem | None:
+    """The problem that `write` put along; None if there is none."""
+    path = input_file(file)
+    try:
+        with path.open("rb") as stream:
+            attached = {found.name: found.data for found in make_reader(stream).iter_attachments()}
+        if PROBLEM not in attached:
+            return None
+        record = parse_json(attached[PROBLEM].decode(), f"{file}, {PROBLEM}")
+    except InputError:
+        raise
+    except Exception as error:  # mcap and zstandard raise whatever they meet in a damaged file
+        raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
+    return problem_from_record(record)
 
 
 def read(file: Path, topic: str | None = None) -> Recorded:
