@@ -165,7 +165,7 @@ def _asked(
         from robotdiffuse.robots import load_robot
 
         robot = load_robot(arguments.robot)
-        problem = own_problem(recorded, robot, read_moveit_scene(arguments.scene, robot))
+        problem = own_problem(recorded, robot, read_moveit_scene(str(arguments.scene), robot))
     try:
         fit = fitted(recorded, problem.robot)
     except InputError as error:
