@@ -1,9 +1,9 @@
 """Certificates: planners that check too little between waypoints, caught; and what proofs cost.
 
-    python benchmarks/certificates.py [--motions 100] [--resolution 0.03] [--commands 3]
+    python benchmarks/certificates.py [--motions 100] [--resolution 0.01] [--commands 3]
 
 Planners of OMPL plan held-out problems of furniture and dense obstacles, without simplification, with a
-checker that looks at states a share of the space's extent apart (OMPL's default is 0.01). What they return is
+checker that looks at states a share of the space's extent apart (0.01 is OMPL's default). What they return is
 cut into waypoints as far apart as the checker looked, as MoveIt does: each waypoint is free on the exact
 meshes. The truth is Coal on those meshes every 0.002 rad. Each motion goes before the judge; what is valid is
 timed, certified, and re-checked. Times are CPU times of warm calls, the least of three, in one process;
@@ -204,7 +204,7 @@ def commands(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--motions", type=int, default=100)
-    parser.add_argument("--resolution", type=float, default=0.03)
+    parser.add_argument("--resolution", type=float, default=0.01)
     parser.add_argument("--commands", type=int, default=3)
     arguments = parser.parse_args()
     ou.setLogLevel(ou.LOG_NONE)

@@ -24,7 +24,8 @@ def violations(
     report: Report = judge.trajectory(motion) if timed else judge.path(motion)
     if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
         return () if report.violation is None else (report.violation,)
-    found = [wrong for wrong in report.found if wrong.kind not in (*CONTACTS, "limits")]
+    still = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
+    found = [w for w in report.found if w.kind != "limits" and not (w.kind in CONTACTS and w.other in still)]
     q, clock = motion.positions, np.arange(len(motion.positions), dtype=float)
     if timed:
         rates = any(wrong.kind in RATES for wrong in found)
@@ -32,9 +33,6 @@ def violations(
     for contact in contacts(problem.robot, problem.scene, q, settings.contact):
         found.append(collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock))))
     found += _limits(problem, q, clock, settings)
-    first = report.violation
-    if first is not None and first not in found and first.kind not in (*CONTACTS, "limits"):
-        found.append(first)
     return tuple(sorted(found, key=lambda wrong: wrong.time))
 
 

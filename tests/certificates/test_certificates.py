@@ -257,6 +257,17 @@ def test_rates_are_checked_anew(planned: tuple[Problem, rd.PlanResult]) -> None:
     assert any("exceeds its limit of velocity" in line for line in found)
 
 
+def test_what_certificates_do_not_prove_is_refused_by_name() -> None:
+    problem, path = problem_of(SWING)
+    certificate = certify(problem, path)
+    object.__setattr__(problem, "moving", ("a ball",))
+    with pytest.raises(InputError, match="the problem has moving, which certificates do not prove"):
+        certify(problem, path)
+    assert (
+        "problem: certificates do not prove anything about moving" in certificate.check(problem).differences
+    )
+
+
 def test_tolerances_are_those_of_the_judge() -> None:
     """The checker does not import the judge."""
     settings = VerifySettings()

@@ -38,9 +38,21 @@ def _cubic(motion: Trajectory, at: Float[ndarray, "k"]) -> Float[ndarray, "k dof
     )
 
 
+NOT_COVERED = ("moving", "start_velocity", "constraints")
+"""What problems may ask for beside, and no certificate proves."""
+
+
+def not_covered(problem: Problem) -> list[str]:
+    """Which of these a problem asks for."""
+    asked = ((name, getattr(problem, name, None)) for name in NOT_COVERED)
+    return [name for name, value in asked if value is not None and len(value)]
+
+
 def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
     """A line for each thing that the motion does not do."""
     robot, motion, tolerances = problem.robot, certificate.motion, certificate.tolerances
+    for name in not_covered(problem):
+        yield f"problem: certificates do not prove anything about {name}"
     if tuple(motion.joint_names) != robot.joint_names:
         yield f"motion: its joints are {', '.join(motion.joint_names)}, not {', '.join(robot.joint_names)}"
         return

@@ -16,7 +16,7 @@ from robotdiffuse.certificates.certificate import DECIMALS, Certificate, Proof, 
 from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.content import robot_parts, scene_parts
 from robotdiffuse.certificates.planes import PlaneFinder
-from robotdiffuse.certificates.requests import configurations
+from robotdiffuse.certificates.requests import configurations, not_covered
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.types import Path, Trajectory
@@ -44,8 +44,13 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     """A certificate for a motion that the judge calls valid.
 
     Raises `NotValidError`, an InputError, with what the judge found if it does not; and InputError for
-    obstacles that certificates do not know, and where no proof is found in reasonable size.
+    obstacles and requests that certificates do not know, and where no proof is found in reasonable size.
     """
+    beside = not_covered(problem)
+    if beside:
+        raise InputError(
+            f"the problem has {', '.join(beside)}, which certificates do not prove anything about"
+        )
     judge = verify_trajectory if isinstance(motion, Trajectory) else verify
     report = judge(problem, motion, settings)  # type: ignore[arg-type]
     if report.violation is not None:
