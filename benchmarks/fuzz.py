@@ -18,6 +18,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable
+from functools import cache
 from multiprocessing.connection import Connection
 from pathlib import Path as FilePath
 from typing import Any
@@ -523,6 +524,66 @@ def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return ask
 
 
+def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    from robotdiffuse.handover import read_motion, write_motion
+    from robotdiffuse.handover.recorded import fitted
+    from robotdiffuse.handover.records import joint_trajectory
+    from robotdiffuse.problems.files import problem_from_record
+    from robotdiffuse.types import Trajectory
+    from robotdiffuse.verify import Verifier
+
+    problem = problem_from_record(PROBLEM | {"scene": PROBLEM["scene"][:1]})
+    rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3)
+    times, still = np.array([0.0, 10.0, 20.0]), np.zeros_like(rows)
+    trajectory = Trajectory(problem.robot.joint_names, times, rows, still, still)
+    ending = (".json", ".yaml", ".csv", ".mcap", ".rosbag2")[rng.integers(5)]
+    file = folder / f"motion{ending}"
+    if ending in (".json", ".yaml"):
+        forms = (
+            lambda r: r,
+            lambda r: {"joint_trajectory": r},
+            lambda r: {"trajectory": [{"joint_trajectory": r}]},
+        )
+        record = forms[rng.integers(3)](joint_trajectory(trajectory.joint_names, trajectory))
+        file.write_bytes(text_of(rng, record, ending))
+    else:
+        write_motion(problem, trajectory, file)
+        part = file if ending != ".rosbag2" else sorted(file.iterdir())[rng.integers(2)]
+        part.write_bytes(damaged(rng, part.read_bytes()))
+
+    def read() -> None:
+        motion = fitted(read_motion(file), problem.robot).motion
+        judge = Verifier(problem)
+        judge.trajectory(motion) if isinstance(motion, Trajectory) else judge.path(motion)
+
+    return read
+
+
+@cache
+def _certificate_record() -> dict[str, Any]:
+    import tempfile
+
+    from robotdiffuse.certificates.writer import certify
+    from robotdiffuse.problems.files import problem_from_record
+    from robotdiffuse.types import Path
+
+    start = PROBLEM["start"]
+    rows = np.array([start, start])
+    rows[1, 0] += 0.05
+    problem = problem_from_record(PROBLEM | {"scene": [], "goal": {"joints": rows[1].tolist()}})
+    with tempfile.TemporaryDirectory() as folder:
+        certify(problem, Path(problem.robot.joint_names, rows)).save(f"{folder}/c.json")
+        return json.loads(FilePath(f"{folder}/c.json").read_text())
+
+
+def _certificate(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    from robotdiffuse.certificates.certificate import load_certificate
+
+    file = folder / "certificate.json"
+    file.write_bytes(text_of(rng, _certificate_record(), ".json"))
+    return lambda: load_certificate(file).check()
+
+
 KINDS: dict[str, Make] = {
     "problem": _problem,
     "moveit": _moveit,
@@ -532,6 +593,8 @@ KINDS: dict[str, Make] = {
     "result": _result,
     "bundle": _bundle,
     "http": _http,
+    "motion": _motion,
+    "certificate": _certificate,
 }
 
 

@@ -23,6 +23,8 @@ COUNTS = {
     "result": 400,
     "bundle": 100,
     "http": 300,
+    "motion": 120,
+    "certificate": 250,
 }
 
 

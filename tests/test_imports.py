@@ -30,9 +30,12 @@ CHAIN = (
     "problems",
     "rates",
     "verify",
+    "violations",
     "paths",
 )
 BELOW: dict[str, set[str]] = {room: set(CHAIN[: i + 1]) for i, room in enumerate(CHAIN)}
+BELOW["certificates"] = {*CHAIN, "certificates"}
+BELOW["handover"] = {*CHAIN, "certificates", "handover"}
 BELOW["data"] = {*CHAIN[: CHAIN.index("problems") + 1], "data"}
 BELOW["learning"] = {*BELOW["data"], "learning"}
 BELOW["planners"] = {*CHAIN, "data", "learning", "planners"}
@@ -56,6 +59,12 @@ EXTRAS = {
     "uvicorn": {"serve"},
     "orjson": {"serve"},
     "matplotlib": {"evaluation"},
+    "foxglove_schemas_protobuf": {"handover"},
+    "mcap": {"handover"},
+    "mcap_protobuf": {"handover"},
+    "rerun": {"handover"},
+    "rosbags": {"handover"},
+    "roslibpy": {"handover"},
     "pinocchio": set(),
     "example_robot_data": set(),
 }

@@ -12,7 +12,7 @@ from mkdocs.structure.pages import Page
 
 READING_ORDER = (
     *("planners", "problems", "robots", "scenes", "results"),
-    *("types", "verify", "paths", "data", "errors"),
+    *("types", "verify", "certificates", "paths", "data", "errors"),
 )
 """Of the rooms that public names are from."""
 TABLES = {
@@ -21,6 +21,8 @@ TABLES = {
     "Denoisers": "learning.denoisers:DENOISERS",
     "Encoders": "learning.encoders:ENCODERS",
     "Samplers": "learning.samplers:SAMPLERS",
+    "Files that motions are written to": "handover:WRITERS",
+    "Files that motions are read from": "handover:READERS",
     "Guidance costs": "learning.costs:COSTS",
 }
 """On the page of parts by name."""

@@ -8,6 +8,9 @@ from typing import TYPE_CHECKING
 from robotdiffuse.compile_cache import ensure_cache
 
 if TYPE_CHECKING:
+    from robotdiffuse.certificates.certificate import Certificate as Certificate
+    from robotdiffuse.certificates.certificate import load_certificate as load_certificate
+    from robotdiffuse.certificates.writer import certify as certify
     from robotdiffuse.data.dataset import RopDataset as RopDataset
     from robotdiffuse.errors import InputError as InputError
     from robotdiffuse.planners import load_planner as load_planner
@@ -46,6 +49,9 @@ __version__ = "0.1.0"
 ensure_cache()
 
 _HOME = {
+    "Certificate": "robotdiffuse.certificates.certificate",
+    "certify": "robotdiffuse.certificates.writer",
+    "load_certificate": "robotdiffuse.certificates.certificate",
     "InputError": "robotdiffuse.errors",
     "RopDataset": "robotdiffuse.data.dataset",
     "load_result": "robotdiffuse.results",

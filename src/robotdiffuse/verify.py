@@ -112,6 +112,8 @@ class Report:
     motion, at most 1 m. None for an invalid motion."""
     self_clearance: float | None
     """The same to the links that it is checked against."""
+    found: tuple[Violation, ...] = ()
+    """All that was seen to be wrong, the first of its kind; see `violations` for every contact."""
 
     @property
     def min_clearance(self) -> float | None:
@@ -229,7 +231,7 @@ class Verifier:
         if times is not None and self.problem.moving:
             moving = self._moving.sweep(times[: last + 1], q[: last + 1])
         if sweep.contact is not None:
-            collision = _collision(
+            collision = collision_violation(
                 sweep.contact, float(np.interp(sweep.contact.at, np.arange(len(clock)), clock))
             )
         ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
@@ -237,10 +239,10 @@ class Verifier:
         every = [v for v in (first, collision, hit, *ends) if v is not None]
         violation = min(every, key=lambda v: v.time, default=None)
         valid = violation is None
-        if not valid:
-            return Report(False, violation, None, None)
-        scene = sweep.scene_clearance if moving is None else min(sweep.scene_clearance, moving.clearance)
-        return Report(True, None, scene, sweep.self_clearance)
+        scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
+        if scene is not None and moving is not None:
+            scene = min(scene, moving.clearance)
+        return Report(valid, violation, scene, itself, tuple(dict.fromkeys((*found, *every))))
 
     def _start(self, q: ndarray) -> Violation | None:
         difference = np.abs(q[0] - self.problem.start)
@@ -430,7 +432,8 @@ def _hit(contact: TimedContact) -> Violation:
     return Violation("scene_collision", time, message, link, other, contact.depth)
 
 
-def _collision(contact: Contact, time: float) -> Violation:
+def collision_violation(contact: Contact, time: float) -> Violation:
+    """A contact as a violation at a time."""
     (link, pair), other = contact.check, contact.other
     kind = "scene_collision" if pair is None else "self_collision"
     message = describe_contact(link, other, contact.depth, pair is not None)

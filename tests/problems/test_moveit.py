@@ -398,12 +398,27 @@ def pose_request(path: list[Any], value: object) -> dict[str, Any]:
     return request_data() | {"goal_constraints": [change(pose_constraint(), path, value)]}
 
 
+def test_scaling_factors_are_noted() -> None:
+    asked = {"max_velocity_scaling_factor": 0.1, "max_acceleration_scaling_factor": 1.0}
+    request = moveit_request(request_data() | asked, moveit_frames({}, load_robot("panda")))
+    [note] = request.notes
+    assert note == (
+        "the request's max_velocity_scaling_factor 0.1 is not taken over: plan with velocity_scaling=0.1"
+    )
+
+
 WRONG_REQUESTS: dict[str, tuple[object, str]] = {
     "number": (3, "a motion plan request is 3"),
     "no goal": (request_data() | {"goal_constraints": []}, "goal_constraints is empty"),
     "path constraints": (
         request_data() | {"path_constraints": {"joint_constraints": [1]}},
         "path_constraints",
+    ),
+    "reference": (request_data() | {"reference_trajectories": [{}]}, "reference_trajectories is not supp"),
+    "cartesian speed": (request_data() | {"max_cartesian_speed": 0.1}, "max_cartesian_speed is not supp"),
+    "scaling": (
+        request_data() | {"max_velocity_scaling_factor": 2},
+        "max_velocity_scaling_factor is 2; it must be a share from 0 to 1",
     ),
     "attached": (
         change(request_data(), ["start_state", "attached_collision_objects"], [1]),

@@ -10,7 +10,19 @@ from contextlib import suppress
 from typing import NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli import bench, data, plan, planners, robot, serve, simulate, train, view
+from robotdiffuse.cli import (
+    bench,
+    data,
+    handover,
+    plan,
+    planners,
+    robot,
+    serve,
+    simulate,
+    train,
+    verify,
+    view,
+)
 from robotdiffuse.errors import InputError
 
 SOLVED, NO_PLAN, BAD_INPUT, UNWRITTEN, STOPPED = 0, 1, 2, 3, 130
@@ -19,7 +31,10 @@ COMMANDS = (
     plan.add_plan,
     plan.add_demo,
     view.add_view,
-    view.add_verify,
+    verify.add_verify,
+    verify.add_certificate,
+    handover.add_export,
+    handover.add_publish,
     simulate.add,
     planners.add,
     robot.add,

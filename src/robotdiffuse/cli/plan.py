@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from robotdiffuse.cli.arguments import natural, not_negative, positive, share
 from robotdiffuse.cli.console import print_result
 from robotdiffuse.cli.draw import ENDINGS, draw, show
+from robotdiffuse.handover import WRITERS
 from robotdiffuse.types import SHORT, UNTIL
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from robotdiffuse.results import PlanResult
     from robotdiffuse.settings import Settings
 
+RESULT_ENDINGS = (".json", ".csv", *ENDINGS, *WRITERS)
 DEMO, DEMO_FAMILY = "shelf.yaml", "shelf"
 DEMO_TIME_LIMIT = 10.0
 """[s]"""
@@ -87,7 +89,8 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         action="append",
         default=[],
         metavar="FILE",
-        help="result (.json), trajectory (.csv), replay (.html) or picture (.png); repeatable",
+        help="result (.json), trajectory (.csv), replay (.html), picture (.png), or for other programs .mcap "
+        "(Foxglove, ROS 2), .rosbag2, .rrd (Rerun) and .yaml (JointTrajectory); repeatable",
     )
     parser.add_argument("--view", action="store_true", help="write a replay (.html) and open it")
     parser.set_defaults(run=run_plan)
@@ -114,13 +117,17 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
 
 def run_plan(arguments: argparse.Namespace) -> int:
     from robotdiffuse.files import check_output
+    from robotdiffuse.handover import check_export, write_motion
     from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, planner_settings
     from robotdiffuse.problems.files import load_problem, problem_record
 
     name = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(name)
     settings = planner_settings(name, arguments.settings) if arguments.settings else None
-    outputs = [check_output(file, (".json", ".csv", *ENDINGS)) for file in arguments.out]
+    outputs = [
+        check_export(file) if Path(file).suffix.lower() in WRITERS else check_output(file, RESULT_ENDINGS)
+        for file in arguments.out
+    ]
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
     problem = load_problem(arguments.problem, arguments.index)
@@ -147,6 +154,8 @@ def run_plan(arguments: argparse.Namespace) -> int:
             continue
         elif file.suffix.lower() == ".csv":
             result.trajectory.save(file)
+        elif file.suffix.lower() in WRITERS:
+            write_motion(problem, result.trajectory, file)
         else:
             draw(problem, result, file)
         print(f"wrote {file}")

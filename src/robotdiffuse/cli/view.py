@@ -1,10 +1,9 @@
-"""robotdiffuse view, robotdiffuse verify"""
+"""robotdiffuse view"""
 
 import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.console import clearances
 from robotdiffuse.cli.draw import ENDINGS, draw, show
 from robotdiffuse.errors import InputError
 
@@ -27,16 +26,6 @@ def add_view(commands: argparse._SubParsersAction) -> None:
         help="FILE.html or FILE.png; repeatable (default: RESULT's name with .html)",
     )
     parser.set_defaults(run=run_view)
-
-
-def add_verify(commands: argparse._SubParsersAction) -> None:
-    parser = commands.add_parser(
-        "verify",
-        help="judge the motion of a result file anew",
-        description="Judge the motion of a result file anew. Exit status: 0 valid, 1 not valid, 2 bad input.",
-    )
-    parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
-    parser.set_defaults(run=run_verify)
 
 
 def read(file: str) -> "tuple[PlanResult, Problem]":
@@ -66,18 +55,3 @@ def run_view(arguments: argparse.Namespace) -> int:
     if not arguments.out:
         show(outputs[0])
     return 0
-
-
-def run_verify(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.verify import verify, verify_trajectory
-
-    result, problem = read(arguments.result)
-    reports = {"path": verify(problem, result.path)} if result.path is not None else {}
-    if result.trajectory is not None:
-        reports["trajectory"] = verify_trajectory(problem, result.trajectory)
-    for what, report in reports.items():
-        if report.violation is not None:
-            print(f"{what}: not valid: {report.violation.message} (at {report.violation.time:.3f})")
-        else:
-            print(f"{what}: valid, clearance at least {clearances(report)}")
-    return 0 if all(report.valid for report in reports.values()) else 1

@@ -272,9 +272,10 @@ def _requested(
     for held in request.attached:
         robot = holding_at(robot, held, start)
     if request.pose_goal is not None:
-        return Problem(robot, scene, start, PoseGoal(*request.pose_goal), (), clearance, views, unseen)
+        goal = PoseGoal(*request.pose_goal)
+        return Problem(robot, scene, start, goal, request.notes, clearance, views, unseen)
     goals = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
-    return Problem(robot, scene, start, JointGoal(goals), (), clearance, views, unseen)
+    return Problem(robot, scene, start, JointGoal(goals), request.notes, clearance, views, unseen)
 
 
 def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot] | None = None) -> Problem:

@@ -58,6 +58,8 @@ class MoveItRequest:
     pose_goal: tuple[str, Float[ndarray, "4 4"]] | None = None
     """A link and T_base_link."""
     attached: tuple[MoveItAttached, ...] = ()
+    notes: tuple[str, ...] = ()
+    """What is not taken over."""
 
 
 def read_moveit_scene(file: str | Path, robot: Robot | None = None) -> Scene:
@@ -225,6 +227,10 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
     for name in ("path_constraints", "trajectory_constraints"):
         if any(_mapping(name, data.get(name)).values()):
             raise InputError(f"{name} are not supported")
+    for name in ("reference_trajectories", "max_cartesian_speed"):
+        if data.get(name):
+            raise InputError(f"{name} is not supported; leave it out")
+    notes = _scaling_notes(data)
     state = _mapping("start_state", data.get("start_state"))
     held = _list("attached_collision_objects", state.get("attached_collision_objects"))
     attached = tuple(_attached(i, entry, frames, folder) for i, entry in enumerate(held))
@@ -237,9 +243,24 @@ def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) ->
         raise InputError("goal_constraints is empty; it must hold at least one goal")
     start = dict(zip(map(str, names), values, strict=True))
     if len(goals) == 1 and _mapping("goal_constraints[0]", goals[0]).get("position_constraints"):
-        return MoveItRequest(start, pose_goal=_pose_goal(goals[0], frames), attached=attached)
+        return MoveItRequest(start, pose_goal=_pose_goal(goals[0], frames), attached=attached, notes=notes)
     each = tuple(_joint_goal(f"goal_constraints[{i}]", goal) for i, goal in enumerate(goals))
-    return MoveItRequest(start, each, attached=attached)
+    return MoveItRequest(start, each, attached=attached, notes=notes)
+
+
+def _scaling_notes(data: dict[str, Any]) -> tuple[str, ...]:
+    """Of shares of the rates' limits, where they are less than all: 0 stands for all there."""
+    notes = []
+    for what in ("velocity", "acceleration"):
+        name = f"max_{what}_scaling_factor"
+        share = float(vector("request", name, [data.get(name) or 0], 1)[0])
+        if not 0 <= share <= 1:
+            raise InputError(f"{name} is {shown(data[name])}; it must be a share from 0 to 1")
+        if 0 < share < 1:
+            notes.append(
+                f"the request's {name} {share:g} is not taken over: plan with {what}_scaling={share:g}"
+            )
+    return tuple(notes)
 
 
 def _attached(i: int, entry: object, frames: MoveItFrames, folder: Path) -> MoveItAttached:

@@ -1,0 +1,295 @@
+"""Certificates: planners that check too little between waypoints, caught; and what proofs cost.
+
+    python benchmarks/certificates.py [--motions 100] [--resolution 0.01] [--commands 3]
+
+Planners of OMPL plan held-out problems of furniture and dense obstacles, without simplification, with a
+checker that looks at states a share of the space's extent apart (0.01 is OMPL's default). What they return is
+cut into waypoints as far apart as the checker looked, as MoveIt does: each waypoint is free on the exact
+meshes. The truth is Coal on those meshes every 0.002 rad. Each motion goes before the judge; what is valid is
+timed, certified, and re-checked. Times are CPU times of warm calls, the least of three, in one process;
+commands are wall times of processes of their own, verify and certificate check in turn.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy import ndarray
+from ompl import base as ob
+from ompl import geometric as og
+from ompl import util as ou
+from report import header, print_table, progress
+
+import robotdiffuse as rd
+from robotdiffuse.certificates.writer import certify
+from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.errors import InputError
+from robotdiffuse.problems.files import problem_record
+from robotdiffuse.problems.goals import JointGoal
+from robotdiffuse.problems.held_out import held_out_problem
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.results import PlanResult
+from robotdiffuse.types import Path as JointPath
+from robotdiffuse.types import Status
+from robotdiffuse.verify import Report, VerifySettings, verify, verify_trajectory
+
+PLANNERS = {
+    "RRTConnect": og.RRTConnect,
+    "RRT": og.RRT,
+    "KPIECE1": og.KPIECE1,
+    "BKPIECE1": og.BKPIECE1,
+}
+FAMILIES = ("shelf", "table", "crate", "rop_dense")
+LIMIT, DENSE = 4.0, 0.002
+"""Wall time of a call [s]; between two looks at the truth [rad]."""
+
+
+class Motion(NamedTuple):
+    planner: str
+    problem: Problem
+    path: JointPath
+
+
+class Seen(NamedTuple):
+    planner: str
+    waypoints_free: bool
+    truth_free: bool
+    report: Report
+
+
+def motions(count: int, resolution: float) -> Iterator[Motion]:
+    """Planners and families in turn, each problem for all planners; what is not solved is left out."""
+    found, number = 0, 0
+    while found < count:
+        problem = held_out_problem(FAMILIES[number % len(FAMILIES)], number)
+        for k, name in enumerate(PLANNERS):
+            path = _planned(problem, name, resolution, 1 + len(PLANNERS) * number + k)
+            if path is not None and found < count:
+                found += 1
+                yield Motion(name, problem, path)
+        number += 1
+
+
+def _planned(problem: Problem, name: str, resolution: float, seed: int) -> JointPath | None:
+    robot, exact = problem.robot, ExactCollision(problem.robot, problem.scene)
+    if not isinstance(problem.goal, JointGoal):
+        return None
+    ou.RNG.setSeed(seed)
+    space, bounds = ob.RealVectorStateSpace(robot.dof), ob.RealVectorBounds(robot.dof)
+    for j in range(robot.dof):
+        bounds.setLow(j, robot.lower[j])
+        bounds.setHigh(j, robot.upper[j])
+    space.setBounds(bounds)
+    setup = og.SimpleSetup(space)
+
+    def row(state: ob.State) -> list[float]:
+        return [state[j] for j in range(robot.dof)]  # type: ignore[index]
+
+    setup.setStateValidityChecker(lambda state: not exact.collides(np.array([row(state)]))[0])
+    setup.getSpaceInformation().setStateValidityCheckingResolution(resolution)
+    ends = space.allocState(), space.allocState()
+    for state, q in zip(ends, (problem.start, problem.goal.positions[0]), strict=True):
+        for j in range(robot.dof):
+            state[j] = q[j]  # type: ignore[index]
+    setup.setStartAndGoalStates(*ends)
+    setup.setPlanner(PLANNERS[name](setup.getSpaceInformation()))
+    if not setup.solve(LIMIT) or not setup.haveExactSolutionPath():
+        return None
+    path = setup.getSolutionPath()
+    path.interpolate()
+    rows = np.array([row(state) for state in path.getStates()])
+    rows[0], rows[-1] = problem.start, problem.goal.positions[0]
+    return JointPath(robot.joint_names, rows)
+
+
+def dense(q: ndarray) -> ndarray:
+    """Configurations at most DENSE apart in any joint."""
+    counts = np.maximum(np.ceil(np.abs(np.diff(q, axis=0)).max(axis=1) / DENSE).astype(int), 1)
+    at = np.concatenate([i + np.arange(n) / n for i, n in enumerate(counts)] + [[len(q) - 1.0]])
+    return np.stack([np.interp(at, np.arange(len(q)), column) for column in q.T], axis=1)
+
+
+def seen(motion: Motion) -> Seen:
+    """The motion before the truth and the judge. Twitching is no collision, and OMPL's raw paths twitch."""
+    exact = ExactCollision(motion.problem.robot, motion.problem.scene)
+    q = motion.path.positions
+    report = verify(motion.problem, motion.path, LENIENT)
+    free = not exact.collides(q).any()
+    return Seen(motion.planner, free, not exact.collides(dense(q)).any(), report)
+
+
+LENIENT = VerifySettings(reversals=1000)
+
+
+def least(act: Callable[[], object]) -> float:
+    """CPU time of a warm call [ms]."""
+    act()
+    times = []
+    for _ in range(3):
+        begun = time.process_time()
+        act()
+        times.append(time.process_time() - begun)
+    return 1e3 * min(times)
+
+
+class Cost(NamedTuple):
+    """Of one certificate; times in ms of CPU."""
+
+    judge: float
+    write: float
+    check: float
+    size: float
+    """[kB]"""
+    stretches: int
+    planes: int
+    share: float
+    """Of the judge's clearance that is proved."""
+
+
+def cost(problem: Problem, motion: rd.Path | rd.Trajectory, folder: Path) -> Cost:
+    timed = isinstance(motion, rd.Trajectory)
+
+    def judge() -> Report:
+        if timed:
+            return verify_trajectory(problem, motion, LENIENT)  # type: ignore[arg-type]
+        return verify(problem, motion, LENIENT)  # type: ignore[arg-type]
+
+    certificate, file = certify(problem, motion, LENIENT), folder / "certificate.json"
+    certificate.save(file)
+    assert certificate.check(problem).valid
+    proved = min(certificate.scene_clearance, certificate.self_clearance)
+    return Cost(
+        least(judge),
+        least(lambda: certify(problem, motion, LENIENT)),
+        least(lambda: certificate.check(problem)),
+        file.stat().st_size / 1000,
+        len(certificate.proof.stretches.claim),
+        len(certificate.proof.planes),
+        proved / (judge().min_clearance or 1.0),
+    )
+
+
+def commands(
+    problem: Problem, result: PlanResult, folder: Path, count: int
+) -> tuple[list[float], list[float]]:
+    """Wall times [s] of `robotdiffuse verify` and `robotdiffuse certificate check`, in turn."""
+    result.save(folder / "result.json", problem_record(problem))
+    rd.certify(problem, result.trajectory or result.path).save(folder / "certificate.json")  # type: ignore[arg-type]
+    found: tuple[list[float], list[float]] = ([], [])
+    for _ in range(count):
+        for times, words in zip(
+            found,
+            (["verify", "result.json"], ["certificate", "check", "certificate.json"]),
+            strict=True,
+        ):
+            begun = time.perf_counter()
+            subprocess.run(
+                [sys.executable, "-m", "robotdiffuse", *words],
+                cwd=folder,
+                check=True,
+                capture_output=True,
+                env={**os.environ},
+            )
+            times.append(time.perf_counter() - begun)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--motions", type=int, default=100)
+    parser.add_argument("--resolution", type=float, default=0.01)
+    parser.add_argument("--commands", type=int, default=3)
+    arguments = parser.parse_args()
+    ou.setLogLevel(ou.LOG_NONE)
+    print(header("numpy", "coal", "ompl", "numba"))
+    drawn = list(progress(list(motions(arguments.motions, arguments.resolution)), "motions"))
+    judged = [seen(motion) for motion in progress(drawn, "judging")]
+    rows = []
+    for name in (*PLANNERS, "all"):
+        of = [one for one in judged if name in (one.planner, "all")]
+        defects = [one for one in of if one.waypoints_free and not one.truth_free]
+        refused = [one for one in of if not one.report.valid]
+        rows.append(
+            [
+                name,
+                len(of),
+                sum(one.waypoints_free for one in of),
+                len(defects),
+                sum(not one.report.valid for one in defects),
+                len(refused),
+                sum(one.report.valid and not one.truth_free for one in of),
+            ]
+        )
+    print_table(
+        f"Motions of OMPL's planners, checked at states {arguments.resolution:g} of the extent apart",
+        [
+            "planner",
+            "motions",
+            "all waypoints free",
+            "collide between",
+            "of these caught",
+            "refused",
+            "missed",
+        ],
+        rows,
+        [
+            "collide between: by Coal every 0.002 rad, though every waypoint is free",
+            "missed: accepted by the judge, and not by that",
+            "refused beyond what collides: contact between two looks, or bodies nearer than 0.1 mm",
+        ],
+    )
+    with tempfile.TemporaryDirectory() as name:
+        measure(drawn, judged, Path(name), arguments.commands)
+
+
+def measure(drawn: list[Motion], judged: list[Seen], folder: Path, count: int) -> None:
+    """What is valid, as the planner returned it, and what this package plans for the same problems."""
+    rough, smooth, failed = [], [], 0
+    verified, checked = list[float](), list[float]()
+    problems = list({id(motion.problem): motion.problem for motion in drawn}.values())
+    for motion, one in progress(list(zip(drawn, judged, strict=True)), "certifying"):
+        if one.report.valid:
+            try:
+                rough.append(cost(motion.problem, motion.path, folder))
+            except InputError:
+                failed += 1
+    for problem in progress(problems, "ours"):
+        result = rd.load_planner("rrt_connect").plan(problem, time_limit=LIMIT)
+        if result.status is Status.SOLVED and result.trajectory is not None:
+            smooth.append(cost(problem, result.trajectory, folder))
+            if len(verified) < 3 * count:
+                a, b = commands(problem, result, folder, count)
+                verified, checked = verified + a, checked + b
+    rows = []
+    for name, costs in (("paths of OMPL", rough), ("timed motions of rrt_connect", smooth)):
+        if costs:
+            table = np.array(costs, float)
+            middle, worst = np.median(table, axis=0), np.percentile(table, 95, axis=0)
+            ratio = np.median(table[:, 2] / table[:, 1])
+            for label, line in ((f"{name}, median of {len(costs)}", middle), ("95th percentile", worst)):
+                numbers = [f"{line[0]:.1f}", f"{line[1]:.0f}", f"{line[2]:.1f}", f"{line[3]:.0f}"]
+                rows.append([label, *numbers, f"{line[4]:.0f}", f"{line[5]:.0f}", f"{line[6]:.2f}"])
+            rows.append([f"check / (judge and search for the proof): {ratio:.2f}", *[""] * 7])
+    print_table(
+        "Certificates: CPU time in one warm process",
+        ["", "judge ms", "certify ms", "check ms", "kB", "stretches", "planes", "proved"],
+        rows,
+        [
+            "proved: clearance proved over the judge's",
+            f"valid motions for which no proof was found: {failed}",
+        ],
+    )
+    if verified:
+        a, b = float(np.median(verified)), float(np.median(checked))
+        print(f"commands, median of {len(verified)}: verify {a:.2f} s, check {b:.2f} s, {b / a:.2f} of it")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,310 @@
+"""Clearances and displacements over stretches of a motion: what proofs consist of.
+
+A stretch is free for a check, a link against the scene or two links, if in the middle of the stretch the
+clearance is more than any point of the link can be displaced from there to anywhere on it. Clearances are
+those of the robot's spheres, or of its convex meshes by planes that part them from what is near. Of two
+links, the further one is seen from the nearer one, so only the joints between them count.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.certificates.kinematics import Linkage, Postures
+from robotdiffuse.certificates.obstacles import BEYOND, CAP, MOST, Obstacles, Rounded, Surface
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+
+SCENE = "scene"
+
+
+class Claim(NamedTuple):
+    """One thing that is to be proved of the whole motion."""
+
+    link: str
+    against: str
+    """SCENE, or the other link, nearer to the base."""
+
+
+class Stretches(NamedTuple):
+    """Stretches of a motion, each for one claim; places are rows plus the share of the way to the next."""
+
+    claim: Int[ndarray, "n"]
+    start: Float[ndarray, "n"]
+    stop: Float[ndarray, "n"]
+
+    def some(self, rows: ndarray) -> "Stretches":
+        return Stretches(self.claim[rows], self.start[rows], self.stop[rows])
+
+
+class Plane(NamedTuple):
+    """A plane between a part of a link and something else, in the middle of a stretch."""
+
+    stretch: int
+    part: int
+    """Of the link's convex meshes; or of its spheres, where it has no mesh."""
+    other: int
+    """Of the scene's obstacles, or of the other link's parts."""
+    normal: tuple[float, float, float]
+    """Towards the link, in the base's frame."""
+
+
+class Part(NamedTuple):
+    """The hull of vertices in the frame of the link, rounded; and a ball about it."""
+
+    vertices: Float[ndarray, "v 3"]
+    faces: Int[ndarray, "f 3"]
+    """None of a single vertex."""
+    rounding: float
+    center: Float[ndarray, "3"]
+    radius: float
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """In the middles of stretches, and from there to their ends."""
+
+    clearance: Float[ndarray, "n"]
+    """[m], at most CAP."""
+    displacement: Float[ndarray, "n"]
+    """[m]"""
+
+
+class Prover:
+    """Bounds for a robot in a scene along straight lines through configurations."""
+
+    def __init__(self, robot: Robot, scene: Scene, q: Float[ndarray, "rows dof"]) -> None:
+        self.robot, self.q = robot, q
+        self.linkage, self.obstacles = Linkage(robot), Obstacles(scene)
+        self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
+        self._of = {link: k for k, link in enumerate(self.linkage.links)}
+        self._levels = self.linkage.levels
+        balls = [_balls(robot, link) for link in self.linkage.links]
+        self._balls = np.concatenate([np.zeros((0, 4)), *balls])
+        counts = [len(rows) for rows in balls]
+        self._first = np.cumsum([0, *counts])
+        self.parts = {link: _parts(robot, link) for link in self.links}
+
+    @cached_property
+    def claims(self) -> tuple[Claim, ...]:
+        """Moving links against the scene; pairs of links that move against each other and may not touch."""
+        level = {link: self._levels[self._of[link]] for link in self.links}
+        moving = [Claim(link, SCENE) for link in self.links if level[link] > 0]
+        pairs = []
+        for i, a in enumerate(self.links):
+            for b in self.links[i + 1 :]:
+                if level[a] != level[b] and frozenset((a, b)) not in self.robot.allowed_collisions:
+                    pairs.append(Claim(a, b) if level[a] > level[b] else Claim(b, a))
+        return (*moving, *pairs)
+
+    def at(self, places: Float[ndarray, "n"]) -> Float[ndarray, "n dof"]:
+        """Configurations."""
+        low = np.clip(places.astype(int), 0, max(len(self.q) - 2, 0))
+        high = np.minimum(low + 1, len(self.q) - 1)
+        share = (places - low)[:, None]
+        return (1 - share) * self.q[low] + share * self.q[high]
+
+    def spans(self, start: ndarray, stop: ndarray, middle: ndarray) -> Float[ndarray, "n dof"]:
+        """How far each joint goes at most between the middle of a stretch and anywhere on it."""
+        q = self.at(middle)
+        spans = np.maximum(np.abs(self.at(start) - q), np.abs(self.at(stop) - q))
+        first, last = np.floor(start).astype(int) + 1, np.ceil(stop).astype(int) - 1
+        within = np.flatnonzero(first <= last)
+        if len(within):
+            edges = np.column_stack([first[within], last[within] + 1]).ravel()
+            rows = np.concatenate([self.q, self.q[-1:]])
+            most = np.maximum.reduceat(rows, edges)[::2]
+            least = np.minimum.reduceat(rows, edges)[::2]
+            beyond = np.maximum(most - q[within], q[within] - least)
+            spans[within] = np.maximum(spans[within], beyond)
+        return spans
+
+    def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
+        """What can be said of stretches; by the planes for those that `by_planes` marks, else by spheres."""
+        ends, which = np.unique(
+            np.column_stack([stretches.start, stretches.stop]), axis=0, return_inverse=True
+        )
+        which = which.ravel()
+        middle = (ends[:, 0] + ends[:, 1]) / 2
+        spans = self.spans(ends[:, 0], ends[:, 1], middle)
+        postures = self.linkage.place(self.at(middle))
+        clearance = np.full(len(which), CAP)
+        displacement = np.zeros(len(which))
+        for pairs in (False, True):
+            is_pair = np.array([claim.against != SCENE for claim in self.claims], bool)
+            rows = np.flatnonzero(is_pair[stretches.claim] == pairs)
+            if len(rows):
+                found = self._by_spheres(stretches.claim[rows], which[rows], postures, spans, pairs)
+                clearance[rows], displacement[rows] = found
+        marked = np.flatnonzero(by_planes)
+        if len(marked):
+            ways = [_steps(self, *ends[k]) for k in which[marked]]
+            found = self._by_planes(stretches, marked, planes, postures, which, ways, displacement[marked])
+            clearance[marked], displacement[marked] = found
+        return Bounds(clearance, displacement)
+
+    def _expand(self, links: ndarray) -> tuple[ndarray, ndarray, ndarray]:
+        """For each of the links all its balls: which row, which ball; and where the balls of each begin."""
+        counts = self._first[links + 1] - self._first[links]
+        begin = np.cumsum(counts) - counts
+        row = np.repeat(np.arange(len(links)), counts)
+        ball = np.arange(counts.sum()) - begin[row] + self._first[links][row]
+        return row, ball, begin
+
+    def _placed(self, postures: Postures, posture: ndarray, link: ndarray, points: ndarray) -> ndarray:
+        T = postures.T[posture, link]
+        return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
+
+    def _by_spheres(
+        self, claim: ndarray, posture: ndarray, postures: Postures, spans: ndarray, pairs: bool
+    ) -> tuple[ndarray, ndarray]:
+        further = np.array([self._of[c.link] for c in self.claims])[claim]
+        row, ball, begin = self._expand(further)
+        at, radius = posture[row], self._balls[ball, 3]
+        centers = self._placed(postures, at, further[row], self._balls[ball, :3])
+        levels, seen_from = self._levels[further], np.zeros(len(claim), int)
+        if pairs:
+            nearer = np.array([self._of.get(c.against, 0) for c in self.claims])[claim]
+            seen_from = self._levels[nearer]
+            distances = self._to_links(postures, at, centers, nearer[row])
+        else:
+            distances = self.obstacles.distances(centers).min(axis=1, initial=CAP)
+        went = self.linkage.displacement(postures, at, centers, radius, levels[row], seen_from[row], spans)
+        clearance = np.minimum.reduceat(distances - radius, begin)
+        return np.minimum(clearance, CAP), np.maximum.reduceat(went, begin)
+
+    def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
+        """From points to the spheres of a link each."""
+        found = np.empty(len(at))
+        step = MOST // 64
+        for first in range(0, len(at), step):
+            some = slice(first, first + step)
+            row, ball, begin = self._expand(link[some])
+            others = self._placed(postures, at[some][row], link[some][row], self._balls[ball, :3])
+            apart = np.sqrt(((centers[some][row] - others) ** 2).sum(axis=1)) - self._balls[ball, 3]
+            found[some] = np.minimum.reduceat(apart, begin)
+        return found
+
+    def _by_planes(
+        self,
+        stretches: Stretches,
+        marked: ndarray,
+        planes: list[Plane],
+        postures: Postures,
+        which: ndarray,
+        ways: list[ndarray],
+        displacement: ndarray,
+    ) -> tuple[ndarray, ndarray]:
+        """Of each part to each obstacle, or part of the other link, the clearance of the balls about them, or
+        the widest gap that a plane shows, and what is left of it along the stretch; of these the least."""
+        normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
+        for plane in planes:
+            normals.setdefault(plane[:3], []).append(plane.normal)
+        least, left = np.full(len(marked), CAP), np.full(len(marked), CAP)
+        places = [(self.claims[stretches.claim[i]], postures.T[which[i]]) for i in marked]
+        standing = [placed(self.parts[claim.link], T[self._of[claim.link]]) for claim, T in places]
+        in_scene = [k for k, (claim, _) in enumerate(places) if claim.against == SCENE]
+        centers = [part.center for k in in_scene for part in standing[k]]
+        to_scene = iter(self.obstacles.distances(np.array(centers).reshape(-1, 3)))
+        for k, (claim, T) in enumerate(places):
+            base = 0 if claim.against == SCENE else int(self._levels[self._of[claim.against]])
+            moved_by = range(base, int(self._levels[self._of[claim.link]]))
+            at = which[marked[k]]
+            for p, part in enumerate(standing[k]):
+                bodies = self.others(claim, T, part)
+                if claim.against == SCENE:
+                    apart = next(to_scene) - part.radius
+                else:
+                    apart = self.balls_apart(part, bodies)
+                apart, along = apart.copy(), apart - displacement[k]
+                for o, body in enumerate(bodies):
+                    shown = normals.get((int(marked[k]), p, o))
+                    if shown is not None:
+                        n = np.array(shown)
+                        n /= np.sqrt((n**2).sum(axis=1, keepdims=True))
+                        nearer = self.linkage.approach(
+                            postures.origins[at], postures.axes[at], part.vertices, moved_by, ways[k], n
+                        )
+                        widest = gaps(part, body, n).max(axis=-1)
+                        remaining = gaps(part, body, n, nearer).max(axis=-1)
+                        least_of, left_of = np.maximum(apart[o], widest), np.maximum(along[o], remaining)
+                        beyond = BEYOND if isinstance(body, Surface) else CAP
+                        apart[o] = max(apart[o], least_of.min(initial=beyond))
+                        along[o] = max(along[o], left_of.min(initial=beyond - displacement[k]))
+                least[k] = min(least[k], apart.min(initial=CAP))
+                left[k] = min(left[k], along.min(initial=CAP))
+        return least, least - left
+
+    def others(self, claim: Claim, T: ndarray, part: Part) -> Sequence[Rounded | Surface | Part]:
+        """What a part of a link is checked against; of surfaces, what is near."""
+        if claim.against == SCENE:
+            return self.obstacles.near(part.center, part.radius)
+        return placed(self.parts[claim.against], T[self._of[claim.against]])
+
+    def balls_apart(self, part: Part, bodies: Sequence[Rounded | Surface | Part]) -> Float[ndarray, "bodies"]:
+        """How far the ball about a part is from the obstacles, or from those about parts of a link."""
+        others = [body for body in bodies if isinstance(body, Part)]
+        if not others:
+            return self.obstacles.distances(part.center[None])[0] - part.radius
+        centers, radii = np.array([other.center for other in others]), [other.radius for other in others]
+        return np.sqrt(((part.center - centers) ** 2).sum(axis=1)) - part.radius - radii
+
+
+def _steps(prover: Prover, start: float, stop: float) -> Float[ndarray, "rows dof"]:
+    """Where a stretch begins, turns and ends, from its middle."""
+    inner = np.arange(int(np.floor(start)) + 1, int(np.ceil(stop)))
+    ends = prover.at(np.array([start, (start + stop) / 2, stop]))
+    return np.concatenate([ends[[0, 2]], prover.q[inner]]) - ends[1]
+
+
+def gaps(
+    part: Part,
+    body: Rounded | Surface | Part,
+    normals: Float[ndarray, "k 3"],
+    nearer: Float[ndarray, "k v"] | None = None,
+) -> Float[ndarray, "*elements k"]:
+    """How far unit vectors part them [m]; of a surface, each of its elements. With `nearer`, when the part's
+    vertices have gone so far against them."""
+    heights = normals @ part.vertices.T
+    nearest = (heights if nearer is None else heights - nearer).min(axis=1) - part.rounding
+    if isinstance(body, Part):
+        return nearest - (body.vertices @ normals.T).max(axis=0) - body.rounding
+    return nearest - body.reach(normals)
+
+
+def placed(parts: tuple[Part, ...], T: Float[ndarray, "4 4"]) -> list[Part]:
+    """Parts where their link stands."""
+    R, t = T[:3, :3], T[:3, 3]
+    return [part._replace(vertices=part.vertices @ R.T + t, center=R @ part.center + t) for part in parts]
+
+
+def _has_geometry(robot: Robot, link: str) -> bool:
+    return bool(len(robot.spheres.get(link, ())) or robot.meshes.get(link))
+
+
+def _balls(robot: Robot, link: str) -> Float[ndarray, "n 4"]:
+    """The spheres of a link, which cover it; one about its meshes where it has none."""
+    if len(robot.spheres.get(link, ())):
+        return robot.spheres[link]
+    if not robot.meshes.get(link):
+        return np.zeros((0, 4))
+    vertices = np.concatenate([mesh.vertices for mesh in robot.meshes[link]])
+    center, radius = _ball(vertices)
+    return np.array([[*center, radius]])
+
+
+def _parts(robot: Robot, link: str) -> tuple[Part, ...]:
+    meshes, none = robot.meshes.get(link, ()), np.zeros((0, 3), int)
+    if meshes:
+        return tuple(Part(mesh.vertices, mesh.faces, 0.0, *_ball(mesh.vertices)) for mesh in meshes)
+    return tuple(Part(s[None, :3], none, float(s[3]), s[:3], float(s[3])) for s in robot.spheres[link])
+
+
+def _ball(vertices: ndarray) -> tuple[ndarray, float]:
+    center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    return center, float(np.sqrt(((vertices - center) ** 2).sum(axis=1)).max())

@@ -1,0 +1,84 @@
+"""Content hashes of robots, scenes and motions, part by part, so that a difference can be named."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
+
+DIGITS = 9
+"""Numbers count up to this decimal: rotations from quaternions differ in the last bits by machine."""
+LENGTH = 16
+"""Hexadecimal digits of the hash of a part; a whole has all 64 of SHA-256."""
+LIMITS = ("lower", "upper", "velocity", "acceleration")
+
+
+def whole(parts: Mapping[str, str]) -> str:
+    """The hash of all parts."""
+    return hashlib.sha256(json.dumps(sorted(parts.items())).encode()).hexdigest()
+
+
+def robot_parts(robot: Robot) -> dict[str, str]:
+    """What a proof about a robot depends on."""
+    parts = {
+        "planned joints": _hash([robot.base, *robot.joint_names]),
+        "allowed collisions": _hash(sorted(sorted(pair) for pair in robot.allowed_collisions)),
+    }
+    for joint in robot.joints:
+        numbers = [joint.T_parent_joint, joint.axis, *(getattr(joint, name) for name in LIMITS)]
+        held = robot.locked.get(joint.name)
+        names = [joint.name, joint.kind, joint.parent, joint.child, held is None]
+        parts[f"joint {joint.name}"] = _hash(names, *numbers, 0.0 if held is None else held)
+    for link, spheres in robot.spheres.items():
+        parts[f"spheres of {link}"] = _hash(link, spheres)
+    for link, meshes in robot.meshes.items():
+        arrays = [array for mesh in meshes for array in (mesh.vertices, mesh.faces)]
+        parts[f"meshes of {link}"] = _hash(link, *arrays)
+    return parts
+
+
+def scene_parts(scene: Scene) -> dict[str, str]:
+    """Each obstacle by its name."""
+    return {shape.name: _hash(shape.kind, *_numbers(shape)) for shape in scene.shapes}
+
+
+def motion_hash(names: Iterable[str], *rows: np.ndarray | None) -> str:
+    """Of all numbers exactly as they are."""
+    digest = hashlib.sha256(json.dumps(list(names)).encode())
+    for array in rows:
+        if array is not None:
+            digest.update(str(array.shape).encode() + np.ascontiguousarray(array, np.float64).tobytes())
+    return digest.hexdigest()
+
+
+def differences(what: str, certified: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
+    """A line for each part that is not the one that was certified."""
+    lines = [f"{what}: {name} is not here" for name in certified if name not in here]
+    lines += [f"{what}: {name} was not there" for name in here if name not in certified]
+    changed = (name for name in certified if name in here and certified[name] != here[name])
+    return lines + [f"{what}: {name} is not as it was" for name in changed]
+
+
+def _numbers(shape: Shape) -> list[object]:
+    if isinstance(shape, PointCloud):
+        return [shape.points, shape.point_radius]
+    if isinstance(shape, Triangulated):
+        mesh = shape.mesh
+        return [mesh.vertices, mesh.faces, mesh.xyz, mesh.wxyz]
+    names = [name for name in ("center", "radius", "size", "height", "wxyz") if hasattr(shape, name)]
+    if not names:
+        raise InputError(f"{shape.name}: a {type(shape).__name__} cannot be certified")
+    return [getattr(shape, name) for name in names]
+
+
+def _hash(names: object, *numbers: object) -> str:
+    digest = hashlib.sha256(json.dumps(names).encode())
+    for values in numbers:
+        rounded = np.round(np.asarray(values, np.float64), DIGITS) + 0.0  # no negative zeros
+        digest.update(str(rounded.shape).encode() + rounded.tobytes())
+    return digest.hexdigest()[:LENGTH]

@@ -1,0 +1,141 @@
+"""What a problem asks of a motion beside that it is free: limits, start, goal, rates. The checker's own."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.certificates.certificate import Certificate, Tolerances
+from robotdiffuse.certificates.kinematics import Linkage
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.types import Path, Trajectory
+
+
+def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> Float[ndarray, "n dof"]:
+    """The rows of a motion, and between them further ones on the cubics through positions and velocities."""
+    if not isinstance(motion, Trajectory) or not len(between):
+        return motion.positions
+    times = np.concatenate([motion.times, between])
+    q = np.concatenate([motion.positions, _cubic(motion, between)])
+    return q[np.argsort(times, kind="stable")]
+
+
+def _cubic(motion: Trajectory, at: Float[ndarray, "k"]) -> Float[ndarray, "k dof"]:
+    row = np.clip(np.searchsorted(motion.times, at, side="right") - 1, 0, len(motion.times) - 2)
+    h = (motion.times[row + 1] - motion.times[row])[:, None]
+    u = (at - motion.times[row])[:, None] / h
+    # Hermite's basis
+    q0, q1, v0, v1 = motion.positions[row], motion.positions[row + 1], motion.velocities[row], 0
+    v1 = motion.velocities[row + 1]
+    return (
+        (1 + 2 * u) * (1 - u) ** 2 * q0
+        + u**2 * (3 - 2 * u) * q1
+        + h * u * (1 - u) ** 2 * v0
+        - h * u**2 * (1 - u) * v1
+    )
+
+
+NOT_COVERED = ("moving", "start_velocity", "constraints")
+"""What problems may ask for beside, and no certificate proves."""
+
+
+def not_covered(problem: Problem) -> list[str]:
+    """Which of these a problem asks for."""
+    asked = ((name, getattr(problem, name, None)) for name in NOT_COVERED)
+    return [name for name, value in asked if value is not None and len(value)]
+
+
+def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
+    """A line for each thing that the motion does not do."""
+    robot, motion, tolerances = problem.robot, certificate.motion, certificate.tolerances
+    for name in not_covered(problem):
+        yield f"problem: certificates do not prove anything about {name}"
+    if tuple(motion.joint_names) != robot.joint_names:
+        yield f"motion: its joints are {', '.join(motion.joint_names)}, not {', '.join(robot.joint_names)}"
+        return
+    q = configurations(motion, certificate.between)
+    beyond = np.maximum(robot.lower - q, q - robot.upper)
+    beyond[:, robot.continuous] = 0.0
+    for j in np.flatnonzero((beyond > tolerances.limit_slack).any(axis=0)):
+        yield f"motion: {robot.joint_names[j]} leaves its limits by {beyond[:, j].max():.3g}"
+    off = np.abs(motion.positions[0] - problem.start).max(initial=0.0)
+    if not off <= tolerances.start_tolerance:
+        yield f"motion: it begins {off:.3g} off the start"
+    if not at_goal(robot, problem.goal, motion.positions[-1], tolerances):
+        yield "motion: it does not end at the goal"
+    if isinstance(motion, Trajectory):
+        yield from _wrong_rates(robot, motion, certificate)
+
+
+def _wrong_rates(robot: Robot, motion: Trajectory, certificate: Certificate) -> Iterator[str]:
+    tolerances, step = certificate.tolerances, np.diff(motion.times)[:, None]
+    if not (step > 0).all():
+        yield "motion: its times do not increase"
+        return
+    times = np.sort(np.concatenate([motion.times, certificate.between]), kind="stable")
+    if len(np.unique(times)) != len(times) or times[0] < motion.times[0] or times[-1] > motion.times[-1]:
+        yield "motion: the times between its rows are not between them"
+        return
+    if len(motion.times) > 1 and _widest_chord(motion, times) > tolerances.chord * (1 + 1e-6) + 1e-12:
+        yield "motion: its cubics leave the straight lines that were certified"
+    v, a, share = motion.velocities, motion.accelerations, 1 + tolerances.rate_slack
+    mean, change = np.diff(motion.positions, axis=0) / step, np.diff(v, axis=0) / step
+    rates = (
+        ("velocity", v, robot.velocity),
+        ("mean velocity between rows", mean, robot.velocity),
+        ("acceleration", a, robot.acceleration),
+        ("mean acceleration between rows", change, robot.acceleration),
+    )
+    blur = {"mean velocity between rows": 2 * tolerances.limit_slack / step.min(initial=np.inf)}
+    for what, values, limit in rates:
+        over = (np.abs(values) > share * limit + blur.get(what, 0.0)) & (limit > 0)
+        for j in np.flatnonzero(over.any(axis=0)):
+            most = np.abs(values[:, j]).max()
+            yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {most:.4g} > {limit[j]:.4g}"
+    known = np.where(robot.velocity > 0, robot.velocity, np.abs(v).max(axis=0, initial=0.0))
+    if (np.abs(v[[0, -1]]) > tolerances.rate_slack * known + tolerances.rest).any():
+        yield "motion: it does not begin and end at rest"
+
+
+def _widest_chord(motion: Trajectory, times: Float[ndarray, "n"]) -> float:
+    """How far the cubics leave the straight lines between certified configurations at most [rad] or [m]: an
+    eighth of the greatest second derivative times the square of the time between them. It is linear in time,
+    so greatest at an end."""
+    row = np.clip(np.searchsorted(motion.times, times[:-1], side="right") - 1, 0, len(motion.times) - 2)
+    h = (motion.times[row + 1] - motion.times[row])[:, None]
+    mean = (motion.positions[row + 1] - motion.positions[row]) / h
+    v0, v1 = motion.velocities[row], motion.velocities[row + 1]
+    most = np.zeros_like(mean)
+    for end in (times[:-1], times[1:]):
+        u = (end - motion.times[row])[:, None] / h
+        most = np.maximum(most, np.abs((6 * u - 4) * v0 + (6 * u - 2) * v1 + (6 - 12 * u) * mean) / h)
+    return float((most * np.diff(times)[:, None] ** 2 / 8).max(initial=0.0))
+
+
+def at_goal(robot: Robot, goal: Goal, q: Float[ndarray, "dof"], tolerances: Tolerances) -> bool:
+    """Whether a configuration is at a goal."""
+    if isinstance(goal, AnyGoal):
+        return any(at_goal(robot, one, q, tolerances) for one in goal.goals)
+    if isinstance(goal, JointGoal):
+        off = goal.positions - q
+        off = np.where(robot.continuous, np.arctan2(np.sin(off), np.cos(off)), off)
+        return bool((np.abs(off) <= tolerances.goal_tolerance).all(axis=1).any())
+    linkage = Linkage(robot)
+    T = linkage.place(q[None]).T[0, linkage.links.index(goal.frame)]
+    xyz = goal.T_base_frame[:3, :3].T @ (T[:3, 3] - goal.T_base_frame[:3, 3])
+    turn = goal.T_base_frame[:3, :3].T @ T[:3, :3]
+    if goal.xyz_tolerance is None:
+        there = bool(np.linalg.norm(xyz) <= tolerances.goal_distance)
+    else:
+        there = bool((np.abs(xyz) <= goal.xyz_tolerance + tolerances.goal_slack).all())
+    if goal.rpy_tolerance is None:
+        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1.0, 1.0))
+        return there and bool(angle <= tolerances.goal_angle + tolerances.goal_slack)
+    roll, pitch = np.arctan2(turn[2, 1], turn[2, 2]), np.arcsin(np.clip(-turn[2, 0], -1.0, 1.0))
+    yaw = np.arctan2(turn[1, 0], turn[0, 0])
+    ways = np.array([[roll, pitch, yaw], [roll + np.pi, np.pi - pitch, yaw + np.pi]])
+    ways = (ways + np.pi) % (2 * np.pi) - np.pi
+    return there and bool((np.abs(ways) <= goal.rpy_tolerance + tolerances.goal_slack).all(axis=1).any())

@@ -1,0 +1,186 @@
+"""The bounds of certificates, before formulas by hand, Coal and the judge's own kinematics."""
+
+# Coal's Python module has no type information.
+# pyright: reportAttributeAccessIssue=false
+
+import coal
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.box_arm import box_arm
+from robotdiffuse.certificates.bounds import SCENE, Prover, Stretches
+from robotdiffuse.certificates.kinematics import Linkage
+from robotdiffuse.certificates.obstacles import CAP, Obstacles, Rounded, Surface
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose, placed_spheres
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
+
+TURN = [0.9, 0.1, -0.3, 0.3]
+
+
+def shapes() -> list[Shape]:
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.2)
+    return [
+        Sphere([0.3, 0.1, 0.2], 0.2),
+        Box([-0.2, 0.1, 0.0], [0.3, 0.1, 0.5], TURN),
+        Cylinder([0.1, -0.4, 0.1], 0.15, 0.4, TURN),
+        Capsule([0.1, 0.4, -0.3], 0.1, 0.3, TURN),
+        Mesh(ball.vertices, ball.faces, [0.0, 0.0, -0.5], TURN),
+        Mesh([[-5, -5, 0], [5, -5, 0], [0, 9, 0]], [[0, 1, 2]], [0, 0, 0.8]),
+        PointCloud(np.random.default_rng(3).uniform(-0.5, 0.5, (40, 3)), 0.02),
+    ]
+
+
+@pytest.mark.parametrize("name", ["panda", "box arm"])
+def test_links_are_where_the_judge_has_them(name: str) -> None:
+    robot = load_robot("panda") if name == "panda" else box_arm()
+    rng = np.random.default_rng(0)
+    q = rng.uniform(robot.lower, robot.upper, (5, robot.dof))
+    linkage = Linkage(robot)
+    T = linkage.place(q).T
+    for k, link in enumerate(linkage.links):
+        assert linkage.levels[k] == robot.link_frame(link)
+        for row in range(len(q)):
+            np.testing.assert_allclose(T[row, k], link_pose(robot, q[row], link), atol=1e-12)
+
+
+def _triangle(corners: np.ndarray) -> coal.Convex:
+    points, faces = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    for corner in corners:
+        points.append(corner)
+    faces.append(coal.Triangle(0, 1, 2))
+    faces.append(coal.Triangle(0, 2, 1))
+    return coal.Convex(points, faces)
+
+
+def test_distances_are_those_of_coal() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-1, 1, (60, 3))
+    scene = Scene(shapes())
+    obstacles = Obstacles(scene)
+    found = obstacles.distances(points)
+    for k, body in enumerate(obstacles.bodies):
+        if isinstance(body, Surface):
+            count = body.corners.shape[1]
+            pieces = [_triangle(c) if count == 3 else coal.Sphere(1e-9) for c in body.corners]
+            at = [np.zeros(3) if count == 3 else c[0] for c in body.corners]
+        else:
+            x, y, z = 2 * body.half
+            geometry = coal.Box(x, y, z)
+            if body.disc:
+                geometry = coal.Cylinder(body.disc, z)
+            elif body.rounding:
+                geometry = coal.Capsule(body.rounding, z) if z else coal.Sphere(body.rounding)
+            pieces, at = [geometry], [body.center]
+        R = body.R if isinstance(body, Rounded) else np.eye(3)
+        less = body.radius if isinstance(body, Surface) else 0.0
+        for point, distance in zip(points, found[:, k], strict=True):
+            ball, place = coal.Sphere(1e-9), coal.Transform3s(np.eye(3), point)
+            request = coal.DistanceRequest()
+            right = min(
+                coal.distance(ball, place, piece, coal.Transform3s(R, t), request, coal.DistanceResult())
+                for piece, t in zip(pieces, at, strict=True)
+            )
+            if isinstance(body, Surface) and count == 3 and right > 0.1:  # of triangles far away, their balls
+                assert 0.6 * min(right, CAP) <= distance <= right + 1e-5
+            elif right - less > 1e-3:
+                assert distance == pytest.approx(min(right - less, CAP), abs=2e-5)
+            else:
+                assert distance < 2e-3
+
+
+def test_reach_is_the_greatest_of_points_on_the_surface() -> None:
+    n = np.random.default_rng(2).normal(size=(20, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    for shape, body in zip(shapes(), Obstacles(Scene(shapes())).bodies, strict=True):
+        T, meshes = shape.solid() if isinstance(body, Rounded) else (np.eye(4), ())
+        reach = body.reach(n) if isinstance(body, Rounded) else body.reach(n).max(axis=0)
+        if isinstance(shape, Mesh):
+            np.testing.assert_allclose(reach, (shape.world_vertices @ n.T).max(axis=0))
+        for mesh in meshes:  # polyhedra around round shapes, at most 2 % of the radius larger
+            outer = ((mesh.vertices @ T[:3, :3].T + T[:3, 3]) @ n.T).max(axis=0)
+            assert (reach <= outer + 1e-9).all()
+            assert (outer <= reach + 0.005).all()
+
+
+@given(st.integers(0, 10_000))
+def test_nothing_moves_further_than_its_displacement(seed: int) -> None:
+    """Random postures within the spans: every sphere, and every pair of links seen from the nearer one."""
+    rng = np.random.default_rng(seed)
+    robot = load_robot("panda")
+    ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
+    ends[1] = ends[0] + (ends[1] - ends[0]) * rng.uniform(0, 0.5)
+    prover = Prover(robot, Scene(), ends)
+    claims, ones = np.arange(len(prover.claims)), np.ones(len(prover.claims))
+    bounds = prover.bounds(Stretches(claims, 0 * ones, ones), ones < 0, [])
+    middle, linkage = prover.at(np.array([0.5])), prover.linkage
+    places = linkage.place(np.concatenate([middle, prover.at(rng.uniform(0, 1, 8))])).T
+    for claim, displacement in zip(prover.claims, bounds.displacement, strict=True):
+        link = linkage.links.index(claim.link)
+        base = 0 if claim.against == SCENE else linkage.links.index(claim.against)
+        seen = np.linalg.inv(places[:, base]) @ places[:, link]
+        balls = robot.spheres[claim.link]
+        centers = balls[:, :3] @ np.swapaxes(seen[:, :3, :3], 1, 2) + seen[:, None, :3, 3]
+        # a point of a ball goes at least as far as its centre, at most by the turning of its radius more
+        assert np.linalg.norm(centers[1:] - centers[0], axis=-1).max() <= displacement + 1e-12
+
+
+@given(st.integers(0, 10_000))
+def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> None:
+    """Vertices of the hand along a bent path, seen from the base and from a link between."""
+    rng = np.random.default_rng(seed)
+    robot = load_robot("panda")
+    linkage, link = Linkage(robot), "panda_hand"
+    middle = rng.uniform(robot.lower, robot.upper)
+    steps = rng.normal(0, 0.1, (4, robot.dof)) * rng.integers(0, 2, robot.dof)
+    normals = rng.normal(size=(2, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    share = rng.uniform(0, 1, (40, 1))
+    at = middle + np.concatenate([share * steps[0], steps[0] + share * (steps[1] - steps[0]), steps])
+    places = linkage.place(np.concatenate([middle[None], at]))
+    k = linkage.links.index(link)
+    [mesh, *_] = robot.meshes[link]
+    for base in (0, linkage.links.index("panda_link4")):
+        # where the hand comes to stand, as seen from where the base stands in the middle
+        T = places.T[0, base] @ np.linalg.inv(places.T[:, base]) @ places.T[:, k]
+        points = mesh.vertices @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
+        moved_by = range(int(linkage.levels[base]), int(linkage.levels[k]))
+        origins, axes = places.origins[0], places.axes[0]
+        bound = linkage.approach(origins, axes, points[0], moved_by, steps, normals)
+        went = (points[0] - points) @ normals.T
+        assert (bound + 1e-12 >= went.max(axis=0).T).all()
+
+
+def test_sphere_clearances_are_distances_of_the_placed_spheres() -> None:
+    robot, scene = load_robot("panda"), Scene([Sphere([0.5, 0.2, 0.5], 0.1)])
+    q = np.zeros((1, robot.dof)) + (robot.lower + robot.upper) / 2
+    prover = Prover(robot, scene, q)
+    claims = np.array([k for k, claim in enumerate(prover.claims) if claim.against == SCENE])
+    found = prover.bounds(Stretches(claims, 0.0 * claims, 0.0 * claims), claims < 0, [])
+    balls = placed_spheres(robot, q[0])
+    still = sum(len(s) for link, s in robot.spheres.items() if robot.link_frame(link) == 0)
+    right = (np.linalg.norm(balls[still:, :3] - [0.5, 0.2, 0.5], axis=1) - 0.1 - balls[still:, 3]).min()
+    assert found.clearance.min() == pytest.approx(min(right, CAP), abs=1e-12)
+    assert (found.displacement == 0).all()
+
+
+def test_spans_know_the_rows_between_the_ends() -> None:
+    rows = np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 0, 0.5]])
+    prover = Prover(box_arm(), Scene(), rows)
+    start, stop = np.array([0.0, 2.0, 0.5]), np.array([3.0, 3.0, 1.5])
+    spans = prover.spans(start, stop, (start + stop) / 2)
+    np.testing.assert_allclose(spans, [[0.5, 0, 0.5], [0, 0, 0.25], [0.5, 0, 0]])
+
+
+def test_unknown_shapes_are_refused_by_name() -> None:
+    class Strange(Shape):
+        kind, name = "strange", "odd"
+        area, bounds = 0.0, np.zeros((2, 3))  # type: ignore[assignment]
+
+    with pytest.raises(InputError, match="odd: a Strange cannot be certified"):
+        Obstacles(Scene([Strange()]))

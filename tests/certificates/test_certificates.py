@@ -1,0 +1,315 @@
+"""Certificates: what is valid can be certified, what is certified is free, and nobody can tamper with one."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import robotdiffuse as rd
+from helpers.box_arm import box_arm
+from robotdiffuse.certificates.certificate import Certificate, Tolerances, load_certificate
+from robotdiffuse.certificates.writer import NotValidError, certify
+from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.errors import InputError
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.types import Path
+from robotdiffuse.verify import VerifySettings, verify
+
+SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3], [0.6, 0.9, 0.3]])
+
+
+def problem_of(rows: np.ndarray, *shapes: Shape, robot: Robot | None = None) -> tuple[Problem, Path]:
+    robot = robot or box_arm()
+    return Problem(robot, Scene(shapes), rows[0], JointGoal(rows[-1:])), Path(robot.joint_names, rows)
+
+
+def near_things() -> dict[str, tuple[Shape, ...]]:
+    shelf = Box([0.6, 0, -0.032 - 0.05], [1.5, 1.5, 0.1])
+    sides = trimesh.creation.box(shelf.size)
+    side = np.linspace(-0.7, 0.7, 30)
+    cloud = np.stack(np.meshgrid(side + 0.6, side, [-0.037]), axis=-1).reshape(-1, 3)
+    return {
+        "nothing": (),
+        "far": (Sphere([0, -1, 0], 0.2),),
+        "a box 2 mm below": (shelf,),
+        "a mesh 2 mm below": (Mesh(sides.vertices, sides.faces, shelf.center),),
+        "points 2 mm below": (PointCloud(cloud, 0.005),),
+    }
+
+
+@pytest.mark.parametrize("name", near_things())
+def test_what_is_valid_can_be_certified_and_what_is_certified_is_free(name: str) -> None:
+    shapes = near_things()[name]
+    problem, path = problem_of(SWING, *shapes)
+    report = verify(problem, path)
+    certificate = certify(problem, path)
+    assert certificate.check(problem).differences == ()
+    exact = ExactCollision(problem.robot, problem.scene)
+    at = np.linspace(0, 2, 60)
+    q = np.stack([np.interp(at, np.arange(3), column) for column in SWING.T], axis=1)
+    least = min(d.distance for row in q for d in exact.link_distances(row))
+    assert report.scene_clearance is not None
+    assert 0.5 * report.scene_clearance - 1e-4 <= certificate.scene_clearance <= min(least, 1.0)
+    assert bool(certificate.proof.planes) == ("below" in name)
+
+
+def test_a_motion_that_is_not_valid_is_not_certified() -> None:
+    problem, path = problem_of(SWING, Sphere([1.1, 0.3, 0], 0.1))
+    with pytest.raises(NotValidError, match=r"the motion is not valid: l\d is .* inside sphere"):
+        certify(problem, path)
+
+
+@pytest.fixture(scope="module")
+def planned() -> tuple[Problem, rd.PlanResult]:
+    problem = rd.Problem(
+        robot=rd.load_robot("panda"),
+        scene=Scene([Sphere([0.5, 0.0, 0.5], 0.2, "ball"), Box([0.5, 0, -0.06], [2, 2, 0.1], name="table")]),
+        start=[-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
+        goal=[1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8],
+    )
+    return problem, rd.load_planner("rrt_connect").plan(problem, time_limit=5.0)
+
+
+@pytest.fixture(scope="module")
+def file(planned: tuple[Problem, rd.PlanResult], tmp_path_factory: pytest.TempPathFactory) -> FilePath:
+    problem, result = planned
+    assert result.trajectory is not None
+    file = tmp_path_factory.mktemp("certificates") / "certificate.json"
+    rd.certify(problem, result.trajectory).save(file)
+    return file
+
+
+def test_a_certificate_is_checked_from_its_file_alone(file: FilePath) -> None:
+    certificate = rd.load_certificate(file)
+    assert certificate.check().differences == ()
+    assert certificate.check().valid
+    assert 0 < certificate.scene_clearance <= 1
+
+
+def test_the_checker_loads_neither_compiled_code_nor_coal() -> None:
+    """It is another path than the judge's, and starts in a fraction of the time."""
+    import subprocess
+    import sys
+
+    code = (
+        "import sys, robotdiffuse.certificates.checker, robotdiffuse.problems.files\n"
+        "print([m for m in ('numba', 'coal', 'torch') if m in sys.modules])\n"
+        "print([m for m in sys.modules if 'robotdiffuse.collision' in m or m == 'robotdiffuse.verify'])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.split("\n")[:2] == ["[]", "[]"], done.stderr
+
+
+def test_a_path_too(planned: tuple[Problem, rd.PlanResult], tmp_path: FilePath) -> None:
+    problem, result = planned
+    assert result.path is not None
+    rd.certify(problem, result.path).save(tmp_path / "c.json")
+    assert rd.load_certificate(tmp_path / "c.json").check(problem).valid
+
+
+def findings(file: FilePath, tmp_path: FilePath, change: Callable[[dict[str, Any]], None]) -> tuple[str, ...]:
+    record = json.loads(file.read_text())
+    change(record)
+    changed = tmp_path / "changed.json"
+    changed.write_text(json.dumps(record))
+    return load_certificate(changed).check().differences
+
+
+def moved_obstacle(record: dict[str, Any]) -> None:
+    record["problem"]["scene"][0]["sphere"]["center"][1] += 0.001
+
+
+def removed_obstacle(record: dict[str, Any]) -> None:
+    del record["problem"]["scene"][1]
+
+
+def altered_waypoint(record: dict[str, Any]) -> None:
+    record["motion"]["positions"][7][2] += 1e-6
+
+
+def altered_time(record: dict[str, Any]) -> None:
+    record["motion"]["times"][3] -= 1e-4
+
+
+def other_start(record: dict[str, Any]) -> None:
+    record["problem"]["start"][0] += 0.01
+
+
+def other_goal(record: dict[str, Any]) -> None:
+    record["problem"]["goal"]["joints"][0] += 0.01
+
+
+def widest(record: dict[str, Any]) -> dict[str, Any]:
+    return max(record["proof"], key=lambda entry: len(entry["start"]))
+
+
+def altered_clearance(record: dict[str, Any]) -> None:
+    widest(record)["clearance"][1] += 1e-5
+
+
+def altered_displacement(record: dict[str, Any]) -> None:
+    widest(record)["displacement"][1] -= 1e-5
+
+
+def removed_stretch(record: dict[str, Any]) -> None:
+    entry = widest(record)
+    for name in ("start", "stop", "clearance", "displacement"):
+        del entry[name][0]
+    entry["by_planes"], entry["planes"] = [], []
+
+
+def removed_claim(record: dict[str, Any]) -> None:
+    record["proof"].remove(widest(record))
+
+
+def claimed_more(record: dict[str, Any]) -> None:
+    record["scene_clearance"] += 0.05
+
+
+def claimed_nothing(record: dict[str, Any]) -> None:
+    record["self_clearance"] = 0.0
+
+
+def tighter(record: dict[str, Any]) -> None:
+    record["tolerances"]["chord"] = 1e-9
+
+
+def looser(record: dict[str, Any]) -> None:
+    record["tolerances"]["goal_tolerance"] = 0.5
+
+
+TAMPERED = {
+    moved_obstacle: "scene: ball is not as it was",
+    removed_obstacle: "scene: table is not here",
+    altered_waypoint: "motion: it is not the one that was certified: its hash differs",
+    altered_time: "motion: it is not the one that was certified: its hash differs",
+    other_start: "motion: it begins 0.01 off the start",
+    other_goal: "motion: it does not end at the goal",
+    altered_clearance: r"proof: clearance of \w+ against [\w ]+ from row [\d.]+ to row [\d.]+ is",
+    altered_displacement: r"proof: displacement of \w+ against [\w ]+ from row [\d.]+ to row [\d.]+ is",
+    removed_stretch: r"proof: nothing is said of \w+ against [\w ]+ from row 0 to row",
+    removed_claim: r"proof: nothing is said of \w+ against",
+    claimed_more: r"proof: \w+ against the scene from row [\d.]+ to row [\d.]+ is clear by [\d.]+ m, not by",
+    claimed_nothing: "proof: a self clearance of 0 m is none",
+    looser: "tolerances: goal_tolerance is 0.5, looser than 0.0001",
+    tighter: "motion: its cubics leave the straight lines that were certified",
+}
+
+
+@pytest.mark.parametrize("change", TAMPERED, ids=lambda change: change.__name__)
+def test_tampering_is_caught_and_named(
+    file: FilePath, tmp_path: FilePath, change: Callable[[dict[str, Any]], None]
+) -> None:
+    import re
+
+    found = findings(file, tmp_path, change)
+    wanted = TAMPERED[change]  # type: ignore[index]
+    assert any(re.match(wanted, line) for line in found), found
+    assert all("\n" not in line for line in found)
+
+
+def test_another_robot_is_caught_and_named(file: FilePath, planned: tuple[Problem, rd.PlanResult]) -> None:
+    certificate, problem = load_certificate(file), planned[0]
+    opened = replace(problem, robot=problem.robot.with_locked({"panda_finger_joint1": 0.01}))
+    found = certificate.check(opened).differences
+    assert "robot: joint panda_finger_joint1 is not as it was" in found
+    wider = dict(problem.robot.spheres) | {"panda_link5": problem.robot.spheres["panda_link5"] * 1.1}
+    found = certificate.check(replace(problem, robot=replace(problem.robot, spheres=wider))).differences
+    assert "robot: spheres of panda_link5 is not as it was" in found
+    other = Problem(box_arm(), problem.scene, [0, 0, 0], [0, 0, 0])
+    assert any(
+        line.startswith("motion: its joints are panda_joint1")
+        for line in certificate.check(other).differences
+    )
+
+
+def test_whoever_forges_the_hashes_too_still_needs_a_proof(
+    planned: tuple[Problem, rd.PlanResult], file: FilePath
+) -> None:
+    """An obstacle in the way, with a certificate that says that it always was there."""
+    from robotdiffuse.certificates.content import scene_parts
+
+    problem, certificate = planned[0], load_certificate(file)
+    blocked = replace(problem, scene=Scene([*problem.scene.shapes, Sphere([0.0, 0.0, 0.6], 0.3, "new")]))
+    forged = replace(certificate, scene_parts=scene_parts(blocked.scene))
+    found = forged.check(blocked).differences
+    assert any("is not shown to be free" in line for line in found)
+    assert not any(line.startswith("scene:") for line in found)
+
+
+def test_rates_are_checked_anew(planned: tuple[Problem, rd.PlanResult]) -> None:
+    problem, result = planned
+    assert result.trajectory is not None
+    certificate = rd.certify(problem, result.trajectory)
+    slower = replace(
+        problem.robot,
+        joints=tuple(replace(j, velocity=0.1 * j.velocity) for j in problem.robot.joints),
+    )
+    found = certificate.check(replace(problem, robot=slower)).differences
+    assert any("exceeds its limit of velocity" in line for line in found)
+
+
+def test_what_certificates_do_not_prove_is_refused_by_name() -> None:
+    problem, path = problem_of(SWING)
+    certificate = certify(problem, path)
+    object.__setattr__(problem, "moving", ("a ball",))
+    with pytest.raises(InputError, match="the problem has moving, which certificates do not prove"):
+        certify(problem, path)
+    assert (
+        "problem: certificates do not prove anything about moving" in certificate.check(problem).differences
+    )
+
+
+def test_tolerances_are_those_of_the_judge() -> None:
+    """The checker does not import the judge."""
+    settings = VerifySettings()
+    for name, value in asdict(Tolerances()).items():
+        assert getattr(settings, name) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("{}", "is not a certificate"),
+        ("[1]", "is not a certificate"),
+        ('{"is": "robotdiffuse certificate", "version": 9}', "version is 9"),
+        ('{"is": "robotdiffuse certificate", "version": 1}', "is damaged: KeyError"),
+    ],
+)
+def test_files_that_are_none(tmp_path: FilePath, text: str, wanted: str) -> None:
+    file = tmp_path / "c.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=wanted):
+        load_certificate(file)
+
+
+def test_damaged_files_are_one_line(file: FilePath, tmp_path: FilePath) -> None:
+    """Every field in turn is replaced by what does not belong there."""
+    whole = json.loads(file.read_text())
+    for name in whole:
+        for value in (None, [], {}, "x", -1, [[1, 2], [3]], {"a": [None]}):
+            changed = tmp_path / "changed.json"
+            changed.write_text(json.dumps(whole | {name: value}))
+            try:
+                found = load_certificate(changed).check()
+            except InputError as error:
+                assert "\n" not in str(error)
+            else:
+                assert isinstance(found.differences, tuple)
+
+
+def test_certificates_of_robots_in_memory_need_their_problem() -> None:
+    problem, path = problem_of(SWING)
+    certificate = certify(problem, path)
+    assert isinstance(certificate, Certificate)
+    assert certificate.problem is None
+    with pytest.raises(InputError, match="holds no problem; give the problem that it is for"):
+        certificate.check()
