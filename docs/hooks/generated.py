@@ -12,7 +12,7 @@ from mkdocs.structure.pages import Page
 
 READING_ORDER = (
     *("planners", "problems", "robots", "scenes", "results"),
-    *("types", "verify", "paths", "data", "errors"),
+    *("types", "verify", "paths", "viewer", "data", "errors"),
 )
 """Of the rooms that public names are from."""
 TABLES = {

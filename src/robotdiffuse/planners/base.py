@@ -64,6 +64,9 @@ class Planner(ABC, Generic[Own]):
         """
         self.prepare(problem.robot)
         request = Request(until, clearance, velocity_scaling, acceleration_scaling, jerk)
+        return replace(self._plan(problem, time_limit, seed, request), problem=problem)
+
+    def _plan(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
         if problem.waypoints:
             from robotdiffuse.planners.legs import plan_by_waypoints
 
