@@ -37,6 +37,7 @@ BELOW["learning"] = {*BELOW["data"], "learning"}
 BELOW["planners"] = {*CHAIN, "data", "learning", "planners"}
 BELOW["simulation"] = {*CHAIN, "simulation"}
 BELOW["viewer"] = {*CHAIN, "viewer"}
+BELOW["live"] = {*CHAIN, "data", "learning", "planners", "viewer", "live"}
 BELOW["generation"] = {*CHAIN, "data", "learning", "planners", "generation"}
 BELOW["evaluation"] = {*CHAIN, "data", "learning", "planners", "simulation", "generation", "evaluation"}
 
@@ -48,7 +49,7 @@ EXTRAS = {
     "ray": {"processes"},
     "zarr": {"data"},
     "accelerate": {"learning"},
-    "viser": {"viewer"},
+    "viser": {"live"},
     "matplotlib": {"evaluation"},
     "pinocchio": set(),
     "example_robot_data": set(),

@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli import bench, data, plan, planners, robot, simulate, train, view
+from robotdiffuse.cli import bench, data, live, plan, planners, robot, simulate, train, view
 from robotdiffuse.errors import InputError
 
 SOLVED, NO_PLAN, BAD_INPUT, UNWRITTEN, STOPPED = 0, 1, 2, 3, 130
@@ -20,6 +20,7 @@ COMMANDS = (
     plan.add_demo,
     view.add_view,
     view.add_verify,
+    live.add,
     simulate.add,
     planners.add,
     robot.add,
