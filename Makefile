@@ -10,7 +10,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: install demo test lint docs bench weights baselines table1 clean
+.PHONY: install demo test lint docs bench weights baselines table1 chromium clean
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
@@ -28,7 +28,14 @@ install: .venv/dev.stamp
 demo: .venv/core.stamp
 	$(BIN)/robotdiffuse demo
 
-test: .venv/dev.stamp
+# the browser of the page's tests, which are skipped without: root on Debian gets it where there is a network
+chromium:
+	@command -v chromium >/dev/null || { test "$$(id -u)" = 0 && command -v apt-get >/dev/null && \
+		{ timeout 120 apt-get update -qq; DEBIAN_FRONTEND=noninteractive \
+		timeout 600 apt-get install -qq -y --no-install-recommends chromium; } >/dev/null 2>&1; } || \
+		echo "there is no chromium: the tests of the live page in a browser are skipped"
+
+test: .venv/dev.stamp chromium
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 lint: .venv/dev.stamp

@@ -42,6 +42,7 @@ BELOW["planners"] = {*CHAIN, "data", "learning", "planners"}
 BELOW["simulation"] = {*CHAIN, "simulation"}
 BELOW["viewer"] = {*CHAIN, "viewer"}
 BELOW["serve"] = {*CHAIN, "planners", "serve"}
+BELOW["live"] = {*CHAIN, "data", "learning", "planners", "viewer", "live"}
 BELOW["generation"] = {*CHAIN, "data", "learning", "planners", "generation"}
 BELOW["evaluation"] = {*CHAIN, "data", "learning", "planners", "simulation", "generation", "evaluation"}
 
@@ -53,11 +54,11 @@ EXTRAS = {
     "ray": {"processes"},
     "zarr": {"data"},
     "accelerate": {"learning"},
-    "viser": {"viewer"},
     "fastapi": {"serve"},
     "starlette": {"serve"},
     "uvicorn": {"serve"},
     "orjson": {"serve"},
+    "viser": {"live"},
     "matplotlib": {"evaluation"},
     "foxglove_schemas_protobuf": {"handover"},
     "mcap": {"handover"},

@@ -12,7 +12,7 @@ from mkdocs.structure.pages import Page
 
 READING_ORDER = (
     *("planners", "problems", "robots", "scenes", "results"),
-    *("types", "verify", "certificates", "paths", "data", "errors"),
+    *("types", "verify", "certificates", "paths", "viewer", "data", "errors"),
 )
 """Of the rooms that public names are from."""
 TABLES = {

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from robotdiffuse.types import Status as Status
     from robotdiffuse.types import Trajectory as Trajectory
     from robotdiffuse.verify import verify as verify
+    from robotdiffuse.viewer.notebook import show as show
 
 __version__ = "0.1.0"
 ensure_cache()
@@ -84,6 +85,7 @@ _HOME = {
     "PlanResult": "robotdiffuse.results",
     "Status": "robotdiffuse.types",
     "Trajectory": "robotdiffuse.types",
+    "show": "robotdiffuse.viewer.notebook",
     "verify": "robotdiffuse.verify",
 }
 

@@ -58,6 +58,8 @@ class PlanResult:
     unseen_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Least and greatest corner of a box, in the base frame, around the unseen space that the motion crosses
     where that is likeliest to be occupied [m]; None where it crosses none."""
+    problem: Any = field(default=None, repr=False)
+    """The `Problem` that was asked, for `rd.show`; None in results that were read from files."""
 
     @property
     def solved(self) -> bool:

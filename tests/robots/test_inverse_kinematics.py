@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from helpers.example_robots import TIPS, example_robot, planar_arm
 from robotdiffuse.errors import InputError
+from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
@@ -163,3 +164,13 @@ def test_bad_input() -> None:
         InverseKinematicsSettings(max_rounds=0)
     with pytest.raises(InputError, match="position_tolerance is 0"):
         InverseKinematicsSettings(position_tolerance=0.0)
+
+
+def test_the_seed_nearby_gives_a_solution_nearby() -> None:
+    robot = load_robot("panda")
+    q = np.array([0.1, -0.4, 0.2, -2.0, 0.1, 1.6, 0.8])
+    T = link_pose(robot, q, "panda_hand")
+    T[:3, 3] += [0.01, -0.01, 0.005]
+    [near] = inverse_kinematics(robot, "panda_hand", T, 1, rng=np.random.default_rng(0), near=q)
+    assert np.abs(near - q).max() < 0.1
+    np.testing.assert_allclose(link_pose(robot, near, "panda_hand"), T, atol=2e-6)

@@ -79,6 +79,9 @@ class Planner(ABC, Generic[Own]):
         request = Request(until, clearance, velocity_scaling, acceleration_scaling, jerk)
         self._check_keeps(problem, request)
         self.prepare(problem.robot)
+        return replace(self._plan(problem, time_limit, seed, request), problem=problem)
+
+    def _plan(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
         if problem.waypoints:
             from robotdiffuse.planners.legs import plan_by_waypoints
 

@@ -75,7 +75,7 @@ def _planned(
         asked = tuple(getattr(problem, field.name) for field in fields(problem) if field.name != "robot")
         worker = idle.get()
         try:
-            return worker.call(_plan, number[problem.robot], asked)
+            return replace(worker.call(_plan, number[problem.robot], asked), problem=problem)
         except BrokenProcessPool:
             return _error(loaded[0], problem, "the process of the planner died of this problem", request)
         except Exception as error:
@@ -119,4 +119,4 @@ def _plan(robot: int, asked: tuple) -> PlanResult:
     if problem.robot not in _state.warm:
         _state.planner.warm_up(problem)
         _state.warm.add(problem.robot)
-    return _state.planner.plan(problem, **_state.request)
+    return replace(_state.planner.plan(problem, **_state.request), problem=None)  # not sent back

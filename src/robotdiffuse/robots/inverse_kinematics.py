@@ -62,6 +62,7 @@ def inverse_kinematics(
     rng: np.random.Generator,
     accept: Callable[[Float[ndarray, "n dof"]], Bool[ndarray, "n"]] | None = None,
     settings: InverseKinematicsSettings | None = None,
+    near: Float[ndarray, "dof"] | None = None,
 ) -> Float[ndarray, "k dof"]:
     """Up to `count` distinct configurations that bring link `frame` to the pose, inside the joint limits.
 
@@ -69,7 +70,8 @@ def inverse_kinematics(
     and joints pushed against a limit are held while the others move. Joints behind the link keep random
     values. The result is empty if the pose was not reached, and depends on nothing but the arguments and the
     state of `rng`. `accept` is called with batches of solutions, e.g. to keep those free of collision; what
-    it refuses does not stop a solution nearby from being tried.
+    it refuses does not stop a solution nearby from being tried. `near` is the seed that is tried first: for a
+    pose that moves by little, the first solution does too.
 
     Raises InputError for an unknown link, one that no planned joint moves, a count below 1, or a matrix that
     is no finite rigid transform.
@@ -90,8 +92,10 @@ def inverse_kinematics(
     target = np.array(T_base_frame, dtype=np.float64)
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
     idle = 0
-    for _ in range(settings.max_rounds):
+    for i in range(settings.max_rounds):
         seeds = rng.uniform(lower, upper, (settings.seeds_per_round, robot.dof))
+        if i == 0 and near is not None:
+            seeds[0] = np.clip(near, lower, upper)
         before = len(accepted)
         while len(seeds) and len(accepted) < count:
             new, used = solve_seeds(

@@ -7,12 +7,17 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.spatial import ConvexHull
 
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.viewer import look
 from robotdiffuse.viewer.look import Surface
 from robotdiffuse.viewer.raster import draw
 
 AZIMUTHS = 18
 ELEVATIONS = np.radians((15.0, 25.0))
 VERTICAL_FIELD = np.radians(28)
+TRACE_POINTS = 120
+"""Configurations at which a motion is looked at."""
 REACH_OF_FRAME = 1.3
 """Obstacles count for the framing up to this distance from the middle of the arm [m]."""
 
@@ -111,6 +116,26 @@ def best_view(
             if score > best_score:
                 best, best_score = _direction(azimuth, elevation), score
     return framed(points, best, width, height, free)
+
+
+def view_of_motion(
+    robot: Robot,
+    scene: Scene,
+    surfaces: list[Surface],
+    tool: tuple[int, Float[ndarray, "3"]],
+    q: Float[ndarray, "n dof"],
+    width: int,
+    height: int,
+    free: tuple[float, float],
+) -> Camera:
+    """The best view of a motion among obstacles; `surfaces` and `tool` are those of `look`."""
+    q = look.dense(q, TRACE_POINTS)
+    poses = look.frames(robot, q)
+    colored = zip(scene.shapes, look.obstacle_colors(scene), strict=True)
+    obstacles = look.join([look.shape_surface(shape, color) for shape, color in colored])
+    ghosts = look.join([look.posed(surfaces, poses[i]) for i in (0, len(q) // 2)])
+    arm, trace = look.posed(surfaces, poses[-1]), look.trace(robot, tool, q)
+    return best_view(arm, ghosts, trace, obstacles, width, height, free)
 
 
 def _score(

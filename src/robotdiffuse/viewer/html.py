@@ -20,13 +20,12 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
 from robotdiffuse.types import Path, Trajectory
 from robotdiffuse.viewer import look
-from robotdiffuse.viewer.camera import VERTICAL_FIELD, best_view
-from robotdiffuse.viewer.look import GOAL, START, Surface, join
+from robotdiffuse.viewer.camera import TRACE_POINTS, VERTICAL_FIELD, view_of_motion
+from robotdiffuse.viewer.look import GOAL, START, Surface
 
 RATE = 60.0
 """Most rows of the motion that are kept for each second; the page interpolates between them."""
 MOST_ROWS = 3000
-TRACE_POINTS = 120
 VIEW = (1600, 1000)
 FREE = (0.09, 0.15)
 """Shares of the window's height that the first view leaves free for the panels."""
@@ -96,7 +95,7 @@ def _page_data(
         "start_color": START,
         "goal_color": GOAL,
         "facts": look.facts(motion, result),
-        "camera": _camera(robot, scene, surfaces, tool, motion.positions, colors),
+        "camera": _camera(robot, scene, surfaces, tool, motion.positions),
     }
 
 
@@ -134,14 +133,8 @@ def _camera(
     surfaces: list[Surface],
     tool: tuple[int, ndarray],
     q: Float[ndarray, "n dof"],
-    colors: list[tuple[int, int, int]],
 ) -> dict[str, Any]:
-    q = look.dense(q, TRACE_POINTS)
-    poses = look.frames(robot, q)
-    obstacles = join([look.shape_surface(s, c) for s, c in zip(scene.shapes, colors, strict=True)])
-    ghosts = join([look.posed(surfaces, poses[i]) for i in (0, len(q) // 2)])
-    points = look.trace(robot, tool, q)
-    camera = best_view(look.posed(surfaces, poses[-1]), ghosts, points, obstacles, *VIEW, FREE)
+    camera = view_of_motion(robot, scene, surfaces, tool, q, *VIEW, FREE)
     return {
         "eye": _rounded(camera.eye, 4),
         "target": _rounded(camera.target, 4),

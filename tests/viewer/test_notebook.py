@@ -1,0 +1,67 @@
+"""rd.show: a replay in a cell."""
+
+import html
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.problems.files import problem_record
+
+START, END = np.array([0.0, -0.4, 0, -2, 0, 1.6, 0.8]), np.array([0.3, -0.4, 0, -2, 0, 1.6, 0.8])
+
+
+@pytest.fixture(scope="module")
+def problem() -> rd.Problem:
+    return rd.Problem(rd.load_robot("panda"), rd.Scene([rd.Sphere([0, 0.9, 0.5], 0.1, "moon")]), START, END)
+
+
+@pytest.fixture(scope="module")
+def result(problem: rd.Problem) -> rd.PlanResult:
+    return rd.load_planner("aorrtc").plan(problem, 5.0)
+
+
+@pytest.fixture
+def notebook(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a kernel of Jupyter has it."""
+    shell = SimpleNamespace(kernel=object())
+    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(get_ipython=lambda: shell))  # type: ignore
+
+
+@pytest.mark.usefixtures("notebook")
+def test_a_result_in_a_cell(result: rd.PlanResult) -> None:
+    cell = rd.show(result, height=300)._repr_html_()
+    assert cell.startswith('<iframe srcdoc="&lt;!doctype html&gt;') and 'height="300"' in cell
+    page = html.unescape(cell.partition('srcdoc="')[2].rpartition('" height')[0])
+    assert page.endswith("</html>\n") and '"moon"' in page
+
+
+@pytest.mark.usefixtures("notebook")
+def test_a_result_file_in_a_cell(result: rd.PlanResult, problem: rd.Problem, tmp_path) -> None:
+    result.save(tmp_path / "with.json", problem_record(problem))
+    assert "moon" in rd.show(rd.load_result(tmp_path / "with.json"))._repr_html_()
+    result.save(tmp_path / "without.json")
+    without = rd.load_result(tmp_path / "without.json")
+    with pytest.raises(rd.InputError, match=r"give it: rd\.show\(result, problem\)"):
+        rd.show(without)
+    assert "moon" in rd.show(without, problem)._repr_html_()
+
+
+@pytest.mark.usefixtures("notebook")
+def test_no_motion(problem: rd.Problem) -> None:
+    blocked = rd.Problem(problem.robot, rd.Scene([rd.Sphere([0.4, 0, 0.4], 0.3)]), START, END)
+    with pytest.raises(rd.InputError, match="there is no motion to show: invalid_start"):
+        rd.show(rd.load_planner("aorrtc").plan(blocked))
+
+
+def test_outside_a_notebook(result: rd.PlanResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "IPython", raising=False)
+    with pytest.raises(rd.InputError, match=r"rd\.show is for notebooks; elsewhere .* `robotdiffuse view`"):
+        rd.show(result)
+
+
+def test_results_of_many_know_their_problems(problem: rd.Problem) -> None:
+    [many] = rd.plan_many([problem], "aorrtc", workers=1, time_limit=5.0)
+    assert many.problem is problem
