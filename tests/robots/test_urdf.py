@@ -157,7 +157,7 @@ def test_bad_arguments_give_one_clear_line(tmp_path: Path) -> None:
         (lambda: read_urdf(file, base="fore", tip="base"), "'base'; known: fore"),
         (lambda: read_urdf(file, base="fore"), "no movable joint"),
         (lambda: read_urdf(file, locked={"wrist": 0.0}), "'wrist'"),
-        (lambda: load_robot("no_such_robot"), "known: baxter_left, "),
+        (lambda: load_robot("no_such_robot"), "baxter_left, baxter_right, "),
         (lambda: load_robot("nowhere/arm.urdf"), "arm.urdf"),
     ):
         with pytest.raises(InputError, match=r"^[^\n]*$") as error:

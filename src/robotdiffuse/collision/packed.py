@@ -1,18 +1,23 @@
 """Link clearances of many configurations in as many packed scenes, and gradients: the denoiser's input in
 training."""
 
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float32
 from numba import njit
 from numpy import ndarray
 
-from robotdiffuse.collision.arrays import RobotArrays, SceneArrays, compile_scene
+from robotdiffuse.collision.arrays import BOX_SLACK, NO_BOX, RobotArrays, SceneArrays, compile_scene
 from robotdiffuse.collision.kernels.clearance_gradients import clearances_and_gradients_into
 from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_clearance import clearances_into, make_clearance_workspace
+from robotdiffuse.collision.kernels.simd import W
 from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
+
+_ZERO, _ONE, _FAR = np.float32(0.0), np.float32(1.0), np.float32(NO_BOX[0, 0])
 
 
 @allocation_free()
@@ -50,21 +55,67 @@ def _unpack(kinds, params, spheres, boxes):
     return n, m
 
 
+class _Rows(NamedTuple):
+    """Room for the rows of SceneArrays, for one scene after the other."""
+
+    spheres: ndarray
+    boxes: ndarray
+    solids: ndarray
+    around: ndarray
+
+
 @njit(cache=True)
-def _scene(empty, floors, floor, kinds, params, spheres, boxes):
-    """A packed scene with its floor, one of `floors`, first of the boxes; spheres and boxes hold its rows."""
+def _make_rows(obstacles):
+    """For so many obstacles and a floor."""
+    return _Rows(
+        np.empty((obstacles, 4), np.float32),
+        np.empty((obstacles + 1, 15), np.float32),
+        np.empty((obstacles + 1, 17), np.float32),
+        np.empty((obstacles // W + 1, 6 * W), np.float32),
+    )
+
+
+@njit(cache=True)
+def _join(spheres, boxes, solids, around):
+    """Writes what `arrays._solids` makes of these; returns how many rows of 16 boxes there are."""
+    n, total = len(spheres), len(spheres) + len(boxes)
+    solids[:total] = _ZERO
+    rows = (total + W - 1) // W
+    around[:rows, : 3 * W], around[:rows, 3 * W :] = _FAR, -_FAR
+    for k in range(total):
+        solid = solids[k]
+        if k < n:
+            solid[:3], solid[15] = spheres[k, :3], spheres[k, 3]
+            solid[3], solid[7], solid[11] = _ONE, _ONE, _ONE
+        else:
+            solid[:15] = boxes[k - n]
+        for i in range(3):
+            extent = solid[15]
+            for j in range(3):
+                extent += abs(solid[3 + 3 * j + i]) * solid[12 + j]
+            extent += np.float32(BOX_SLACK) * (_ONE + abs(solid[i]) + extent)
+            around[k // W, i * W + k % W] = solid[i] - extent
+            around[k // W, (3 + i) * W + k % W] = solid[i] + extent
+    return rows
+
+
+@njit(cache=True)
+def _scene(empty, floors, floor, kinds, params, rows):
+    """A packed scene with its floor, one of `floors`, first of the boxes, in these rows."""
     fixed = 0
     if floor >= 0:
-        boxes[0] = floors[floor]
+        rows.boxes[0] = floors[floor]
         fixed = 1
-    n, m = _unpack(kinds, params, spheres, boxes[fixed:])
+    n, m = _unpack(kinds, params, rows.spheres, rows.boxes[fixed:])
+    spheres, boxes = rows.spheres[:n], rows.boxes[: fixed + m]
+    sixteens = _join(spheres, boxes, rows.solids, rows.around)
     return SceneArrays(
-        spheres[:n],
-        boxes[: fixed + m],
+        spheres,
+        boxes,
         empty.cylinders,
         empty.capsules,
-        empty.solids,
-        empty.around,
+        rows.solids[: n + fixed + m],
+        rows.around[:sixteens],
         empty.points,
         empty.point_rows,
         empty.cell_first,
@@ -78,11 +129,10 @@ def _scene(empty, floors, floor, kinds, params, spheres, boxes):
 def _packed_link_clearances(robot, empty, floors, floor, kinds, params, q, limit):
     first = np.searchsorted(robot.frame, 1)
     out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
-    spheres = np.empty((kinds.shape[1], 4), np.float32)
-    boxes = np.empty((kinds.shape[1] + 1, 15), np.float32)
-    work = make_clearance_workspace(robot, len(spheres) + len(boxes) + 1)
+    rows = _make_rows(kinds.shape[1])
+    work = make_clearance_workspace(robot, len(rows.spheres) + len(rows.boxes) + 1)
     for b in range(len(q)):
-        scene = _scene(empty, floors, floor[b], kinds[b], params[b], spheres, boxes)
+        scene = _scene(empty, floors, floor[b], kinds[b], params[b], rows)
         clearances_into(robot, scene, q[b], limit, work, out[b])
     return out
 
@@ -92,11 +142,10 @@ def _packed_gradients(robot, empty, floors, floor, kinds, params, q, limit, marg
     first = np.searchsorted(robot.frame, 1)
     out = np.empty((q.shape[0], q.shape[1], len(robot.frame) - first), np.float32)
     gradients = np.empty(q.shape, np.float32)
-    spheres = np.empty((kinds.shape[1], 4), np.float32)
-    boxes = np.empty((kinds.shape[1] + 1, 15), np.float32)
-    work = make_clearance_workspace(robot, len(spheres) + len(boxes) + 1)
+    rows = _make_rows(kinds.shape[1])
+    work = make_clearance_workspace(robot, len(rows.spheres) + len(rows.boxes) + 1)
     for b in range(len(q)):
-        scene = _scene(empty, floors, floor[b], kinds[b], params[b], spheres, boxes)
+        scene = _scene(empty, floors, floor[b], kinds[b], params[b], rows)
         clearances_and_gradients_into(robot, scene, q[b], limit, margin, work, out[b], gradients[b])
     return out, gradients
 
