@@ -1,8 +1,12 @@
 """robotdiffuse live"""
 
 import argparse
+import os
+import signal
 import socket
+import sys
 import threading
+from typing import NoReturn
 
 from robotdiffuse.cli.arguments import positive
 from robotdiffuse.errors import InputError
@@ -50,7 +54,7 @@ def port(text: str) -> int:
     return int(text)
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> NoReturn:
     try:
         from robotdiffuse.live.page import Page
     except ModuleNotFoundError as error:
@@ -59,6 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("the page needs viser: pip install 'robotdiffuse[live]'") from None
     from rich.console import Console
 
+    from robotdiffuse.cli import STOPPED
     from robotdiffuse.live.door import bound, is_loopback, new_token
     from robotdiffuse.live.exchange import first_problem
     from robotdiffuse.live.session import Choice, Session
@@ -73,10 +78,12 @@ def run(arguments: argparse.Namespace) -> int:
     host, number = listening.getsockname()[:2]
     token = "" if is_loopback(host) else new_token()
     page = Page(Session(problem, choice), listening, token)
+    ended = threading.Event()
+    for wish in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(wish, lambda *_: ended.set())
     name = socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
     print(f"the page is at http://{name}:{number}/{token} (Ctrl-C ends it)", flush=True)
-    try:
-        threading.Event().wait()
-    finally:
-        page.close()
-    return 0
+    ended.wait()
+    page.close()
+    print("robotdiffuse: stopped", file=sys.stderr, flush=True)
+    os._exit(STOPPED)  # threads that plan or compile would be waited for otherwise, and nothing is lost
