@@ -44,7 +44,7 @@ NOT_COVERED = ("moving", "start_velocity", "constraints")
 
 def not_covered(problem: Problem) -> list[str]:
     """Which of these a problem asks for."""
-    asked = ((name, getattr(problem, name, None)) for name in NOT_COVERED)
+    asked = ((name, getattr(problem, name)) for name in NOT_COVERED)
     return [name for name, value in asked if value is not None and len(value)]
 
 

@@ -39,8 +39,8 @@ BATCH_WORK = 12_000
 """Iterations of search that take about as long as a batch of 16 samples in two steps, or its refinement."""
 WAYPOINTS = 48
 """Of smooth noise: as many as the networks have."""
-BATCH_SECONDS = 0.05
-"""What a batch or its refinement takes, until it is known [s]."""
+BATCH_SECONDS = 0.1
+"""What a batch or its refinement takes, until it is known [s]: the first of a process is slow."""
 LOAD_SECONDS = 3.0
 """A call that has so much time left may load PyTorch and the network [s]."""
 
