@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.distance import frames_of, placed
+from robotdiffuse.collision.kernels.distance import frames_of, placed, solid_distance
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
 from robotdiffuse.collision.kernels.simd import W, first_lane, greatest, lane, least, load, magnitude, root
 
@@ -35,40 +35,6 @@ def _signed_distances(x, y, z, solid):
         inside = least(greatest(greatest(u, v), w), _ZERO)
     u, v, w = greatest(u, _ZERO), greatest(v, _ZERO), greatest(w, _ZERO)
     return root(u * u + v * v + w * w) + inside - solid[15]
-
-
-@allocation_free(fastmath=True)
-def _signed_distance(solid, x, y, z):
-    """Of a point to an obstacle, and its gradient."""
-    dx, dy, dz = x - solid[0], y - solid[1], z - solid[2]
-    u = dx * solid[3] + dy * solid[4] + dz * solid[5]
-    v = dx * solid[6] + dy * solid[7] + dz * solid[8]
-    w = dx * solid[9] + dy * solid[10] + dz * solid[11]
-    a, b, c = abs(u) - solid[12], abs(v) - solid[13], abs(w) - solid[14]
-    # outwards in the first two axes: round solids have but one such direction
-    ou, ov, pu, pv = np.copysign(_ONE, u), _ZERO, _ZERO, np.copysign(_ONE, v)
-    if solid[16] > _ZERO:
-        r = np.sqrt(u * u + v * v) + _TINY
-        a, b, ou, ov = r - solid[12], -solid[12], u / r, v / r
-    if a <= _ZERO and b <= _ZERO and c <= _ZERO:
-        d, na, nb, nc = max(a, b, c), _ZERO, _ZERO, _ZERO
-        if a >= b and a >= c:
-            na = _ONE
-        elif b >= c:
-            nb = _ONE
-        else:
-            nc = _ONE
-    else:
-        a, b, c = max(a, _ZERO), max(b, _ZERO), max(c, _ZERO)
-        d = np.sqrt(a * a + b * b + c * c) + _TINY
-        na, nb, nc = a / d, b / d, c / d
-    u, v, w = na * ou + nb * pu, na * ov + nb * pv, np.copysign(nc, w)
-    return (
-        d - solid[15],
-        solid[3] * u + solid[6] * v + solid[9] * w,
-        solid[4] * u + solid[7] * v + solid[10] * w,
-        solid[5] * u + solid[8] * v + solid[11] * w,
-    )
 
 
 @allocation_free(forceinline=True)
@@ -155,7 +121,7 @@ def _row_cost(robot, scene, row, frame, margin, nearest, wrench):
         i = first_lane(pushed)
         pushed &= pushed - 1
         px, py, pz = lane(x, i), lane(y, i), lane(z, i)
-        d, nx, ny, nz = _signed_distance(scene.solids[nearest[i]], px, py, pz)
+        d, nx, ny, nz = solid_distance(scene.solids[nearest[i]], px, py, pz)
         h = max(lane(within, i) - d, _ZERO)
         cost += _HALF * h * h
         _push(wrench, px, py, pz, h * nx, h * ny, h * nz)

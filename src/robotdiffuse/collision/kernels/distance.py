@@ -48,75 +48,37 @@ def placed(frame, x, y, z):
 
 
 @allocation_free(fastmath=True)
-def _local(obstacle, x, y, z):
-    dx, dy, dz = x - obstacle[0], y - obstacle[1], z - obstacle[2]
-    return (
-        obstacle[3] * dx + obstacle[4] * dy + obstacle[5] * dz,
-        obstacle[6] * dx + obstacle[7] * dy + obstacle[8] * dz,
-        obstacle[9] * dx + obstacle[10] * dy + obstacle[11] * dz,
-    )
-
-
-@allocation_free(fastmath=True)
-def _outwards(obstacle, u, v, w):
-    return (
-        obstacle[3] * u + obstacle[6] * v + obstacle[9] * w,
-        obstacle[4] * u + obstacle[7] * v + obstacle[10] * w,
-        obstacle[5] * u + obstacle[8] * v + obstacle[11] * w,
-    )
-
-
-@allocation_free(fastmath=True)
-def _sphere(obstacle, x, y, z):
-    dx, dy, dz = x - obstacle[0], y - obstacle[1], z - obstacle[2]
-    d = np.sqrt(dx * dx + dy * dy + dz * dz) + _TINY
-    return d - obstacle[3], dx / d, dy / d, dz / d
-
-
-@allocation_free(fastmath=True)
-def _box(obstacle, x, y, z):
-    u, v, w = _local(obstacle, x, y, z)
-    a, b, c = abs(u) - obstacle[12], abs(v) - obstacle[13], abs(w) - obstacle[14]
+def solid_distance(solid, x, y, z):
+    """Signed distance of a point to a row of `SceneArrays.solids`, and its gradient."""
+    dx, dy, dz = x - solid[0], y - solid[1], z - solid[2]
+    u = dx * solid[3] + dy * solid[4] + dz * solid[5]
+    v = dx * solid[6] + dy * solid[7] + dz * solid[8]
+    w = dx * solid[9] + dy * solid[10] + dz * solid[11]
+    a, b, c = abs(u) - solid[12], abs(v) - solid[13], abs(w) - solid[14]
+    # outwards in the first two axes: round solids have but one such direction
+    ou, ov, pu, pv = np.copysign(_ONE, u), _ZERO, _ZERO, np.copysign(_ONE, v)
+    if solid[16] > _ZERO:
+        r = np.sqrt(u * u + v * v) + _TINY
+        a, b, ou, ov = r - solid[12], -solid[12], u / r, v / r
     if a <= _ZERO and b <= _ZERO and c <= _ZERO:
+        d, na, nb, nc = max(a, b, c), _ZERO, _ZERO, _ZERO
         if a >= b and a >= c:
-            nu, nv, nw, d = np.copysign(_ONE, u), _ZERO, _ZERO, a
+            na = _ONE
         elif b >= c:
-            nu, nv, nw, d = _ZERO, np.copysign(_ONE, v), _ZERO, b
+            nb = _ONE
         else:
-            nu, nv, nw, d = _ZERO, _ZERO, np.copysign(_ONE, w), c
+            nc = _ONE
     else:
         a, b, c = max(a, _ZERO), max(b, _ZERO), max(c, _ZERO)
         d = np.sqrt(a * a + b * b + c * c) + _TINY
-        nu, nv, nw = np.copysign(a / d, u), np.copysign(b / d, v), np.copysign(c / d, w)
-    nx, ny, nz = _outwards(obstacle, nu, nv, nw)
-    return d, nx, ny, nz
-
-
-@allocation_free(fastmath=True)
-def _cylinder(obstacle, x, y, z):
-    u, v, w = _local(obstacle, x, y, z)
-    r = np.sqrt(u * u + v * v) + _TINY
-    a, c = r - obstacle[12], abs(w) - obstacle[13]
-    if a <= _ZERO and c <= _ZERO:
-        if a >= c:
-            nr, nw, d = _ONE, _ZERO, a
-        else:
-            nr, nw, d = _ZERO, np.copysign(_ONE, w), c
-    else:
-        a, c = max(a, _ZERO), max(c, _ZERO)
-        d = np.sqrt(a * a + c * c) + _TINY
-        nr, nw = a / d, np.copysign(c / d, w)
-    nx, ny, nz = _outwards(obstacle, nr * u / r, nr * v / r, nw)
-    return d, nx, ny, nz
-
-
-@allocation_free(fastmath=True)
-def _capsule(obstacle, x, y, z):
-    u, v, w = _local(obstacle, x, y, z)
-    w -= min(max(w, -obstacle[13]), obstacle[13])
-    d = np.sqrt(u * u + v * v + w * w) + _TINY
-    nx, ny, nz = _outwards(obstacle, u / d, v / d, w / d)
-    return d - obstacle[12], nx, ny, nz
+        na, nb, nc = a / d, b / d, c / d
+    u, v, w = na * ou + nb * pu, na * ov + nb * pv, np.copysign(nc, w)
+    return (
+        d - solid[15],
+        solid[3] * u + solid[6] * v + solid[9] * w,
+        solid[4] * u + solid[7] * v + solid[10] * w,
+        solid[5] * u + solid[8] * v + solid[11] * w,
+    )
 
 
 @allocation_free(inline="always")
@@ -126,20 +88,8 @@ def scene_distance(scene, x, y, z, limit):
     To point clouds up to a few millimetres too much.
     """
     best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
-    for k in range(len(scene.spheres)):
-        d, nx, ny, nz = _sphere(scene.spheres[k], x, y, z)
-        if d < best:
-            best, bx, by, bz = d, nx, ny, nz
-    for k in range(len(scene.boxes)):
-        d, nx, ny, nz = _box(scene.boxes[k], x, y, z)
-        if d < best:
-            best, bx, by, bz = d, nx, ny, nz
-    for k in range(len(scene.cylinders)):
-        d, nx, ny, nz = _cylinder(scene.cylinders[k], x, y, z)
-        if d < best:
-            best, bx, by, bz = d, nx, ny, nz
-    for k in range(len(scene.capsules)):
-        d, nx, ny, nz = _capsule(scene.capsules[k], x, y, z)
+    for k in range(len(scene.solids)):
+        d, nx, ny, nz = solid_distance(scene.solids[k], x, y, z)
         if d < best:
             best, bx, by, bz = d, nx, ny, nz
     if len(scene.points):
