@@ -24,8 +24,8 @@ from robotdiffuse.collision.motion import covered
 from robotdiffuse.robots.lever_arms import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.moving import MovingObstacle, track_speeds
+from robotdiffuse.scenes.placement import placed
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.solids import placed
 from robotdiffuse.transforms import inverse, quaternion_from_rotation
 
 if TYPE_CHECKING:

@@ -36,9 +36,9 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving import MovingObstacle
+from robotdiffuse.scenes.placement import placed
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Shape
-from robotdiffuse.scenes.solids import placed
 from robotdiffuse.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.transforms import inverse, rotation_angle, transform
 from robotdiffuse.types import Trajectory

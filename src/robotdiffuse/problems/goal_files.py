@@ -17,6 +17,7 @@ from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.equipment import pose_entry, pose_of
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
 from robotdiffuse.scenes.files import check_fields
+from robotdiffuse.scenes.placement import placed
 from robotdiffuse.scenes.scene import Scene
 
 GOALS = ("joints", "joint_set", "pose", "any")
@@ -76,8 +77,6 @@ def _object_pose(field: str, name: object, scene: Scene) -> Float[ndarray, "4 4"
     shapes = {shape.name: shape for shape in scene.shapes}
     if name not in shapes:
         raise unknown_name(f"object in {field}.relative_to:", str(name), shapes)
-    from robotdiffuse.scenes.solids import placed  # compiled code, which most problems do not need
-
     try:
         return placed(shapes[str(name)])
     except InputError as error:

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.checks import form, numbers, vector, within
 from robotdiffuse.errors import InputError, shown
+from robotdiffuse.scenes.placement import placed
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.transforms import (
     inverse,
@@ -178,13 +179,6 @@ class MovingObstacle:
         velocity = None if self.velocity is None else T[:3, :3] @ self.velocity
         poses = None if self.poses is None else T @ self.poses
         return replace(self, shape=self.shape.moved(T), velocity=velocity, poses=poses)
-
-
-def placed(shape: Shape) -> Float[ndarray, "4 4"]:
-    """T_base_shape; InputError for a cloud of points, which has no frame of its own."""
-    from robotdiffuse.scenes import solids  # and compiled code, which reading a problem can do without
-
-    return solids.placed(shape)
 
 
 def track_speeds(

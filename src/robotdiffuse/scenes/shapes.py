@@ -44,7 +44,7 @@ class Shape(ABC):
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
         """The shape after a rigid motion."""
-        from robotdiffuse.scenes.solids import moved
+        from robotdiffuse.scenes.placement import moved
 
         return moved(self, T)
 
