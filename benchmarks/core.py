@@ -1,6 +1,7 @@
 """Quality per millisecond: first motions, lengths over time, kernel, limits, timing, collisions.
 
     python benchmarks/core.py [--problems FOLDER --lengths FILE] [--parts first,lengths,...] [--each 25]
+                              [--motions 400]
 
 Prints the report that is kept in benchmarks/results/core.txt. FOLDER holds MotionBenchMaker families (scene
 and request files), FILE reference lengths, {"length": {"family/number": {"best_known": ...}}}; of families
@@ -263,8 +264,8 @@ def steps(a: np.ndarray, b: np.ndarray) -> int:
     return max(int(np.ceil(np.abs(b - a).max() / 0.005)), 1)
 
 
-def collisions(cases: Sequence[Case], _lengths: dict, motions: int = 400) -> None:
-    """Motions checked on meshes at 2 mrad by Coal and by PyBullet, half of them in scenes with thin
+def collisions(_cases: Sequence[Case], _known: dict, motions: int) -> None:
+    """Motions checked on meshes every 5 mrad by Coal and by PyBullet, half of them in scenes with thin
     things."""
     from robotdiffuse.simulation.oracle import PyBulletOracle
 
@@ -275,7 +276,7 @@ def collisions(cases: Sequence[Case], _lengths: dict, motions: int = 400) -> Non
         for i in progress(range(motions // 2), name):
             problem = families[i % len(families)].draw(PANDA, np.random.default_rng([SEED, i])).problem(PANDA)
             problem = thin(problem, rng) if i % 2 else problem
-            result = planner.plan(problem, 0.2, seed=i, clearance=0.0)
+            result = planner.plan(problem, 0.05, seed=i, clearance=0.0)
             if result.trajectory is None:
                 continue
             legs = pairwise(result.trajectory.positions)
@@ -283,7 +284,7 @@ def collisions(cases: Sequence[Case], _lengths: dict, motions: int = 400) -> Non
             checked, looked = checked + 1, looked + len(dense)
             hits[0] += bool(ExactCollision(PANDA, problem.scene).collides(dense).any())
             with PyBulletOracle(PANDA, problem.scene) as oracle:
-                hits[1] += any(oracle.collides(q) for q in dense)
+                hits[1] += oracle.check_frames(dense, tolerance=0.0) is not None
         rows.append((name, checked, looked, *hits))
     columns = ["planner", "motions", "configurations", "in collision by Coal", "by PyBullet"]
     print_table("Returned motions on meshes", columns, rows)
@@ -298,6 +299,7 @@ def main() -> None:
     parser.add_argument("--lengths", type=Path, help="reference lengths (JSON)")
     parser.add_argument("--each", type=int, default=25, help="problems of each family (25)")
     parser.add_argument("--parts", default=",".join(PARTS), help="of the report, parted by commas (all)")
+    parser.add_argument("--motions", type=int, default=400, help="that are checked on meshes (400)")
     arguments = parser.parse_args()
     known = json.loads(arguments.lengths.read_text())["length"] if arguments.lengths else {}
     print(header("numpy", "numba", "coal", "toppra"))
@@ -305,7 +307,8 @@ def main() -> None:
     for name in ("aorrtc", "robotdiffuse", "rrt_connect"):
         load_planner(name).plan(cases[0].problem, 30.0)  # compiles
     for part in arguments.parts.split(","):
-        PARTS[part](cases, known)
+        more = (arguments.motions,) if part == "collisions" else ()
+        PARTS[part](cases, known, *more)
 
 
 if __name__ == "__main__":
