@@ -317,7 +317,7 @@ def test_planners_lists_them_all_without_loading_them() -> None:
 def test_settings_of_a_planner_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("planners", "rrt_connect") == 0
     printed = capsys.readouterr().out
-    assert "range" in printed and "1.0" in printed and "Longest extension of a tree" in printed
+    assert "range" in printed and "0.7" in printed and "Longest extension of a tree" in printed
     assert run("planners", "teleport") == 2
     assert "unknown planner 'teleport'" in capsys.readouterr().err
 
@@ -339,9 +339,9 @@ def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        ("rangee=0.5", "has no setting 'rangee'; it has range=1.0, resolution=0.05, "),
+        ("rangee=0.5", "has no setting 'rangee'; it has range=0.7, resolution=0.05, "),
         ("range=0", "rrt_connect.range is 0.0; it must be positive"),
-        ("range", "'range' is not NAME=VALUE; rrt_connect has range=1.0, "),
+        ("range", "'range' is not NAME=VALUE; rrt_connect has range=0.7, "),
     ],
 )
 def test_wrong_settings_are_told(

@@ -42,8 +42,8 @@ NO_SHORTER = 1e-4
 class SearchSettings(Settings):
     """What RRT-Connect and AORRTC have in common."""
 
-    range: Positive = 1.0
-    """Longest extension of a tree [rad, joint-space L2]."""
+    range: Positive = 0.7
+    """Longest extension of a tree [rad, joint-space L2]: longer ones are in vain more often."""
     resolution: Positive = 0.05
     """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
     covers the rest, and after a path that it refuses the search looks twice as closely."""
