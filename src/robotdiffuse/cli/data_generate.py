@@ -11,8 +11,9 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
     parser = actions.add_parser(
         "generate",
         help="plan many random problems",
-        description="Solve many random problems by Shared-Tree Informed RRT*, and keep what the judge passes "
-        "in shards. Ctrl-C or a crash loses at most the shards in hand; the same command goes on.",
+        description="Solve many random problems by Shared-Tree Informed RRT*, or another planner, and keep "
+        "what the judge passes in shards. Ctrl-C or a crash loses at most the shards in hand; the same "
+        "command goes on.",
     )
     parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")
     parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF (default: panda)")
@@ -41,6 +42,9 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--safety-distance", type=not_negative, metavar="M", help="to obstacles [m] (default: 0.05)"
     )
+    parser.add_argument(
+        "--planner", metavar="NAME", help="shared_tree_rrt_star (default, the paper's) or aorrtc"
+    )
     parser.add_argument("--shard", type=count, metavar="N", help="motions in a shard (default: 500)")
     parser.add_argument(
         "--workers",
@@ -54,6 +58,7 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
 
 SETTINGS = (
     "robot",
+    "planner",
     "trajectories",
     "seed",
     "mix",
@@ -76,10 +81,13 @@ def run_generate(arguments: argparse.Namespace) -> int:
 
     from robotdiffuse.errors import InputError
     from robotdiffuse.generation import GenerationSettings, generate
+    from robotdiffuse.generation.searches import SEARCHES
 
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers is for this machine's processes; --cluster uses all cores that it has")
     given = {name: getattr(arguments, name) for name in SETTINGS if getattr(arguments, name) is not None}
+    if arguments.planner is not None and arguments.planner != GenerationSettings.planner:
+        given["search"] = SEARCHES.defaults(arguments.planner)
     settings = GenerationSettings(**given)
     if arguments.safety_distance is not None:
         search = replace(settings.search, safety_distance=arguments.safety_distance)

@@ -4,10 +4,14 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.generation.aorrtc import AORRTCSearchSettings
+from robotdiffuse.generation.searches import SEARCHES
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSettings
-from robotdiffuse.problems.families import FAMILIES, load_family
+from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import POSE, POSITION, Family
-from robotdiffuse.settings import Bound, Count, Natural, OneOf, Settings, Share
+from robotdiffuse.problems.families.scaled import family_for
+from robotdiffuse.robots import load_robot
+from robotdiffuse.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
 
 TARGETS = (POSITION, POSE)
 TIMINGS = ("arc", "time")
@@ -38,12 +42,14 @@ class GenerationSettings(Settings):
     """How waypoints are spaced: evenly in joint-space length (arc), or in time by toppra (time)."""
     shard: Count = 500
     """Trajectories in a shard: what an interruption may lose."""
-    search: SharedTreeSettings = field(
+    planner: Annotated[str, OneOf(SEARCHES)] = "shared_tree_rrt_star"
+    """What solves the problems; the default is the paper's."""
+    search: Annotated[SharedTreeSettings | AORRTCSearchSettings, SettingsOf("planner", SEARCHES)] = field(
         default=SharedTreeSettings(
             resolution=0.02, improvement=0.01, patience=6, step_rounds=5, connect_iterations=800
         )
     )
-    """How problems are solved: quicker than a user's default, at 1 % more length."""
+    """Its settings: for the paper's planner quicker than a user's default, at 1 % more length."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -57,8 +63,9 @@ class GenerationSettings(Settings):
 
     @property
     def families(self) -> dict[str, Family]:
-        """Those of the mix, in its order."""
-        return {name: load_family(name) for name in self.mix}
+        """Those of the mix, in its order and in the robot's size."""
+        robot = load_robot(self.robot)
+        return {name: family_for(name, robot) for name in self.mix}
 
     @property
     def slots(self) -> int:

@@ -1,5 +1,7 @@
 """One shard of the data: problems drawn and solved until it is full; it depends on settings and number."""
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
@@ -11,6 +13,8 @@ from robotdiffuse.collision.motion import search_space
 from robotdiffuse.data.rows import resample
 from robotdiffuse.data.shards import Row, row_of
 from robotdiffuse.errors import InputError
+from robotdiffuse.generation.aorrtc import AORRTCSearch
+from robotdiffuse.generation.searches import SEARCHES
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch
@@ -62,19 +66,20 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     """The row of a problem by its number, or why there is none: thinned, unsolved or refused."""
     rng = np.random.default_rng([settings.seed, number])
     family, drawn = draw(settings, robot, rng)
+    drawn = replace(drawn, goals=np.stack([robot.same_stance(goal, drawn.start)[0] for goal in drawn.goals]))
     checker = CollisionChecker(robot, drawn.scene)
     lines_free = [_line_is_free(settings, checker, drawn.start, goal) for goal in drawn.goals]
     thinned = rng.random() >= settings.trivial_share
     if thinned and all(lines_free):
         return "thinned"  # whichever goal a search would choose
-    search = SharedTreeSearch(
+    search: SharedTreeSearch | AORRTCSearch = SEARCHES.load(settings.planner)(
         checker, drawn.start, drawn.goals, settings.search, random_state(settings.seed, number)
     )
     search.run()
     path = search.path()
     if path is None:
         return "unsolved"
-    goal, line_free = drawn.goals[search.best_goal], lines_free[search.best_goal]
+    goal, line_free = search.goals[search.best_goal], lines_free[search.best_goal]
     if thinned and line_free:
         return "thinned"
     judge = Verifier(drawn.problem(robot), VerifySettings())
@@ -90,7 +95,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
         PackedScenes.pack([drawn.scene], settings.slots, floor is not None),
         q,
         checker.link_clearances(q).min(axis=1),
-        drawn.goals,
+        search.goals,
         search.goal_costs,
         search.best_goal,
         drawn.T_base_tip,

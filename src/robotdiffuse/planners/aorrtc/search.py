@@ -1,7 +1,7 @@
 """The anytime loop of planners that search: a first path, then ever shorter ones, and the judge on the
 way."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,9 +62,20 @@ class AnytimeSearch:
     """
 
     def __init__(
-        self, call: Call, ends: Ends, settings: SearchSettings, name: str, bounded: bool = True
+        self,
+        call: Call,
+        ends: Ends,
+        settings: SearchSettings,
+        name: str,
+        bounded: bool = True,
+        clearances: Sequence[float] = (),
+        tries: int = FIRST_TRIES,
     ) -> None:
-        """`name` is the stage of the paths that are found here; without `bounded`, rounds are restarts."""
+        """`name` is the stage of the paths that are found here; without `bounded`, rounds are restarts.
+
+        clearances: what is tried, falling, in place of the call's clearance and parts of it [m]; each for so
+            many iterations, `tries`, without a path.
+        """
         self.call, self.ends, self.settings, self.name, self.bounded = call, ends, settings, name, bounded
         self.start, self.goals = ends.rows()
         self.best: Float[ndarray, "n dof"] | None = None
@@ -85,7 +96,8 @@ class AnytimeSearch:
         self._rounds: list[_Round | None] = [None, None]
         """The one below the bound, and one without bound."""
         wanted = [share * call.clearance for share in (1.0, 0.5, 0.25)]
-        self._clearances = [*(kept for kept in wanted if kept > LEAST_CLEARANCE), LEAST_CLEARANCE, 0.0]
+        usual = [*(kept for kept in wanted if kept > LEAST_CLEARANCE), LEAST_CLEARANCE, 0.0]
+        self._clearances, self._tries = [*clearances] or usual, tries
         self._enter(0)
 
     @property
@@ -117,7 +129,7 @@ class AnytimeSearch:
         enough = self.work + work
         while self.best is None and self.call.elapsed < until and self.work < enough:
             self._slice()
-            if self.best is None and self._tried >= FIRST_TRIES:
+            if self.best is None and self._tried >= self._tries:
                 self._lower(help_out)
         return self.best is not None
 
@@ -180,7 +192,7 @@ class AnytimeSearch:
             self._enter(self._level + 1)
             self._straight()
         else:
-            self._tried = FIRST_TRIES - HELP_AFTER
+            self._tried = self._tries - HELP_AFTER
             if help_out is not None and self.work >= HELP_AFTER:
                 help_out()
 

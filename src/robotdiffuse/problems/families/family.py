@@ -49,6 +49,8 @@ AT_LIMIT = 1e-3
 """Joints closer than this to a limit count as clipped [rad]."""
 FULL_POSE = InverseKinematicsSettings(max_rounds=4, patience=2)
 """A few rounds: a target inside an obstacle is better drawn anew than searched for long."""
+POSE_JOINTS = 6
+"""Joints that any pose takes."""
 POSITION_ONLY = replace(FULL_POSE, position_only=True)
 
 
@@ -141,7 +143,7 @@ def reaching_configurations(
     settings: InverseKinematicsSettings = FULL_POSE,
 ) -> Float[ndarray, "k dof"]:
     """Up to `count` free configurations with the tip at its target, as float32: what data hold, so that the
-    judge sees exactly these.
+    judge sees exactly these. Arms of fewer than six joints reach positions alone.
 
     Solutions with a joint at a limit, where the solver clips it, would be far too many, and are left out.
     """
@@ -150,6 +152,7 @@ def reaching_configurations(
         inside = ((q > robot.lower + AT_LIMIT) & (q < robot.upper - AT_LIMIT)).all(axis=1)
         return inside & checker.free(q)
 
+    settings = replace(settings, position_only=True) if robot.dof < POSE_JOINTS else settings
     q = inverse_kinematics(robot, robot.tip, T_base_tip, count, rng=rng, accept=accept, settings=settings)
     return robot.least_turns(q).astype(np.float32)
 

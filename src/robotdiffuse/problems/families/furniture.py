@@ -17,6 +17,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
+    POSE_JOINTS,
     Drawn,
     PositiveRange,
     Range,
@@ -26,6 +27,7 @@ from robotdiffuse.problems.families.family import (
     keeps_out,
     reaching_configurations,
 )
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
@@ -156,7 +158,8 @@ class Furniture(Ranges, ABC):
         return self.furnish(rng, keep_out).scene
 
     def draw(self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION) -> Drawn:
-        """Start and goals are poses with the fingers in two of the regions, whatever the target."""
+        """Start and goals are poses with the fingers in two of the regions, whatever the target; for an arm
+        of fewer than six joints, their positions."""
         keep_out = base_spheres(robot)
 
         def attempt() -> Drawn | None:
@@ -168,6 +171,8 @@ class Furniture(Ranges, ABC):
                 return None
             T_base_tip = sample_target(second, rng)
             reached = reaching_configurations(robot, T_base_tip, goals, checker, rng)
+            if len(reached) and robot.dof < POSE_JOINTS:
+                T_base_tip = link_pose(robot, reached[0].astype(np.float64), robot.tip)
             return Drawn(furnished.scene, start[0], reached, T_base_tip) if len(reached) else None
 
         return first_drawn(attempt, self, robot)
