@@ -10,7 +10,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.weights_at_hand import comes_with_package
+from robotdiffuse.learning.weights_at_hand import weights_for
 from robotdiffuse.planners.aorrtc.planner import AORRTCSettings
 from robotdiffuse.planners.aorrtc.search import SLICE, AnytimeSearch
 from robotdiffuse.planners.diffusion import encode
@@ -218,8 +218,8 @@ def test_locked_joints_that_the_network_does_not_know_keep_the_weights():
     """Fingers at another opening; an arm joint that is held leaves the network fewer joints."""
     for opening in (0.0, 0.065):
         robot = load_robot("panda", locked={"panda_finger_joint1": opening})
-        assert comes_with_package("model", robot) and RobotDiffuse().model(robot) is not None
-    assert not comes_with_package("model", load_robot("panda", locked={"panda_joint7": 0.3}))
+        assert weights_for("model", robot) is not None and RobotDiffuse().model(robot) is not None
+    assert weights_for("model", load_robot("panda", locked={"panda_joint7": 0.3})) is None
 
 
 def test_settings_and_weights_are_checked(tmp_path):

@@ -2,9 +2,15 @@
 
 import argparse
 import os
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import count, natural, not_negative, share, shares
 from robotdiffuse.problems.families import FAMILIES
+
+if TYPE_CHECKING:
+    from robotdiffuse.generation import GenerationSettings
 
 
 def add_generate(actions: argparse._SubParsersAction) -> None:
@@ -73,14 +79,9 @@ SETTINGS = (
 
 def run_generate(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
-    from datetime import timedelta
-    from pathlib import Path
-
-    from rich.console import Console
-    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     from robotdiffuse.errors import InputError
-    from robotdiffuse.generation import GenerationSettings, generate
+    from robotdiffuse.generation import GenerationSettings
     from robotdiffuse.generation.searches import SEARCHES
 
     if arguments.cluster is not None and arguments.workers is not None:
@@ -92,6 +93,20 @@ def run_generate(arguments: argparse.Namespace) -> int:
     if arguments.safety_distance is not None:
         search = replace(settings.search, safety_distance=arguments.safety_distance)
         settings = replace(settings, search=search)
+    made = generated(settings, arguments.out, arguments.workers, arguments.cluster)
+    print(f"{made:,} trajectories of {settings.waypoints} waypoints in {arguments.out}")
+    return 0
+
+
+def generated(
+    settings: "GenerationSettings", out: str | Path, workers: int | None = None, cluster: str | None = None
+) -> int:
+    """`generation.generate` with a bar; on all cores unless told how many."""
+    from rich.console import Console
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from robotdiffuse.generation import generate
+
     console = Console(stderr=True)
     columns = (
         *Progress.get_default_columns()[:2],
@@ -113,7 +128,4 @@ def run_generate(arguments: argparse.Namespace) -> int:
                 left = timedelta(seconds=round((total - done) * elapsed / new))
                 bar.update(task, completed=done, rate=f"{new / elapsed:.1f}/s", left=f"{left} left")
 
-        workers = arguments.workers or os.cpu_count() or 1
-        made = generate(settings, Path(arguments.out), workers, arguments.cluster, show)
-    print(f"{made:,} trajectories of {settings.waypoints} waypoints in {arguments.out}")
-    return 0
+        return generate(settings, Path(out), workers or os.cpu_count() or 1, cluster, show)

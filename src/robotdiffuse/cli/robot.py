@@ -89,7 +89,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run_list(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation.tables import Column, Table, show
-    from robotdiffuse.learning.weights_at_hand import comes_with_package
+    from robotdiffuse.learning.weights_at_hand import weights_for
     from robotdiffuse.robots import known_robots, load_robot
     from robotdiffuse.robots.bundle import read_source
 
@@ -101,7 +101,7 @@ def run_list(arguments: argparse.Namespace) -> int:
             rows.append((name, None, None, None, None, "", str(error)))
             continue
         spheres = sum(len(part) for part in robot.spheres.values())
-        weights = "yes" if comes_with_package("model", robot) else "no"
+        weights = "no" if weights_for("model", robot) is None else "yes"
         refused, pairs = read_source(place).get("refused"), len(robot.checked_pairs())
         rows.append((name, robot.dof, spheres, pairs, refused, weights, str(place)))
     refused = Column("refused", "%", ".1f", scale=100.0)

@@ -3,6 +3,8 @@
 import argparse
 import os
 from contextlib import nullcontext
+from functools import partial
+from typing import Any
 
 from robotdiffuse.cli.arguments import count, names, natural, positive, share
 from robotdiffuse.errors import InputError, shown
@@ -50,9 +52,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     planner = kinds.add_parser(
         "planner",
         help="the network that predicts motions",
-        description="Train the network that predicts motions, on planned trajectories.",
+        description="Train the network that predicts motions, on planned trajectories. With --robot and "
+        "without --data: makes data for the arm, trains on them, and puts the weights where planners find "
+        "them, in about two hours of two cores.",
     )
-    planner.add_argument("--data", required=True, metavar="FOLDER", help="folder with shards of trajectories")
+    planner.add_argument(
+        "--data", metavar="FOLDER", help="folder with shards of trajectories (default: made for --robot)"
+    )
     planner.add_argument(
         "--config",
         default="compact",
@@ -64,17 +70,20 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--encoder",
         metavar="FOLDER",
         help="folder with a trained encoder, or the name of one to train along: pointnet, dgcnn; needed "
-        "unless the config names one",
+        "for --data unless the config names one (default: the one that comes with the package)",
     )
-    planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the data's robot")
+    planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (panda)")
+    planner.add_argument(
+        "--trajectories", type=count, metavar="N", help="motions to make, without --data (60,000)"
+    )
     planner.add_argument(
         "--generate",
         type=count,
         metavar="N",
         help="meanwhile fill the data folder with N processes; training begins with the first shard, and "
-        "takes in the others",
+        "takes in the others. Without --data: make them first, with N processes (all cores)",
     )
-    _add_shared(planner)
+    _add_shared(planner, out_required=False)
     _add_device(planner)
     parts = planner.add_argument_group("parts of the model, instead of the config's")
     parts.add_argument(
@@ -107,9 +116,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     baseline.set_defaults(run=run_baseline)
 
 
-def _add_shared(parser: argparse.ArgumentParser) -> None:
+def _add_shared(parser: argparse.ArgumentParser, out_required: bool = True) -> None:
+    default = "" if out_required else "; without --data for data too (default: beside the user's robots)"
     parser.add_argument(
-        "--out", required=True, metavar="FOLDER", help="folder for weights, settings and checkpoints"
+        "--out",
+        required=out_required,
+        metavar="FOLDER",
+        help=f"folder for weights, settings and checkpoints{default}",
     )
     length = parser.add_mutually_exclusive_group()
     length.add_argument("--minutes", type=positive, metavar="MIN", help="length of the run in wall time")
@@ -169,6 +182,12 @@ def run_planner(arguments: argparse.Namespace) -> int:
         given["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
     if arguments.schedule is not None:
         given["schedule"] = ScheduleSettings(kind=arguments.schedule)
+    if arguments.data is None:
+        return _run_for_robot(arguments, given)
+    if arguments.out is None:
+        raise InputError("--data is given, and no --out: name a folder for the weights")
+    if arguments.trajectories is not None:
+        raise InputError("--trajectories is for data that are made; --data names a folder that has some")
     settings = planner_training(arguments.config, given)
     meanwhile = nullcontext()
     if arguments.generate is not None:
@@ -176,6 +195,24 @@ def run_planner(arguments: argparse.Namespace) -> int:
     with meanwhile:
         report = train_planner(settings, arguments.out)
     _report(report, arguments.out)
+    return 0
+
+
+def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
+    from robotdiffuse.cli.train_robot import train_for_robot
+    from robotdiffuse.learning.training.configs import planner_training
+
+    if arguments.robot is None:
+        raise InputError("name an arm with --robot, whose data are made, or a folder of data with --data")
+    report, kept = train_for_robot(
+        arguments.robot,
+        given,
+        partial(planner_training, arguments.config),
+        arguments.out,
+        arguments.trajectories,
+        arguments.generate,
+    )
+    _report(report, str(kept))
     return 0
 
 

@@ -27,7 +27,7 @@ from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.network import Network
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.weights_at_hand import BUNDLED, check_weights, untrained
+from robotdiffuse.learning.weights_at_hand import BUNDLED, check_weights, untrained, weights_for
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Settings
@@ -219,7 +219,7 @@ def load_network(name: str, folder: str | FilePath | None, robot: Robot) -> Any:
     made for another robot.
     """
     check_weights(name, folder)
-    place = BUNDLED / robot.name if folder is None else FilePath(folder)
+    place = (weights_for(name, robot) or BUNDLED / robot.name) if folder is None else FilePath(folder)
     if not (place / f"{name}.json").is_file():
         raise untrained(name, f"no weights of the network {name} come with the package for {robot.name}")
     network = _loaded(name, place)

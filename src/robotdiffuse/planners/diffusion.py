@@ -20,7 +20,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.weights_at_hand import comes_with_package
+from robotdiffuse.learning.weights_at_hand import weights_for
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings, nearest_goals
@@ -78,7 +78,7 @@ class ModelSampler(LearnedPlanner[Own]):
 
         Raises InputError if the settings name weights of another robot, or ones that cannot be read.
         """
-        if self.settings.weights is None and not comes_with_package("model", robot):
+        if self.settings.weights is None and weights_for("model", robot) is None:
             return None
         return self.network(robot)
 

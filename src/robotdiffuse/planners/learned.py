@@ -19,7 +19,8 @@ SAMPLES_PER_GOAL = 4
 @dataclass(frozen=True)
 class LearnedSettings(Settings):
     weights: str | None = None
-    """Folder of trained weights; None: those that come with the package for the robot."""
+    """Folder of trained weights; None: those that were trained here for the robot, or
+    come with the package."""
 
 
 Own = TypeVar("Own", bound=LearnedSettings)

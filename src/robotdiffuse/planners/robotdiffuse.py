@@ -21,7 +21,7 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.learning.guidance import CollisionGuidance
-from robotdiffuse.learning.weights_at_hand import comes_with_package
+from robotdiffuse.learning.weights_at_hand import weights_for
 from robotdiffuse.planners.aorrtc.planner import AORRTC, STEP, AORRTCSettings
 from robotdiffuse.planners.aorrtc.search import AnytimeSearch, anytime
 from robotdiffuse.planners.base import CLEARANCE, CONSTRAINTS
@@ -87,11 +87,11 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         if call.problem.constraints:
             return plan_constrained(call, ends, settings.search)
         search = AnytimeSearch(call, ends, settings.search, AORRTC.name)
-        if settings.weights is not None or comes_with_package(self.network_name, robot):
+        if settings.weights is not None or weights_for(self.network_name, robot) is not None:
             batches = _NetworkBatches(self, call, ends, search)
         else:
             batches = _Batches(self, call, ends, search)
-            note = f"no weights come with the package for {robot.name}; planned by search and smooth noise"
+            note = f"there are no weights for {robot.name}; planned by search and smooth noise"
             call.notes.append(note)
 
         def improve() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.reading import is_file
 from robotdiffuse.robots.bundle import MESH_FILE, ROBOT_FILE, read_bundle, read_source
+from robotdiffuse.robots.places import user_robots
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 
 __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
@@ -74,13 +75,11 @@ def known_robots() -> dict[str, Path]:
 
 
 def _added() -> dict[str, Path]:
-    from robotdiffuse.robots.add import user_robots
-
     return {file.parent.name: file.parent for file in sorted(user_robots().glob(f"*/{ROBOT_FILE}"))}
 
 
 def _from_urdf(urdf: Path) -> Robot:
-    from robotdiffuse.robots.add import add_robot, user_robots
+    from robotdiffuse.robots.add import add_robot
     from robotdiffuse.robots.urdf import UrdfTree
 
     tree, source = UrdfTree(urdf, {}), str(urdf.resolve())

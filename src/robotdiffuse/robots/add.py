@@ -1,6 +1,5 @@
 """Making a robot from a URDF: spheres, allowed collisions and limits, written as a robot folder."""
 
-import os
 import resource
 import sys
 import time
@@ -12,6 +11,7 @@ from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.robots.allowed_collisions import BY_SRDF, CHECKED, LIMITS, NAMED, POSE, PairReport
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
 from robotdiffuse.robots.limits import read_limits, with_limits
+from robotdiffuse.robots.places import user_robots
 from robotdiffuse.robots.preparation import LinkReport, PreparationSettings, Progress, prepare
 from robotdiffuse.robots.refusals import Refusals
 from robotdiffuse.robots.robot import Robot
@@ -89,15 +89,6 @@ class AddReport:
             if pair.reason in TAKEN_FOR_SAFE and pair.colliding
         ]
         return (*found, *(f"spheres do not cover {link.link}" for link in self.links if not link.covered))
-
-
-def user_robots() -> Path:
-    """Where robots that were added are kept: $ROBOTDIFFUSE_ROBOTS or the user's data directory."""
-    chosen = os.environ.get("ROBOTDIFFUSE_ROBOTS")
-    if chosen:
-        return Path(chosen)
-    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    return Path(data) / "robotdiffuse" / "robots"
 
 
 def add_robot(

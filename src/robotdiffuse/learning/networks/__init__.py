@@ -10,7 +10,7 @@ NETWORKS = Registry(
             "robotdiffuse.learning.motion_model:MotionModel",
             "the diffusion model of motions",
             "MotionModelSettings",
-            "planner --data FOLDER --encoder FOLDER",
+            "planner --robot NAME",
         ),
         "mpnet": Entry(
             _ROOM + "mpnet:MPNetNetwork",
@@ -26,7 +26,7 @@ NETWORKS = Registry(
             "robotdiffuse.learning.motion_model:MotionModel",
             "the same model without an encoder, for MPD and EDMP",
             "MotionModelSettings",
-            "planner --config trajectory_prior --data FOLDER",
+            "planner --config trajectory_prior --data FOLDER --out FOLDER",
         ),
     },
 )
