@@ -66,7 +66,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     """The row of a problem by its number, or why there is none: thinned, unsolved or refused."""
     rng = np.random.default_rng([settings.seed, number])
     family, drawn = draw(settings, robot, rng)
-    drawn = replace(drawn, goals=np.stack([robot.same_stance(goal, drawn.start)[0] for goal in drawn.goals]))
+    drawn = with_near_goals(robot, drawn)
     checker = CollisionChecker(robot, drawn.scene)
     lines_free = [_line_is_free(settings, checker, drawn.start, goal) for goal in drawn.goals]
     thinned = rng.random() >= settings.trivial_share
@@ -115,6 +115,11 @@ def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -
     number = int(rng.choice(len(shares), p=shares / shares.sum()))
     family = list(settings.families.values())[number]
     return number, family.draw(robot, rng, settings.goals, settings.target)
+
+
+def with_near_goals(robot: Robot, drawn: Drawn) -> Drawn:
+    """The problem with goals of joints that turn more than once as near to the start as whole turns allow."""
+    return replace(drawn, goals=np.stack([robot.same_stance(q, drawn.start)[0] for q in drawn.goals]))
 
 
 def _line_is_free(

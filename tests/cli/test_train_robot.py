@@ -1,0 +1,130 @@
+"""train planner --robot: data and weights for an arm by one command, whatever interrupts it."""
+
+import json
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from helpers.factory_runs import contents, in_this_process
+from robotdiffuse.cli import main, train_robot
+from robotdiffuse.cli.train_robot import data_for, train_for_robot
+from robotdiffuse.errors import InputError
+from robotdiffuse.generation import factory
+from robotdiffuse.generation.settings import GenerationSettings
+from robotdiffuse.learning.denoisers.transformer import TransformerSettings
+from robotdiffuse.learning.training.configs import planner_training
+from robotdiffuse.learning.training.run import TrainingRun
+from robotdiffuse.learning.weights_at_hand import user_weights, weights_for
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.problems.families.scaled import family_for
+from robotdiffuse.robots import load_robot
+
+STEPS, BATCH = 20, 8
+SMALL = TransformerSettings(width=16, layers=1, heads=2, hidden=24, patch=8)
+TINY = {"samples": STEPS * BATCH, "batch": BATCH, "denoiser_settings": SMALL, "validation_problems": 2}
+
+
+@pytest.fixture(autouse=True)
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    monkeypatch.setattr(factory, "on_this_machine", in_this_process)
+
+    def few(*asked: object) -> GenerationSettings:
+        return replace(data_for(*asked), mix={"rop": 1.0}, shard=4)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(train_robot, "data_for", few)
+
+
+def made(robot: str, out: Path | None = None) -> Path:
+    make = partial(planner_training, "compact")
+    report, kept = train_for_robot(robot, TINY, make, None if out is None else str(out), motions=12)
+    assert report["samples"] == STEPS * BATCH
+    return kept
+
+
+def test_an_arm_of_five_joints_plans_with_what_it_learned(tmp_path: Path) -> None:
+    robot = load_robot("so101")
+    assert weights_for("model", robot) is None
+    kept = made("so101")
+    assert kept == tmp_path / "robots" / "so101" / "weights" == weights_for("model", robot)
+    planner = RobotDiffuse(RobotDiffuseSettings())
+    model = planner.model(robot)
+    assert model is not None and model.dof == 5
+    drawn = family_for("rop_dense", robot).draw(robot, np.random.default_rng(1))
+    result = planner.plan(drawn.problem(robot), 20.0, until="short")
+    assert result.solved and rd.verify(drawn.problem(robot), result.path).valid  # type: ignore[arg-type]
+    assert not any("there are no weights" in note for note in result.notes)
+    assert weights_for("model", replace(load_robot("ur5e"), name="so101")) is None
+
+
+def test_data_are_in_the_size_of_the_arm() -> None:
+    large, small = (data_for(name, load_robot(name), None, None) for name in ("ur5e", "so101"))
+    assert large.search.safety_distance == 0.05 and small.search.safety_distance == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("phase", ["data", "training"])
+def test_it_goes_on_where_it_was_interrupted(
+    phase: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = made("ur5e", tmp_path / "whole")
+    expected = contents(whole)
+    with monkeypatch.context() as patch:
+        if phase == "data":
+            patch.setattr(factory, "write_shard", interrupted(factory.write_shard, 2))
+        else:
+            patch.setattr(TrainingRun, "step", interrupted(TrainingRun.step, 8, save=True))
+        with pytest.raises(KeyboardInterrupt):
+            made("ur5e", tmp_path / "stopped")
+    shards = sorted(file.name for file in (tmp_path / "stopped" / "data").glob("shard_*"))
+    assert len(shards) == (1 if phase == "data" else 3)
+    assert (tmp_path / "stopped" / "training.safetensors").is_file() == (phase == "training")
+    again = made("ur5e", tmp_path / "stopped")
+    weights = "model.safetensors"
+    assert contents(again)[weights] == expected[weights]
+
+
+def interrupted(call, at: int, save: bool = False):
+    """The call, in place of whose `at`-th Ctrl-C comes."""
+    calls = 0
+
+    def counted(*arguments: object) -> object:
+        nonlocal calls
+        calls += 1
+        if calls == at:
+            if save:
+                arguments[0].save()  # type: ignore[attr-defined]
+            raise KeyboardInterrupt
+        return call(*arguments)
+
+    return counted
+
+
+def test_bad_input_is_a_clear_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def error(*arguments: str) -> str:
+        assert main(["train", "planner", *arguments]) == 2
+        return capsys.readouterr().err
+
+    assert "unknown robot 'ur5x'; known: " in error("--robot", "ur5x")
+    assert "name an arm with --robot" in error()
+    assert "--data is given, and no --out" in error("--data", str(tmp_path))
+    assert "--trajectories is for data that are made" in error(
+        *("--data", str(tmp_path), "--out", "x", "--trajectories", "3")
+    )
+    full = type("Usage", (), {"free": 1_000_000})
+    with monkeypatch.context() as patch:
+        patch.setattr(train_robot.shutil, "disk_usage", lambda folder: full)
+        assert "make room, or name another folder with --out" in error("--robot", "ur5e")
+    (tmp_path / "half" / "data").mkdir(parents=True)
+    (tmp_path / "half" / "data" / "manifest.json").write_text("{")
+    assert "manifest.json is damaged" in error("--robot", "ur5e", "--out", str(tmp_path / "half"))
+    file = user_weights(load_robot("ur5e")) / "model.json"
+    file.parent.mkdir(parents=True)
+    file.write_text(json.dumps({"format": 2}))
+    with pytest.raises(InputError, match=r"weights/model\.json is damaged"):
+        weights_for("model", load_robot("ur5e"))
