@@ -2,6 +2,8 @@
 
 import argparse
 import os
+import sys
+import time
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +13,9 @@ from robotdiffuse.problems.families import FAMILIES
 
 if TYPE_CHECKING:
     from robotdiffuse.generation import GenerationSettings
+
+TELL_EVERY = 60.0
+"""Between two lines on progress where there is no terminal [s]."""
 
 
 def add_generate(actions: argparse._SubParsersAction) -> None:
@@ -117,7 +122,7 @@ def generated(
     )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("trajectories", rate="", left="", total=settings.trajectories)
-        before: list[int] = []
+        before, said = list[int](), [time.monotonic()]
 
         def show(done: int, total: int) -> None:
             if not before:
@@ -127,5 +132,8 @@ def generated(
             if elapsed and new:
                 left = timedelta(seconds=round((total - done) * elapsed / new))
                 bar.update(task, completed=done, rate=f"{new / elapsed:.1f}/s", left=f"{left} left")
+                if not console.is_terminal and time.monotonic() > said[-1] + TELL_EVERY:
+                    said.append(time.monotonic())
+                    print(f"{done:,} of {total:,} trajectories, {left} left", file=sys.stderr, flush=True)
 
         return generate(settings, Path(out), workers or os.cpu_count() or 1, cluster, show)
