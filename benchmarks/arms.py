@@ -24,7 +24,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import load_planner
-from robotdiffuse.problems.families import load_family
+from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.robots.add import AddReport, add_robot
 from robotdiffuse.robots.refusals import Refusals, measure_refusals
 from robotdiffuse.robots.robot import Robot
@@ -112,13 +112,15 @@ def on_table(robot: Robot, samples: int) -> tuple[float, float]:
 
 
 def solved(robot: Robot, problems: int) -> tuple[int, int, int] | None:
-    """The families' scenes as they are for a Panda: of the arms here, those of its size reach into them."""
+    """In the families' scenes, in the size of the arm."""
     planner = load_planner("robotdiffuse")
     drawn = []
     for family in FURNITURE:
         rng = np.random.default_rng(3)
         try:
-            drawn += [load_family(family).draw(robot, rng) for _ in range(-(-problems // len(FURNITURE)))]
+            drawn += [
+                family_for(family, robot).draw(robot, rng) for _ in range(-(-problems // len(FURNITURE)))
+            ]
         except InputError:
             continue
     if not drawn:

@@ -18,7 +18,7 @@ from report import header, print_table, progress
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import load_planner
-from robotdiffuse.problems.families import load_family
+from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots import ROBOTS, load_robot
@@ -70,7 +70,8 @@ def tried(name: str, problems: int) -> Tally:
         rng = np.random.default_rng(SEED)
         try:
             drawn += [
-                load_family(family).draw(robot, rng).problem(robot) for _ in range(problems // len(FAMILIES))
+                family_for(family, robot).draw(robot, rng).problem(robot)
+                for _ in range(problems // len(FAMILIES))
             ]
         except InputError:  # the arm is too small for this family's furniture
             continue
