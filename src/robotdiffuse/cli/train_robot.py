@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from robotdiffuse.learning.training.config import PlannerTraining
 
 MOTIONS = 60_000
-"""About twenty minutes of two cores; with turned copies 360,000, of which training sees each ten times."""
-SAMPLES = 4_000_000
-"""Of training: about an hour and a half of one core."""
+"""About twenty minutes of two cores; with turned copies 360,000, of which training sees each seven times."""
+SAMPLES = 2_400_000
+"""Of training, as the Panda's weights had: one to two hours of one core."""
 MIX = {"rop": 0.2, "rop_dense": 0.3, "shelf": 0.2, "crate": 0.15, "table": 0.15}
 """More furniture than the Panda's weights were trained on: there a network has most to say."""
 WAYPOINTS = 96
