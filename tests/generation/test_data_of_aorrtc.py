@@ -1,15 +1,19 @@
 """Data by AORRTC: what the paper's planner promises of its data holds for its too."""
 
 from dataclasses import replace
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 import pytest
 
+from helpers.factory_runs import in_this_process
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.data.manifest import write_manifest
 from robotdiffuse.errors import InputError
-from robotdiffuse.generation import GenerationSettings
+from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.aorrtc import AORRTCSearchSettings
+from robotdiffuse.generation.factory import manifest_of
 from robotdiffuse.generation.searches import SEARCHES
 from robotdiffuse.generation.shard_maker import draw, solve
 from robotdiffuse.robots import load_robot
@@ -88,3 +92,16 @@ def test_settings_are_those_of_the_planner() -> None:
         GenerationSettings(planner="bi_rrt")
     assert GenerationSettings.from_json(SETTINGS.to_json(), "settings") == SETTINGS
     assert SEARCHES.defaults("aorrtc") == SETTINGS.search
+
+
+def test_data_sets_of_before_there_was_a_choice_go_on(
+    tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(factory, "on_this_machine", in_this_process)
+    settings = GenerationSettings(trajectories=2, shard=1, waypoints=8)
+    manifest = manifest_of(settings)
+    manifest.settings.pop("planner")
+    write_manifest(tmp_path, manifest)
+    assert generate(settings, tmp_path) == 2
+    with pytest.raises(InputError, match=r'begun with planner "shared_tree_rrt_star", not "aorrtc"'):
+        generate(replace(settings, planner="aorrtc", search=AORRTCSearchSettings()), tmp_path)

@@ -14,8 +14,6 @@ from robotdiffuse.scenes.shapes import Box
 
 FORMAT = 1
 MANIFEST = "manifest.json"
-FIRST_PLANNER = "shared_tree_rrt_star"
-"""Of data sets that do not say which: there was one."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,6 @@ def read_manifest(folder: str | FilePath) -> Manifest:
         if "frames" in data:  # as waypoints were called once
             data["waypoints"] = data.pop("frames")
             data["settings"] = {"waypoints": data["waypoints"]} | data["settings"]
-        data["settings"] = {"planner": FIRST_PLANNER} | data["settings"]
         return Manifest(**_with_floors(data))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} is damaged: {error}") from None

@@ -20,6 +20,8 @@ from robotdiffuse.processes import CLUSTERS, interrupts_afterwards, on_this_mach
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 
+FIRST_PLANNER = "shared_tree_rrt_star"
+"""Of data sets that do not say which: there was one."""
 PACKAGES = ("numpy", "numba", "zarr")
 
 
@@ -148,7 +150,7 @@ def _claim(wanted: Manifest, out: Path) -> None:
         return
     found = read_manifest(out)
     found.check_robot(load_robot(wanted.robot))
-    begun = _by_name(found.settings)
+    begun = _by_name({"planner": FIRST_PLANNER} | found.settings)
     for name, value in _by_name(wanted.settings).items():
         if begun.get(name) != value:
             raise InputError(
