@@ -13,7 +13,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.live.certificate import FREE, NONE, WAITING, WRONG, Certificate
 from robotdiffuse.live.exchange import problem_text, replay_page, uploaded_problem
 from robotdiffuse.live.obstacles import LEAST, MOST, NEW, dimensions
-from robotdiffuse.live.session import Session, State
+from robotdiffuse.live.session import KEEP_TREES, Session, State
 from robotdiffuse.planners import PLANNERS
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, Trajectory
@@ -87,8 +87,19 @@ class Panel:
         self._limit = gui.add_slider(
             "Time limit [s]", min=0.05, max=10.0, step=0.05, initial_value=min(choice.time_limit, 10.0)
         )
-        self._follow = gui.add_checkbox("Replan after each change", initial_value=choice.follow)
-        self._candidates = gui.add_checkbox("Draw the network's candidates", initial_value=choice.candidates)
+        self._follow = gui.add_checkbox(
+            "Keep planning", initial_value=choice.follow, hint="Plan anew after each change"
+        )
+        self._candidates = gui.add_checkbox(
+            "Candidates",
+            initial_value=choice.candidates,
+            hint="What the network proposes: red where it touches, green with 5 cm of clearance",
+        )
+        self._trees = gui.add_checkbox(
+            "Search trees",
+            initial_value=choice.trees,
+            hint="From the start (blue) and the goal (green), of " + ", ".join(KEEP_TREES),
+        )
         self._now = gui.add_button("Plan now", icon=viser.Icon.ROUTE)
         self._stages = gui.add_html("")
         self._kind = gui.add_dropdown("Plot", PLOTS, initial_value=PLOTS[0])
@@ -98,6 +109,7 @@ class Panel:
         self._on(self._limit, lambda event: session.choose(time_limit=event.target.value))
         self._on(self._follow, lambda event: session.choose(follow=event.target.value))
         self._on(self._candidates, lambda event: session.choose(candidates=event.target.value))
+        self._on(self._trees, lambda event: session.choose(trees=event.target.value))
         self._on(self._kind, lambda _event: self._show_plot(session.state))
         self._now.on_click(lambda event: self.guarded(event, session.plan_now))
 
@@ -162,6 +174,7 @@ class Panel:
             (self._planner, state.choice.planner),
             (self._follow, state.choice.follow),
             (self._candidates, state.choice.candidates),
+            (self._trees, state.choice.trees),
         ):
             _set(widget, value)
         if self._new_value("motion", state.motion):
@@ -260,7 +273,7 @@ class Panel:
             self._plot = self._server.gui.add_uplot(
                 data=data,
                 series=(uplot.Series(label="time [s]"), *joints, limit, limit),
-                scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(-105.0, 105.0))},
+                scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(-118.0, 118.0))},
                 axes=(uplot.Axis(label="s"), uplot.Axis(label="% of limit")),
                 legend=uplot.Legend(show=False),
                 height=220,
