@@ -256,11 +256,23 @@ def damage(folder, case):
         values = json.loads(about.read_text())
         values["settings"]["denoiser_settings"]["width"] = 32
         about.write_text(json.dumps(values))
+    elif case == "beyond all memory":
+        values = json.loads(about.read_text())
+        values["settings"]["denoiser_settings"]["hidden"] = 2**63
+        about.write_text(json.dumps(values))
+    elif case in ("joint too few", "ragged frames"):
+        values = json.loads(about.read_text())
+        rows = values["robot"]["lower" if case == "joint too few" else "frame_offsets"]
+        (rows if case == "joint too few" else rows[0][0]).pop()
+        about.write_text(json.dumps(values))
 
 
 @pytest.mark.parametrize(
     ("case", "file"),
     [
+        ("beyond all memory", "model.json"),
+        ("joint too few", "robot.lower has 2 entries for 3 joints"),
+        ("ragged frames", "not 4 x 4"),
         ("truncated", "model.safetensors"),
         ("bit", "model.safetensors"),
         ("no weights", "model.safetensors"),
