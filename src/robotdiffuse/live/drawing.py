@@ -10,6 +10,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from robotdiffuse.live.obstacles import dimensions, handle_pose, held_at
+from robotdiffuse.live.session import reach
 from robotdiffuse.planners.candidates import Candidates
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -30,7 +31,12 @@ EDGE_POINTS, MOST_EDGES = 6, 4000
 """Of the tool's way along each edge of a tree; edges of each tree that are drawn, the first ones."""
 TREES = ("/trees/start", "/trees/goal")
 COAT = 0.002
-"""How far what is seen through stands out, so that it lies over the arm where both are in one place [m]."""
+"""How far what is seen through stands out, so that it lies over the arm where both are in one place [m]; the
+less that is seen through it, the further."""
+TRACE_WIDTH, FAN_WIDTH, TREE_WIDTH = 0.0066, 0.0025, 0.002
+"""Of lines, as shares of the arm's reach."""
+GHOST = 0.3
+"""Opacity of start and goal."""
 SELECTED = 0.35
 """How much lighter the obstacle is that was clicked on."""
 
@@ -82,7 +88,7 @@ class Arm:
             parts = _colored(surface) if color is None else [(color, surface)]
             for k, (own, part) in enumerate(parts):
                 if opacity is not None:
-                    part = replace(part, vertices=part.vertices + COAT * part.normals)
+                    part = replace(part, vertices=part.vertices + opacity / GHOST * COAT * part.normals)
                 _add(server, f"/{name}/{i}/{k}", part, own, opacity)
 
     def show(self, poses: "Poses | None", at: int = 0) -> None:
@@ -179,7 +185,7 @@ def draw_trace(
     points = look.trace(robot, tool, look.dense(motion.positions, TRACE_POINTS))
     share = np.linspace(0, 1, len(points))[:, None]
     colors = (1 - share) * np.array(START) + share * np.array(GOAL)
-    _lines(server, "/trace", [points], [colors], 0.008)
+    _lines(server, "/trace", [points], [colors], TRACE_WIDTH * reach(robot))
 
 
 def draw_fan(
@@ -192,7 +198,7 @@ def draw_fan(
     ways = [look.trace(robot, tool, q) for q in candidates.positions]
     of = zip(ways, candidates.clearances, strict=True)
     colors = [np.tile(fan_color(clearance), (len(way), 1)) for way, clearance in of]
-    _lines(server, "/fan", ways, colors, 0.003)
+    _lines(server, "/fan", ways, colors, FAN_WIDTH * reach(robot))
 
 
 def draw_trees(
@@ -202,7 +208,9 @@ def draw_trees(
     for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
         ways = [] if tree is None else _edges(robot, tool, tree)
         if len(ways):
-            _lines(server, name, ways, [np.tile(color, (EDGE_POINTS, 1))] * len(ways), 0.0025)
+            _lines(
+                server, name, ways, [np.tile(color, (EDGE_POINTS, 1))] * len(ways), TREE_WIDTH * reach(robot)
+            )
         else:
             server.scene.remove_by_name(name)
 

@@ -16,8 +16,8 @@ from viser import infra
 from robotdiffuse.errors import InputError
 from robotdiffuse.live.certificate import certificate
 from robotdiffuse.live.door import SECRET, Door
-from robotdiffuse.live.drawing import RATE as FILM_RATE
 from robotdiffuse.live.drawing import (
+    GHOST,
     RED,
     Arm,
     Obstacles,
@@ -27,6 +27,7 @@ from robotdiffuse.live.drawing import (
     draw_trees,
     film,
 )
+from robotdiffuse.live.drawing import RATE as FILM_RATE
 from robotdiffuse.live.latest import Latest
 from robotdiffuse.live.panel import Deeds, Panel
 from robotdiffuse.live.player import Player
@@ -49,8 +50,6 @@ SUNS = (2.0, (-2.0, -3.0, 5.0)), (1.1, (3.0, 2.0, 3.0)), (0.7, (-3.0, 3.0, 1.0))
 """Lights: how bright, and from where."""
 BESIDE_PANEL = 0.2
 """Of the window's height, how far what is looked at stands to the left."""
-GHOST = 0.3
-"""Opacity of start and goal."""
 
 
 class _Server(viser.ViserServer):

@@ -3,6 +3,7 @@
 import html
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -183,7 +184,7 @@ class Panel:
             self._new_joints(state.problem.robot)
         if self._new_value("start", state.problem.start):
             for widget, value in zip(self._joints, state.problem.start, strict=True):
-                _set(widget, float(value))
+                _set(widget, round(float(value), 3))
         self._show_obstacle(state, selected)
 
     def _new_value(self, what: str, value: object) -> bool:
@@ -229,16 +230,16 @@ class Panel:
         with self._joints_box:
             for name, low, high, turns in limits:
                 low, high = (-np.pi, np.pi) if turns else (float(low), float(high))
-                middle = 0.5 * (low + high)
-                widget = self._server.gui.add_slider(
-                    name, min=low, max=high, step=0.001, initial_value=middle
-                )
-                self._on(widget, lambda _event: self._session.set_start(self._start()))
+                low, high = np.floor(100 * low) / 100, np.ceil(100 * high) / 100  # for short labels
+                widget = self._server.gui.add_slider(name, min=low, max=high, step=0.001, initial_value=low)
+                self._on(widget, partial(self._move_joint, len(self._joints)))
                 self._joints.append(widget)
 
-    def _start(self) -> np.ndarray:
-        robot = self._session.state.problem.robot
-        return np.clip([widget.value for widget in self._joints], robot.lower, robot.upper)
+    def _move_joint(self, index: int, event: Any) -> None:
+        problem = self._session.state.problem
+        q = problem.start.copy()
+        q[index] = np.clip(event.target.value, problem.robot.lower[index], problem.robot.upper[index])
+        self._session.set_start(q)
 
     def show_time(self, at: float, duration: float) -> None:
         """Where the slider stands."""

@@ -32,8 +32,8 @@ from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.settings import Bound, OneOf, Settings
 from robotdiffuse.verify import Report, verify_trajectory
 
-AHEAD = np.array([0.35, 0.0, 0.35])
-"""Where new obstacles stand, as shares of the arm's reach."""
+AHEAD, SIZE = np.array([0.35, 0.0, 0.35]), 0.066
+"""Where new obstacles stand, and the radius of a ball, as shares of the arm's reach."""
 KEEP_TREES = {
     "robotdiffuse": "search.keep_trees=true",
     "aorrtc": "keep_trees=true",
@@ -179,8 +179,10 @@ class Session:
     def add_obstacle(self, kind: str, center: Float[ndarray, "3"] | None = None) -> str:
         """Its name. Without a centre [m], before the arm, halfway to where it reaches."""
         with self._lock:
-            center = reach(self._state.problem.robot) * AHEAD if center is None else center
-            shapes = [*self._state.problem.known_scene.shapes, new_obstacle(kind, center)]
+            length = reach(self._state.problem.robot)
+            center = length * AHEAD if center is None else center
+            obstacle = new_obstacle(kind, center, round(SIZE * length, 2))
+            shapes = [*self._state.problem.known_scene.shapes, obstacle]
             self._set_scene(shapes)
             return self._state.problem.known_scene.shapes[-1].name
 
