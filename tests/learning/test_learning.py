@@ -24,6 +24,7 @@ from robotdiffuse.learning.encoders.point_autoencoder import (
     chamfer,
     nearest,
 )
+from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.robots.normalizer import JointNormalizer
@@ -288,6 +289,13 @@ def test_damaged_weights_give_one_line(tmp_path, case, file):
     with pytest.raises(InputError, match=file) as caught:
         load_model(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_numbers_of_waypoints_are_bounded():
+    """Matrices of 10**25 rows were asked for; found by fuzzing."""
+    for field in ("waypoints", "rows"):
+        with pytest.raises(InputError, match=rf"{field} is 1000+; it must be between . and 4096"):
+            MotionModelSettings.from_json({field: 10**25}, "model")
 
 
 def test_encoder_files(tmp_path):
