@@ -14,4 +14,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from robotdiffuse.processes import leave
+
+    leave(main())
