@@ -198,17 +198,14 @@ def test_point_clouds_agree_with_coal() -> None:
 def test_a_mesh_that_comes_again_takes_no_memory_again() -> None:
     """PyBullet keeps what it was given of a mesh, 0.15 kB a triangle, after its body is removed too."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
-    home = np.zeros(7)
-    with (
-        World(load_robot("panda"), Scene([])) as world,
-        PyBulletOracle(load_robot("panda"), Scene([])) as new,
-    ):
+    panda, home = load_robot("panda"), np.zeros(7)
+    with World(panda, Scene([])) as world, PyBulletOracle(panda, Scene([])) as oracle:
         for x in (0.6, 0.8, 0.6):
             scene = Scene([Mesh(ball.vertices, ball.faces, xyz=(x, 0.0, 0.4))])
             world.set_scene(scene)
-            new.set_scene(scene)
+            oracle.set_scene(scene)
             assert len(world._meshes) == 1
             with PyBulletOracle(panda, scene) as fresh:
-                assert new.distance(home) == pytest.approx(fresh.distance(home), abs=1e-9)
+                assert oracle.distance(home) == pytest.approx(fresh.distance(home), abs=1e-9)
         world.set_scene(Scene([Mesh(1.1 * ball.vertices, ball.faces)]))
         assert len(world._meshes) == 2
