@@ -26,7 +26,7 @@ from robotdiffuse.learning.encoders.point_autoencoder import (
 )
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.training.config import EncoderTraining
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.scenes.sampling import PANDA_REGION
 
@@ -296,6 +296,8 @@ def test_numbers_of_waypoints_are_bounded():
     for field in ("waypoints", "rows"):
         with pytest.raises(InputError, match=rf"{field} is 1000+; it must be between . and 4096"):
             MotionModelSettings.from_json({field: 10**25}, "model")
+    with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
+        PlannerTraining.from_json({"data": "d", "encoder": "e", "waypoints": 10**25}, "training")
 
 
 def test_encoder_files(tmp_path):
