@@ -13,6 +13,7 @@ import json
 import multiprocessing
 import os
 import resource
+import shutil
 import tempfile
 import time
 import traceback
@@ -223,6 +224,28 @@ EQUIPPED: dict[str, Any] = {
     "goal": {"pose": {"frame": "parcel", "xyz": [0.45, 0.3, 1.0], "wxyz": [0, 1, 0, 0]}},
     "waypoints": [{"joints": [0.2, -0.785, 0, -2.356, 0, 1.571, 0.785]}],
 }
+CONSTRAINED: dict[str, Any] = {
+    "constraints": [
+        {"axis_cone": {"frame": "panda_hand", "axis": [0, 0, 1], "direction": [0, 0, -1], "angle": 0.17}},
+        {"position_box": {"frame": "panda_hand", "low": [0, -1, 0], "high": [1, 1, 1], "xyz": [0, 0, 0.1]}},
+        {"on_plane": {"frame": "panda_hand", "point": [0, 0, 0.4], "normal": [0, 0, 1], "tolerance": 0.1}},
+        {"on_line": {"frame": "panda_hand", "point": [0.5, 0, 0.4], "direction": [0, 1, 0], "tolerance": 1}},
+        {"cartesian_line": {"frame": "panda_hand", "tolerance": 0.1, "angle": 0.5, "speed": 0.1}},
+    ],
+    "goal": {"pose": POSE | {"xyz_tolerance": [0.1, 0.1, 0], "rpy_tolerance": [0, 0, 3.1]}},
+}
+MOVING: dict[str, Any] = {
+    "moving": [
+        {"sphere": {"center": [0.5, -0.6, 0.5], "radius": 0.1}, "velocity": [0, 0.3, 0]},
+        {
+            "box": {"center": [0.6, 0, 0.3], "size": [0.2, 0.2, 0.2]},
+            "times": [0, 2],
+            "poses": [{"xyz": [0.6, 0, 0.3]}, {"xyz": [0.6, 1, 0.3], "wxyz": [1, 0, 0, 0]}],
+        },
+        {"sphere": {"center": [0.5, 0.6, 0.5], "radius": 0.1, "name": "hand"}, "max_speed": 0.5},
+    ],
+}
+IN_MOTION: dict[str, Any] = {"start_velocity": [0.1, 0, 0, 0, 0, 0, 0]}
 MOVEIT = {
     "name": "",
     "robot_model_name": "panda",
@@ -250,7 +273,17 @@ MOVEIT = {
     },
 }
 JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
-REQUEST = {
+HELD = {
+    "link_name": "panda_hand",
+    "touch_links": ["panda_leftfinger"],
+    "object": {
+        "header": {"frame_id": "panda_hand"},
+        "id": "cup",
+        "primitives": [{"type": 3, "dimensions": [0.2, 0.03]}],
+        "primitive_poses": [{"position": [0, 0, 0.15], "orientation": [0, 0, 0, 1]}],
+    },
+}
+REQUEST: dict[str, Any] = {
     "start_state": {"joint_state": {"name": JOINTS, "position": PROBLEM["start"]}},
     "goal_constraints": [
         {
@@ -294,8 +327,8 @@ def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
         data["goal"] = {"pose": POSE}
     if rng.random() < 0.1:
         data["views"], data["unseen"] = [VIEW], "optimistic"
-    elif rng.random() < 0.15:
-        data |= EQUIPPED
+    else:
+        data |= (*({},) * 3, EQUIPPED, CONSTRAINED, MOVING, IN_MOTION)[rng.integers(7)]
     ending = (".yaml", ".json", ".jsonl")[rng.integers(3)]
     file = folder / f"problem{ending}"
     file.write_bytes(text_of(rng, data, ending))
@@ -319,7 +352,10 @@ def _judged(file: FilePath) -> None:
 def _moveit(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     from robotdiffuse.problems.files import load_motion_bench_maker
 
-    scene, request = (yaml_text(rng, data, i) for i, data in enumerate((MOVEIT, REQUEST)))
+    asked = copy.deepcopy(REQUEST)
+    if rng.random() < 0.3:
+        asked["start_state"]["attached_collision_objects"] = [HELD]
+    scene, request = (yaml_text(rng, data, i) for i, data in enumerate((MOVEIT, asked)))
     (folder / "scene0001.yaml").write_bytes(scene)
     (folder / "request0001.yaml").write_bytes(request)
 
@@ -538,7 +574,10 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     trajectory = Trajectory(problem.robot.joint_names, times, rows, still, still)
     ending = (".json", ".yaml", ".csv", ".mcap", ".rosbag2")[rng.integers(5)]
     file = folder / f"motion{ending}"
-    if ending in (".json", ".yaml"):
+    if ending == ".json" and rng.random() < 0.3:
+        trajectory.save(file)
+        file.write_bytes(text_of(rng, json.loads(file.read_text()), ending))
+    elif ending in (".json", ".yaml"):
         forms = (
             lambda r: r,
             lambda r: {"joint_trajectory": r},
@@ -584,6 +623,105 @@ def _certificate(rng: np.random.Generator, folder: FilePath) -> Callable[[], obj
     return lambda: load_certificate(file).check()
 
 
+def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Depth images, and the views that name them."""
+    from PIL import Image
+
+    ending, image = (".png", ".npy", ".npz")[rng.integers(3)], rng.integers(0, 3000, (6, 8)).astype(np.uint16)
+    file = folder / f"depth{ending}"
+    if ending == ".png":
+        Image.fromarray(image).save(file)
+    else:
+        (np.save if ending == ".npy" else np.savez)(file, image if rng.random() < 0.5 else image / 1000)
+    if rng.random() < 0.6:
+        file.write_bytes(damaged(rng, file.read_bytes()))
+    view = VIEW | {"depth": file.name, "intrinsics": [6.0, 6.0, 4, 3], "scale": 0.001}
+    del view["cloud"]
+    problem = PROBLEM | {"scene": PROBLEM["scene"][:1], "views": [view], "unseen": "padded"}
+    (folder / "problem.json").write_bytes(
+        text_of(rng, problem, ".json") if rng.random() < 0.5 else json.dumps(problem).encode()
+    )
+    return lambda: _judged(folder / "problem.json")
+
+
+def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Problem files that browsers send to the live page."""
+    from robotdiffuse.live.exchange import problem_text, uploaded_problem
+    from robotdiffuse.live.session import Session
+    from robotdiffuse.robots import load_robot
+
+    problem = PROBLEM | ({}, EQUIPPED, CONSTRAINED, MOVING)[rng.integers(4)]
+    ending = (".yaml", ".json")[rng.integers(2)]
+    content = text_of(rng, problem, ending)
+
+    def read() -> None:
+        problem = uploaded_problem(content, f"p{ending}", load_robot("panda"))
+        Session(problem).close()
+        problem_text(problem)
+
+    return read
+
+
+def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Heads of requests, at the door of the live page: handed on or not, never an error."""
+    from robotdiffuse.live.door import admitted
+
+    token = ("", "abc")[rng.integers(2)]
+    host = (b"localhost:8080", b"[::1]:1", b"a.example")[rng.integers(3)]
+    head = b"GET /abc/?x=1 HTTP/1.1\r\nHost: %s\r\nOrigin: http://%s\r\nUpgrade: websocket" % (host, host)
+    head = damaged(rng, head)
+    return lambda: admitted(head, token)
+
+
+def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """What --set says of planners, and settings of trainings."""
+    from robotdiffuse.learning.training.config import PlannerTraining
+    from robotdiffuse.planners import PLANNERS, planner_settings
+
+    if rng.random() < 0.5:
+        data = mutated(rng, PlannerTraining(data="d", encoder="e").to_json())
+        return lambda: PlannerTraining.from_json(data, "settings")
+    names = [*PLANNERS]
+    name = names[rng.integers(len(names))]
+    fields = ("range", "guidance.margin", "search.iterations", "samples", "weights", "", "a.b.c")
+    value = str(_nasty(rng))
+    said = f"{fields[rng.integers(len(fields))]}={value}" if rng.random() < 0.8 else value
+    return lambda: planner_settings(name, [said])
+
+
+def _weights(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Folders with the weights of a network."""
+    from robotdiffuse.learning.checkpoint import BUNDLED, load_network
+    from robotdiffuse.robots import load_robot
+
+    about, tensors = (BUNDLED / "panda" / f"mpinets.{ending}" for ending in ("json", "safetensors"))
+    whole = rng.random() < 0.8
+    text = text_of(rng, json.loads(about.read_text()), ".json") if whole else about.read_bytes()
+    (folder / about.name).write_bytes(text)
+    if whole:
+        (folder / tensors.name).symlink_to(tensors)
+    else:
+        (folder / tensors.name).write_bytes(damaged(rng, tensors.read_bytes()[: 10 ** rng.integers(2, 7)]))
+    return lambda: load_network("mpinets", folder, load_robot("panda"))
+
+
+def _npz(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """The authors' data sets."""
+    import io
+
+    from robotdiffuse.data.robot_npz import import_npz
+
+    stream, x = io.BytesIO(), np.zeros((2, 254, 7), np.float32)
+    x += np.array(PROBLEM["start"], np.float32)
+    y = np.concatenate([x[:, 0], x[:, -1], np.ones((2, 9), np.float32)], axis=1)
+    if rng.random() < 0.3:
+        y[0, rng.integers(y.shape[1])] = (np.nan, 1e30, np.inf)[rng.integers(3)]
+    np.savez(stream, x_train=x, y_train=y)
+    file = folder / "robot.npz"
+    file.write_bytes(damaged(rng, stream.getvalue()) if rng.random() < 0.8 else stream.getvalue())
+    return lambda: import_npz(file, folder / "set")
+
+
 KINDS: dict[str, Make] = {
     "problem": _problem,
     "moveit": _moveit,
@@ -595,6 +733,12 @@ KINDS: dict[str, Make] = {
     "http": _http,
     "motion": _motion,
     "certificate": _certificate,
+    "depth": _depth,
+    "upload": _upload,
+    "head": _head,
+    "settings": _settings,
+    "weights": _weights,
+    "npz": _npz,
 }
 
 
@@ -609,8 +753,7 @@ def _work(pipe: Connection, seed: int, count: int, kinds: tuple[str, ...]) -> No
             inner = FilePath(folder) / str(i)
             inner.mkdir()
             pipe.send((*one(kind, i, inner), time.process_time() - begun))
-            for file in inner.iterdir():
-                file.unlink()
+            shutil.rmtree(inner)
 
 
 def run(seconds: float, seed: int, kinds: tuple[str, ...]) -> tuple[Counter, list[str], dict[str, float]]:

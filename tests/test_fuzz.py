@@ -25,6 +25,12 @@ COUNTS = {
     "http": 300,
     "motion": 120,
     "certificate": 250,
+    "depth": 150,
+    "upload": 120,
+    "head": 500,
+    "settings": 150,
+    "weights": 100,
+    "npz": 80,
 }
 
 

@@ -60,3 +60,28 @@ def test_a_worker_in_compiled_code_does_not_outlive_a_parent_that_is_killed() ->
         while worker.exists():
             assert time.monotonic() < until, "it lives as long as its call"
             time.sleep(0.02)
+
+
+SWALLOWING = """
+import ctypes, signal, time
+from robotdiffuse.processes import interrupts_at_once
+with interrupts_at_once(lambda: print("tidy", flush=True)):
+    try:
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+        time.sleep(0.1)
+    except BaseException:
+        pass
+    print("lives", flush=True)
+"""
+
+
+def test_ctrl_c_is_not_lost_in_callbacks() -> None:
+    """`robot add` went on for minutes after a Ctrl-C that came while compiled code was loaded."""
+    ended = subprocess.run([sys.executable, "-c", SWALLOWING], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "tidy\n", "robotdiffuse: stopped\n")
+
+
+def test_ctrl_c_that_is_ignored_stays_ignored() -> None:
+    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)" + SWALLOWING
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, "lives\n")

@@ -7,6 +7,7 @@ import pytest
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.registry import Entry, Registry
+from robotdiffuse.scenes.sampling import VisibleRegion
 from robotdiffuse.settings import Bound, Count, NotNegative, OneOf, Positive, Settings, SettingsOf, Share
 
 
@@ -113,6 +114,12 @@ def test_assignments() -> None:
 def test_assignments_that_are_wrong(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Search().changed([text])
+
+
+def test_tuples_of_a_fixed_length_have_it() -> None:
+    """It was an IndexError, from weights whose description had lost a number; found by fuzzing."""
+    with pytest.raises(InputError, match=r"region.center is \[0.0, 0.1\]; it must have 3 entries"):
+        VisibleRegion.from_json({"center": [0.0, 0.1]}, "region")
 
 
 def test_descriptions() -> None:

@@ -6,7 +6,10 @@ import sys
 def main() -> int:
     """As `cli.main`; Ctrl-C is one line while that is still imported, too."""
     try:
-        from robotdiffuse import cli
+        from robotdiffuse.processes import interrupts_at_once
+
+        with interrupts_at_once():
+            from robotdiffuse import cli
     except KeyboardInterrupt:
         print("robotdiffuse: stopped", file=sys.stderr)
         return 130
@@ -14,4 +17,6 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from robotdiffuse.processes import leave
+
+    leave(main())

@@ -12,6 +12,7 @@ import select
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
@@ -21,7 +22,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from robotdiffuse import __version__
 from robotdiffuse.errors import InputError
@@ -209,6 +210,31 @@ def interrupts_afterwards() -> Iterator[None]:
         signal.raise_signal(signal.SIGINT)
 
 
+@contextmanager
+def interrupts_at_once(tidy: Callable[[], None] = lambda: None) -> Iterator[None]:
+    """Ctrl-C ends this process, after `tidy`, wherever it is: for work that leaves nothing half-done.
+
+    An exception would be lost while compiled code is loaded, whose callbacks swallow it, and mistaken for an
+    error of theirs by some packages that are being imported.
+    """
+
+    def stop(*_: object) -> None:
+        with suppress(Exception):
+            tidy()
+            print("robotdiffuse: stopped", file=sys.stderr, flush=True)
+        os._exit(130)
+
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    if ignored or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def prepare_worker(entries: Added) -> None:
     """A worker has what its parent has `added` to the tables, and ends with it, even where that is killed."""
     take_over(entries)
@@ -231,6 +257,21 @@ def _end_by_signal_with(parent: BaseProcess) -> None:
     with suppress(OSError, AttributeError):  # systems that cannot have the thread
         fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())
         fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)
+
+
+def leave(status: int) -> NoReturn:
+    """End this process with an exit status: at once if it is one of several that torchrun started.
+
+    Threads of PyTorch's process group that want the interpreter while it is being taken down abort the
+    process, rarely, and under load. What it had to do is done by then: files are written, others have heard.
+    """
+    if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+        with suppress(OSError, ValueError):
+            sys.stdout.flush()
+        with suppress(OSError, ValueError):
+            sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
 
 
 def end(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -> None:

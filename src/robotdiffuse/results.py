@@ -12,7 +12,7 @@ from robotdiffuse.checks import FASTEST, within
 from robotdiffuse.errors import InputError, shown
 from robotdiffuse.files import check_output, write_atomically
 from robotdiffuse.reading import read_json
-from robotdiffuse.types import ROWS, Path, Status, Trajectory
+from robotdiffuse.types import ROWS, Path, Status, Trajectory, Tree
 
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
 
@@ -58,6 +58,9 @@ class PlanResult:
     unseen_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     """Least and greatest corner of a box, in the base frame, around the unseen space that the motion crosses
     where that is likeliest to be occupied [m]; None where it crosses none."""
+    trees: tuple[Tree, ...] = field(default=(), repr=False)
+    """Of the search: from the start and from the goals, as they found the shortest path of the search, or
+    stood when time ran out. Only where the planner's settings say `keep_trees`; files do not hold them."""
     problem: Any = field(default=None, repr=False)
     """The `Problem` that was asked, for `rd.show`; None in results that were read from files."""
 

@@ -291,6 +291,9 @@ def _typed(hint: Any, value: Any, where: str) -> Any:
     options = [_split(option)[0] for option in _options(bare)]
     for option in options:
         if get_origin(option) is tuple and isinstance(value, list | tuple):
+            count = len(get_args(option))
+            if get_args(option)[-1] is not Ellipsis and len(value) != count:
+                raise InputError(f"{where} is {shown(value)}; it must have {count} entries")
             return tuple(_typed(get_args(option)[0], entry, where) for entry in value)
         if get_origin(option) is dict and isinstance(value, dict):
             return {str(key): _typed(get_args(option)[1], entry, where) for key, entry in value.items()}

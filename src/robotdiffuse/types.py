@@ -6,10 +6,10 @@ import json
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.files import check_output, write_atomically
@@ -52,6 +52,16 @@ class Path:
     def length(self) -> float:
         """Sum of the Euclidean lengths of the segments in joint space [rad]."""
         return float(np.linalg.norm(np.diff(self.positions, axis=0), axis=1).sum())
+
+
+class Tree(NamedTuple):
+    """What a search has grown from one end; from a node to its parent the straight line in joint space is
+    free."""
+
+    nodes: Float[ndarray, "n dof"]
+    """[rad], [m] for prismatic joints; the roots first."""
+    parents: Int[ndarray, "n"]
+    """The row of each node's parent, before its own; -1 for roots."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """The authors' layout: what is written in it, and the data set that is made of it, come back the same."""
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -118,6 +119,16 @@ def test_an_imported_set_loads_with_other_spheres(tmp_path):
     ]
     assert sum(sizes) == 3
     assert (read_shard(tmp_path / "again", 0)["obstacle_params"][..., 3] == np.float32(0.2)).all()
+
+
+def test_a_header_that_breaks_off_is_one_line(tmp_path):
+    """NumPy gives it to Python's tokenizer, whose errors are no ValueErrors; found by fuzzing."""
+    file = tmp_path / "robot.npz"
+    with zipfile.ZipFile(file, "w") as archive:
+        header = b"{'descr': '<f4', 'shape': (3,"
+        archive.writestr("x_train.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    with pytest.raises(InputError, match=r"is no robot\.npz"):
+        import_npz(file, tmp_path / "out")
 
 
 def test_what_cannot_be_imported(tmp_path, monkeypatch):

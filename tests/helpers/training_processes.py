@@ -19,6 +19,7 @@ from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.run import TrainingRun, Validation
+from robotdiffuse.processes import leave
 
 STEP_SECONDS = 0.3
 STOP_AFTER = 3
@@ -91,3 +92,4 @@ if __name__ == "__main__":
     training.load_robot = lambda name: arm
     given = PlannerTraining.from_json(json.loads(Path(values).read_text()), "settings")
     {"slow": slow, "two": two}[kind](given, Path(folder))
+    leave(0)

@@ -24,8 +24,9 @@ from robotdiffuse.learning.encoders.point_autoencoder import (
     chamfer,
     nearest,
 )
+from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.training.config import EncoderTraining
+from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.scenes.sampling import PANDA_REGION
 
@@ -256,11 +257,23 @@ def damage(folder, case):
         values = json.loads(about.read_text())
         values["settings"]["denoiser_settings"]["width"] = 32
         about.write_text(json.dumps(values))
+    elif case == "beyond all memory":
+        values = json.loads(about.read_text())
+        values["settings"]["denoiser_settings"]["hidden"] = 2**63
+        about.write_text(json.dumps(values))
+    elif case in ("joint too few", "ragged frames"):
+        values = json.loads(about.read_text())
+        rows = values["robot"]["lower" if case == "joint too few" else "frame_offsets"]
+        (rows if case == "joint too few" else rows[0][0]).pop()
+        about.write_text(json.dumps(values))
 
 
 @pytest.mark.parametrize(
     ("case", "file"),
     [
+        ("beyond all memory", "model.json"),
+        ("joint too few", "robot.lower has 2 entries for 3 joints"),
+        ("ragged frames", "not 4 x 4"),
         ("truncated", "model.safetensors"),
         ("bit", "model.safetensors"),
         ("no weights", "model.safetensors"),
@@ -276,6 +289,15 @@ def test_damaged_weights_give_one_line(tmp_path, case, file):
     with pytest.raises(InputError, match=file) as caught:
         load_model(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+def test_numbers_of_waypoints_are_bounded():
+    """Matrices of 10**25 rows were asked for; found by fuzzing."""
+    for field in ("waypoints", "rows"):
+        with pytest.raises(InputError, match=rf"{field} is 1000+; it must be between . and 4096"):
+            MotionModelSettings.from_json({field: 10**25}, "model")
+    with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
+        PlannerTraining.from_json({"data": "d", "encoder": "e", "waypoints": 10**25}, "training")
 
 
 def test_encoder_files(tmp_path):

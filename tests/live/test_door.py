@@ -50,6 +50,13 @@ def test_elsewhere_the_path_begins_with_the_token() -> None:
     assert admitted(strange, "token") is None
 
 
+@pytest.mark.parametrize("wrong", ["[::1", "[::fg]:1", "]", "//[", "127.0.0.1]["])
+def test_what_is_no_host_is_not_let_in(wrong: str) -> None:
+    """Python's splitting of URLs raises errors about brackets; found by fuzzing."""
+    assert admitted(request(Host=wrong), "") is None
+    assert admitted(request(Host="localhost", Origin=f"http://{wrong}"), "") is None
+
+
 def test_the_door_hands_on_what_it_lets_in_with_the_secret() -> None:
     inner = socket.create_server(("127.0.0.1", 0))
     listening = bound("127.0.0.1", 0)

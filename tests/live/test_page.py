@@ -85,7 +85,7 @@ def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(
     view: Any, live: "tuple[Page, str]"
 ) -> None:
     session = live[0].session
-    beside(view, "Replan after each change").uncheck(force=True)
+    beside(view, "Keep planning").uncheck(force=True)
     until(lambda: not session.state.choice.follow)
     view.get_by_role("tab", name="Obstacles").click()
     view.get_by_role("button", name="Add").click()
@@ -148,6 +148,20 @@ def on_screen(view: Any, page: "Page", point: np.ndarray) -> tuple[float, float]
     size = view.viewport_size
     focal = 0.5 * size["height"] / np.tan(0.5 * camera.fov)
     return 0.5 * size["width"] + focal * x / z, 0.5 * size["height"] + focal * y / z
+
+
+def test_the_trees_of_the_search_are_drawn_when_asked_for(view: Any, live: "tuple[Page, str]") -> None:
+    page = live[0]
+    drawn = page._server.scene._handle_from_node_name
+    answer = page.session.state.answer
+    view.get_by_role("tab", name="Plan").click()
+    box = beside(view, "Search trees")
+    box.check(force=True)
+    until(lambda: {"/trees/start", "/trees/goal"} <= drawn.keys())
+    box.uncheck(force=True)
+    until(lambda: not {"/trees/start", "/trees/goal"} & drawn.keys())
+    assert answer is not None and len(answer.trees) == 2
+    assert page.session.state.answer is answer, "drawing them is no reason to plan"
 
 
 def test_it_plays_and_is_scrubbed(view: Any, live: "tuple[Page, str]") -> None:

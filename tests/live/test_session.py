@@ -262,6 +262,7 @@ def test_candidates_of_an_arm_without_weights_are_smooth_noise() -> None:
     assert drawn is not None and drawn.source == "smooth_noise"
     assert drawn.positions.shape[0] == len(drawn.clearances) and (drawn.clearances > 0).all()
     np.testing.assert_allclose(drawn.positions[:, 0], np.tile(start, (len(drawn.positions), 1)), atol=1e-5)
+    assert certificate(until(session, settled)).lines[0].startswith("no obstacles, between links")
     session.choose(candidates=False)
     assert session.state.candidates is None
     session.close()
@@ -312,7 +313,10 @@ CORNERS = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 @pytest.mark.parametrize(
     "shape",
     [
-        *(new_obstacle(kind, np.array([0.1, 0.2, 0.3])) for kind in ("sphere", "box", "cylinder", "capsule")),
+        *(
+            new_obstacle(kind, np.array([0.1, 0.2, 0.3]), 0.08)
+            for kind in ("sphere", "box", "cylinder", "capsule")
+        ),
         Mesh(CORNERS, [[0, 1, 2], [0, 1, 3]], xyz=(0.1, 0, 0)),
         PointCloud(CORNERS),
     ],

@@ -249,9 +249,11 @@ def solve(
     from rich.console import Console
 
     from robotdiffuse.planners import load_planner
+    from robotdiffuse.processes import interrupts_at_once
 
     console = Console(stderr=True)
-    with console.status("loading compiled code (a new machine compiles it first, for about a minute)"):
+    loading = console.status("loading compiled code (a new machine compiles it first, for about a minute)")
+    with interrupts_at_once(loading.stop), loading:
         loaded = load_planner(planner, settings, weights)
         loaded.warm_up(problem)
     with console.status(f"planning with {planner}"):

@@ -121,11 +121,14 @@ def run_add(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from robotdiffuse.cli.preparation import print_preparation
-    from robotdiffuse.robots.add import add_robot
+    from robotdiffuse.processes import interrupts_at_once
 
     console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+    bar = Progress(console=console, transient=True, disable=not console.is_terminal)
+    with interrupts_at_once(bar.stop), bar:
+        from robotdiffuse.cli.preparation import print_preparation
+        from robotdiffuse.robots.add import add_robot
+
         task = bar.add_task("reading")
 
         def progress(what: str, step: int, steps: int) -> None:

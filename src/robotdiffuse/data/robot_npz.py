@@ -6,7 +6,6 @@ are the target's position is our reading of the 23. float32.
 """
 
 import os
-import zipfile
 from collections.abc import Callable
 from pathlib import Path as FilePath
 
@@ -20,7 +19,7 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.data.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
 from robotdiffuse.data.shards import Row, check_shapes, read_shard, row_of, shard_indices, write_shard
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shortened
 from robotdiffuse.files import alone_in
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.robots import load_robot
@@ -172,8 +171,8 @@ def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[nd
             x, y = (np.asarray(stored[name], np.float32) for name in wanted)
     except OSError as error:
         raise InputError(f"cannot read {file}: {error.strerror or error}") from None
-    except (ValueError, TypeError, KeyError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{file} is no robot.npz: {' '.join(str(error).split())}") from None
+    except Exception as error:  # NumPy, zipfile and Python's tokenizer raise whatever they meet
+        raise InputError(f"{file} is no robot.npz: {shortened(str(error))}") from None
     for (name, row), array in zip(wanted.items(), (x, y), strict=True):
         if array.shape != (len(x), *row) or not len(x):
             shape = " x ".join(map(str, ("n", *row)))

@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shortened
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.completion.network import CompletionNetwork, CompletionSettings
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
@@ -236,10 +236,12 @@ def _load(name: str, folder: FilePath) -> Network:
     tensors, about = _read(folder, name)
     where, settings = str(folder / f"{name}.json"), NETWORKS.settings(name)
     assert settings is not None and issubclass(settings, Settings)
-    network: Network = NETWORKS.load(name)(
-        RobotIdentity.from_json(about.get("robot"), f"{where}: robot"),
-        settings.from_json(about.get("settings"), f"{where}: settings"),
-    )
+    robot = RobotIdentity.from_json(about.get("robot"), f"{where}: robot")
+    made = settings.from_json(about.get("settings"), f"{where}: settings")
+    try:
+        network: Network = NETWORKS.load(name)(robot, made)
+    except (RuntimeError, TypeError, MemoryError, OverflowError) as error:  # as PyTorch has it of sizes
+        raise InputError(f"{where}: no network can be of such settings: {shortened(str(error))}") from None
     _fill(network, tensors, folder / f"{name}.safetensors")
     return network.for_inference()
 

@@ -46,11 +46,15 @@ GuideFn = Callable[[ndarray, float], ndarray]
 values."""
 
 
+MOST_WAYPOINTS = 4096.0
+"""Matrices are made whose sides are as long."""
+
+
 @dataclass(frozen=True)
 class ModelParts(Settings):
     """What a model and its training are told alike."""
 
-    waypoints: Annotated[int, Bound(least=3.0)] = 48
+    waypoints: Annotated[int, Bound(least=3.0, most=MOST_WAYPOINTS)] = 48
     """Waypoints of a trajectory, evenly spaced along it (joint-space length; paper: 254)."""
     denoiser: Annotated[str, OneOf(DENOISERS)] = "transformer"
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
@@ -60,7 +64,7 @@ class ModelParts(Settings):
     """Calls of the denoiser for a batch; None: all levels of the schedule (the paper's)."""
     parametrization: Annotated[str, OneOf(PARAMETRIZATIONS)] = "waypoints"
     """What the rows are that are diffused: waypoints (the paper's), or b_spline control points."""
-    rows: Count | None = None
+    rows: Annotated[int, Bound(least=1.0, most=MOST_WAYPOINTS)] | None = None
     """As many; None: as there are waypoints."""
     target: Annotated[str, OneOf(TARGETS)] = "residual"
     """What rows are relative to: the straight line from start to goal (residual), the mean of the data

@@ -33,6 +33,15 @@ class RobotIdentity(Settings):
     links: tuple[str, ...]
     """Links with collision spheres that some planned joint moves, in the order of link clearances."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        dof = len(self.joint_names)
+        for name in ("lower", "upper", "frame_offsets"):
+            if len(getattr(self, name)) != dof:
+                raise InputError(f"robot.{name} has {len(getattr(self, name))} entries for {dof} joints")
+        if any([len(row) for row in T] != [4] * 4 for T in self.frame_offsets):
+            raise InputError("robot.frame_offsets has an entry that is not 4 x 4 numbers")
+
     @staticmethod
     @once_per_robot
     def of(robot: Robot) -> "RobotIdentity":

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from robotdiffuse.live.session import State
+from robotdiffuse.verify import Report
 
 FREE, WRONG, NONE, WAITING = "free", "wrong", "none", "waiting"
 """Kinds of certificates: green, red, no motion, not judged yet."""
@@ -34,14 +35,21 @@ def certificate(state: State) -> Certificate:
     violation = report.violation
     if violation is None:
         lines = (
-            f"to obstacles {_distance(report.scene_clearance)}, between links "
-            f"{_distance(report.self_clearance)}, all along {trajectory.duration:.2f} s",
+            f"{_to_obstacles(state, report)}, between links {_distance(report.self_clearance)}, "
+            f"all along {trajectory.duration:.2f} s",
             *more,
         )
         return Certificate(FREE, f"free, clearance at least {_distance(report.min_clearance)}", lines)
     what = "collides" if violation.kind in COLLISIONS else "not valid"
     when = f"at {violation.time:.2f} s of {trajectory.duration:.2f} s"
     return Certificate(WRONG, f"{what}: {violation.message}", (when, *more))
+
+
+def _to_obstacles(state: State, report: Report) -> str:
+    problem = state.problem
+    if not (problem.scene.shapes or problem.moving):
+        return "no obstacles"
+    return f"to obstacles {_distance(report.scene_clearance)}"
 
 
 def _why_not(state: State) -> str:

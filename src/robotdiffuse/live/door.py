@@ -133,7 +133,7 @@ def admitted(head: bytes, token: str) -> bytes | None:
     [host, *more], origins = named("host") or [""], named("origin")
     if more or any(k.lower() == SECRET.lower() for k, _, _ in fields):
         return None
-    if any(urlsplit(origin).netloc != host for origin in origins):
+    if any(_part(origin, "netloc") != host for origin in origins):
         return None
     path = words[1]
     if token:
@@ -142,10 +142,18 @@ def admitted(head: bytes, token: str) -> bytes | None:
         if not hmac.compare_digest(first.encode(), token.encode()):
             return None
         path = f"/{rest}" if slash else f"/{mark}{query}"
-    elif not is_loopback(urlsplit(f"//{host}").hostname or ""):
+    elif not is_loopback(_part(f"//{host}", "hostname")):
         return None
     lines[0] = f"GET {path} {words[2]}"
     return "\r\n".join(lines).encode("latin-1")
+
+
+def _part(url: str, name: str) -> str:
+    """Of what may be no URL; then ""."""
+    try:
+        return getattr(urlsplit(url), name) or ""
+    except ValueError:
+        return ""
 
 
 def new_token() -> str:

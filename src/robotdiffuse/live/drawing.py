@@ -1,7 +1,7 @@
 """The scene in 3D, as viser draws it: arms, obstacles, the trace of the tool, the fan of candidates."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import viser
@@ -10,21 +10,33 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from robotdiffuse.live.obstacles import dimensions, handle_pose, held_at
+from robotdiffuse.live.session import reach
 from robotdiffuse.planners.candidates import Candidates
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 from robotdiffuse.transforms import quaternion_from_rotation
-from robotdiffuse.types import Trajectory
+from robotdiffuse.types import Trajectory, Tree
 from robotdiffuse.viewer import look
 from robotdiffuse.viewer.look import GOAL, START, Surface
 
 RATE = 30.0
 """Poses of a motion that are worked out for each second."""
 RED, AMBER = (0xD6, 0x3B, 0x3B), (0xE0, 0x9A, 0x2F)
+GAMMA = 2.2
 COMFORT = 0.05
 """Candidates with so much clearance are wholly green [m]."""
 TRACE_POINTS = 120
+EDGE_POINTS, MOST_EDGES = 6, 4000
+"""Of the tool's way along each edge of a tree; edges of each tree that are drawn, the first ones."""
+TREES = ("/trees/start", "/trees/goal")
+COAT = 0.002
+"""How far what is seen through stands out, so that it lies over the arm where both are in one place [m]; the
+less that is seen through it, the further."""
+TRACE_WIDTH, FAN_WIDTH, TREE_WIDTH = 0.0066, 0.0025, 0.002
+"""Of lines, as shares of the arm's reach."""
+GHOST = 0.3
+"""Opacity of start and goal."""
 SELECTED = 0.35
 """How much lighter the obstacle is that was clicked on."""
 
@@ -75,6 +87,8 @@ class Arm:
                 continue
             parts = _colored(surface) if color is None else [(color, surface)]
             for k, (own, part) in enumerate(parts):
+                if opacity is not None:
+                    part = replace(part, vertices=part.vertices + opacity / GHOST * COAT * part.normals)
                 _add(server, f"/{name}/{i}/{k}", part, own, opacity)
 
     def show(self, poses: "Poses | None", at: int = 0) -> None:
@@ -171,7 +185,7 @@ def draw_trace(
     points = look.trace(robot, tool, look.dense(motion.positions, TRACE_POINTS))
     share = np.linspace(0, 1, len(points))[:, None]
     colors = (1 - share) * np.array(START) + share * np.array(GOAL)
-    _lines(server, "/trace", [points], [colors], 0.008)
+    _lines(server, "/trace", [points], [colors], TRACE_WIDTH * reach(robot))
 
 
 def draw_fan(
@@ -184,7 +198,30 @@ def draw_fan(
     ways = [look.trace(robot, tool, q) for q in candidates.positions]
     of = zip(ways, candidates.clearances, strict=True)
     colors = [np.tile(fan_color(clearance), (len(way), 1)) for way, clearance in of]
-    _lines(server, "/fan", ways, colors, 0.003)
+    _lines(server, "/fan", ways, colors, FAN_WIDTH * reach(robot))
+
+
+def draw_trees(
+    server: viser.ViserServer, robot: Robot, tool: tuple[int, ndarray], trees: tuple[Tree, ...]
+) -> None:
+    """The ways of the tool along all edges, in the colours of start and goal; nothing of none."""
+    for name, color, tree in zip(TREES, (START, GOAL), trees or (None, None), strict=True):
+        ways = [] if tree is None else _edges(robot, tool, tree)
+        if len(ways):
+            _lines(
+                server, name, ways, [np.tile(color, (EDGE_POINTS, 1))] * len(ways), TREE_WIDTH * reach(robot)
+            )
+        else:
+            server.scene.remove_by_name(name)
+
+
+def _edges(robot: Robot, tool: tuple[int, ndarray], tree: Tree) -> list[Float[ndarray, "points 3"]]:
+    children = np.flatnonzero(tree.parents >= 0)[:MOST_EDGES]
+    begin, end = tree.nodes[tree.parents[children]], tree.nodes[children]
+    share = np.linspace(0, 1, EDGE_POINTS)[:, None]
+    q = (begin[:, None] + share * (end - begin)[:, None]).astype(np.float64)
+    points = look.trace(robot, tool, q.reshape(-1, robot.dof))
+    return list(points.reshape(-1, EDGE_POINTS, 3))
 
 
 def fan_color(clearance: float) -> Float[ndarray, "3"]:
@@ -198,9 +235,8 @@ def fan_color(clearance: float) -> Float[ndarray, "3"]:
 def _lines(
     server: viser.ViserServer, name: str, ways: list[ndarray], colors: list[ndarray], width: float
 ) -> None:
-    """Polylines as segments; `width` [m]."""
+    """Polylines as segments; `width` [m], colours in sRGB, which viser takes for linear ones."""
     points = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways])
     ends = np.concatenate([np.stack([color[:-1], color[1:]], axis=1) for color in colors])
-    server.scene.add_line_segments(
-        name, points.astype(np.float32), np.round(ends).astype(np.uint8), thickness=width
-    )
+    linear = np.round(255 * (ends / 255) ** GAMMA).astype(np.uint8)
+    server.scene.add_line_segments(name, points.astype(np.float32), linear, thickness=width)

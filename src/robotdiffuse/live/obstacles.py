@@ -11,13 +11,13 @@ from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere, pose
 from robotdiffuse.transforms import inverse, rotation_from_quaternion, transform
 
-NEW: dict[str, Callable[[Float[ndarray, "3"]], Shape]] = {
-    "sphere": lambda center: Sphere(center, 0.08),
-    "box": lambda center: Box(center, (0.16, 0.16, 0.16)),
-    "cylinder": lambda center: Cylinder(center, 0.06, 0.25),
-    "capsule": lambda center: Capsule(center, 0.06, 0.2),
+NEW: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
+    "sphere": lambda center, size: Sphere(center, size),
+    "box": lambda center, size: Box(center, (2 * size, 2 * size, 2 * size)),
+    "cylinder": lambda center, size: Cylinder(center, 0.75 * size, 3 * size),
+    "capsule": lambda center, size: Capsule(center, 0.75 * size, 2.5 * size),
 }
-"""Obstacles that can be added, as they are at first, by where they stand [m]."""
+"""Obstacles that can be added, as they are at first, by where they stand and by a ball's radius [m]."""
 LEAST, MOST = 0.01, 2.0
 """Of a dimension [m]."""
 AXES = ("x", "y", "z")
@@ -25,11 +25,11 @@ ORIENTED = (Box, Cylinder, Capsule, Mesh)
 """Others are turned by nothing: balls, and points, which a pose of their own would have to be kept for."""
 
 
-def new_obstacle(kind: str, center: Float[ndarray, "3"]) -> Shape:
+def new_obstacle(kind: str, center: Float[ndarray, "3"], size: float) -> Shape:
     """An obstacle of a kind in NEW; InputError for another kind."""
     if kind not in NEW:
         raise unknown_name("kind of obstacle", kind, NEW)
-    return NEW[kind](center)
+    return NEW[kind](center, size)
 
 
 def handle_pose(shape: Shape) -> Float[ndarray, "4 4"]:

@@ -16,8 +16,18 @@ from viser import infra
 from robotdiffuse.errors import InputError
 from robotdiffuse.live.certificate import certificate
 from robotdiffuse.live.door import SECRET, Door
+from robotdiffuse.live.drawing import (
+    GHOST,
+    RED,
+    Arm,
+    Obstacles,
+    Poses,
+    draw_fan,
+    draw_trace,
+    draw_trees,
+    film,
+)
 from robotdiffuse.live.drawing import RATE as FILM_RATE
-from robotdiffuse.live.drawing import RED, Arm, Obstacles, Poses, draw_fan, draw_trace, film
 from robotdiffuse.live.latest import Latest
 from robotdiffuse.live.panel import Deeds, Panel
 from robotdiffuse.live.player import Player
@@ -40,8 +50,6 @@ SUNS = (2.0, (-2.0, -3.0, 5.0)), (1.1, (3.0, 2.0, 3.0)), (0.7, (-3.0, 3.0, 1.0))
 """Lights: how bright, and from where."""
 BESIDE_PANEL = 0.2
 """Of the window's height, how far what is looked at stands to the left."""
-GHOST = 0.3
-"""Opacity of start and goal."""
 
 
 class _Server(viser.ViserServer):
@@ -150,6 +158,10 @@ class Page:
                 self._show_violation(state)
             if self._new("candidates", state.candidates):
                 draw_fan(self._server, robot, self._tool, state.candidates)
+            answer = state.answer
+            trees = answer.trees if state.choice.trees and answer is not None else ()
+            if (answer is not None or not state.choice.trees) and self._new("trees", trees):
+                draw_trees(self._server, robot, self._tool, trees)
 
     def _new(self, what: str, value: object) -> bool:
         """Whether it is another than at the last drawing."""
@@ -171,7 +183,8 @@ class Page:
         for gizmo in self._gizmos:
             gizmo.fit(reach(robot))
         self._look_at_all(surfaces)
-        for what in ("start", "goal", "motion", "verdict", "scene"):
+        draw_trees(self._server, robot, self._tool, ())
+        for what in ("start", "goal", "motion", "verdict", "scene", "trees"):
             self._drawn.pop(what, None)
 
     def _look_at_all(self, surfaces: list[Surface]) -> None:

@@ -3,6 +3,7 @@
 import html
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.live.certificate import FREE, NONE, WAITING, WRONG, Certificate
 from robotdiffuse.live.exchange import problem_text, replay_page, uploaded_problem
 from robotdiffuse.live.obstacles import LEAST, MOST, NEW, dimensions
-from robotdiffuse.live.session import Session, State
+from robotdiffuse.live.session import KEEP_TREES, Session, State
 from robotdiffuse.planners import PLANNERS
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, Trajectory
@@ -87,8 +88,19 @@ class Panel:
         self._limit = gui.add_slider(
             "Time limit [s]", min=0.05, max=10.0, step=0.05, initial_value=min(choice.time_limit, 10.0)
         )
-        self._follow = gui.add_checkbox("Replan after each change", initial_value=choice.follow)
-        self._candidates = gui.add_checkbox("Draw the network's candidates", initial_value=choice.candidates)
+        self._follow = gui.add_checkbox(
+            "Keep planning", initial_value=choice.follow, hint="Plan anew after each change"
+        )
+        self._candidates = gui.add_checkbox(
+            "Candidates",
+            initial_value=choice.candidates,
+            hint="What the network proposes: red where it touches, green with 5 cm of clearance",
+        )
+        self._trees = gui.add_checkbox(
+            "Search trees",
+            initial_value=choice.trees,
+            hint="From the start (blue) and the goal (green), of " + ", ".join(KEEP_TREES),
+        )
         self._now = gui.add_button("Plan now", icon=viser.Icon.ROUTE)
         self._stages = gui.add_html("")
         self._kind = gui.add_dropdown("Plot", PLOTS, initial_value=PLOTS[0])
@@ -98,6 +110,7 @@ class Panel:
         self._on(self._limit, lambda event: session.choose(time_limit=event.target.value))
         self._on(self._follow, lambda event: session.choose(follow=event.target.value))
         self._on(self._candidates, lambda event: session.choose(candidates=event.target.value))
+        self._on(self._trees, lambda event: session.choose(trees=event.target.value))
         self._on(self._kind, lambda _event: self._show_plot(session.state))
         self._now.on_click(lambda event: self.guarded(event, session.plan_now))
 
@@ -162,6 +175,7 @@ class Panel:
             (self._planner, state.choice.planner),
             (self._follow, state.choice.follow),
             (self._candidates, state.choice.candidates),
+            (self._trees, state.choice.trees),
         ):
             _set(widget, value)
         if self._new_value("motion", state.motion):
@@ -170,7 +184,7 @@ class Panel:
             self._new_joints(state.problem.robot)
         if self._new_value("start", state.problem.start):
             for widget, value in zip(self._joints, state.problem.start, strict=True):
-                _set(widget, float(value))
+                _set(widget, round(float(value), 3))
         self._show_obstacle(state, selected)
 
     def _new_value(self, what: str, value: object) -> bool:
@@ -216,16 +230,16 @@ class Panel:
         with self._joints_box:
             for name, low, high, turns in limits:
                 low, high = (-np.pi, np.pi) if turns else (float(low), float(high))
-                middle = 0.5 * (low + high)
-                widget = self._server.gui.add_slider(
-                    name, min=low, max=high, step=0.001, initial_value=middle
-                )
-                self._on(widget, lambda _event: self._session.set_start(self._start()))
+                low, high = np.floor(100 * low) / 100, np.ceil(100 * high) / 100  # for short labels
+                widget = self._server.gui.add_slider(name, min=low, max=high, step=0.001, initial_value=low)
+                self._on(widget, partial(self._move_joint, len(self._joints)))
                 self._joints.append(widget)
 
-    def _start(self) -> np.ndarray:
-        robot = self._session.state.problem.robot
-        return np.clip([widget.value for widget in self._joints], robot.lower, robot.upper)
+    def _move_joint(self, index: int, event: Any) -> None:
+        problem = self._session.state.problem
+        q = problem.start.copy()
+        q[index] = np.clip(event.target.value, problem.robot.lower[index], problem.robot.upper[index])
+        self._session.set_start(q)
 
     def show_time(self, at: float, duration: float) -> None:
         """Where the slider stands."""
@@ -260,7 +274,7 @@ class Panel:
             self._plot = self._server.gui.add_uplot(
                 data=data,
                 series=(uplot.Series(label="time [s]"), *joints, limit, limit),
-                scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(-105.0, 105.0))},
+                scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(-118.0, 118.0))},
                 axes=(uplot.Axis(label="s"), uplot.Axis(label="% of limit")),
                 legend=uplot.Legend(show=False),
                 height=220,

@@ -18,7 +18,7 @@ from numpy import ndarray
 from robotdiffuse.errors import InputError, shortened, unknown_name
 from robotdiffuse.live.latest import Latest
 from robotdiffuse.live.obstacles import handle_pose, held_at, new_obstacle, resized
-from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, load_planner
+from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, load_planner, planner_settings
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.candidates import Candidates, draw_candidates
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
@@ -32,8 +32,14 @@ from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.settings import Bound, OneOf, Settings
 from robotdiffuse.verify import Report, verify_trajectory
 
-AHEAD = np.array([0.35, 0.0, 0.35])
-"""Where new obstacles stand, as shares of the arm's reach."""
+AHEAD, SIZE = np.array([0.35, 0.0, 0.35]), 0.066
+"""Where new obstacles stand, and the radius of a ball, as shares of the arm's reach."""
+KEEP_TREES = {
+    "robotdiffuse": "search.keep_trees=true",
+    "aorrtc": "keep_trees=true",
+    "rrt_connect": "keep_trees=true",
+}
+"""The planners whose search can be looked at, and what they are told for it."""
 QUICK = InverseKinematicsSettings(max_rounds=2, patience=1)
 """For poses that hands move: many are out of reach."""
 
@@ -50,6 +56,8 @@ class Choice(Settings):
     """Plan anew after each change."""
     candidates: bool = False
     """Draw a batch of the diffusion model after each plan, to look at."""
+    trees: bool = False
+    """Show the trees of the search that found the last plan, or none."""
 
 
 @dataclass(frozen=True)
@@ -135,11 +143,12 @@ class Session:
         with self._lock:
             if "planner" in changes:
                 PLANNERS.entry(changes["planner"])
-            choice = replace(self._state.choice, **changes)
-            if choice == self._state.choice:
-                return
+            before, choice = self._state.choice, replace(self._state.choice, **changes)
             self._state = replace(self._state, choice=choice)
-            self._changed()
+            if replace(before, trees=choice.trees) != choice:
+                self._changed()
+            elif before != choice:
+                self.tell()
 
     def plan_now(self) -> None:
         """Plan, whether the session follows changes or not."""
@@ -170,8 +179,10 @@ class Session:
     def add_obstacle(self, kind: str, center: Float[ndarray, "3"] | None = None) -> str:
         """Its name. Without a centre [m], before the arm, halfway to where it reaches."""
         with self._lock:
-            center = reach(self._state.problem.robot) * AHEAD if center is None else center
-            shapes = [*self._state.problem.known_scene.shapes, new_obstacle(kind, center)]
+            length = reach(self._state.problem.robot)
+            center = length * AHEAD if center is None else center
+            obstacle = new_obstacle(kind, center, round(SIZE * length, 2))
+            shapes = [*self._state.problem.known_scene.shapes, obstacle]
             self._set_scene(shapes)
             return self._state.problem.known_scene.shapes[-1].name
 
@@ -289,7 +300,9 @@ class Session:
         try:
             planner = self._planners.get(choice.planner)
             if planner is None:
-                planner = load_planner(choice.planner)
+                told = KEEP_TREES.get(choice.planner)
+                settings = None if told is None else planner_settings(choice.planner, [told])
+                planner = load_planner(choice.planner, settings)
                 planner.warm_up(problem)
                 self._planners[choice.planner] = planner
             began = time.perf_counter()

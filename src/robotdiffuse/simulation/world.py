@@ -15,6 +15,7 @@ from robotdiffuse.scenes.shapes import (
     Box,
     Capsule,
     Cylinder,
+    Mesh,
     PointCloud,
     Shape,
     Sphere,
@@ -87,6 +88,8 @@ class World:
             pybullet.resetJointState(self.body, index, value, physicsClientId=self.client)
         self.obstacles: dict[str, int] = {}
         """PyBullet's number of each obstacle, by name."""
+        self._meshes: dict[tuple[bytes, bytes], int] = {}
+        """PyBullet's number of the shape of each mesh: what a mesh takes, it never gives back."""
         self.set_scene(scene)
 
     def __enter__(self) -> "World":
@@ -150,11 +153,8 @@ class World:
     def _add(self, shape: Shape, color: tuple[int, int, int]) -> int:
         if isinstance(shape, PointCloud):
             return self._add_points(shape, color)
+        what: dict[str, object] = {}
         if isinstance(shape, Triangulated):
-            file = Path(self._folder.name) / "obstacle.obj"
-            write_obj(file, shape.mesh.vertices, shape.mesh.faces)
-            flags = pybullet.GEOM_FORCE_CONCAVE_TRIMESH
-            what = {"shapeType": pybullet.GEOM_MESH, "fileName": str(file), "flags": flags}
             xyz, wxyz = shape.mesh.xyz, shape.mesh.wxyz
         elif isinstance(shape, Sphere):
             what = {"shapeType": pybullet.GEOM_SPHERE, "radius": shape.radius}
@@ -173,13 +173,32 @@ class World:
             vertices, faces = _surface(shape)
             large = np.ptp(vertices, axis=0).max() > FURNITURE_SIZE
             look = self._add_look(vertices, faces, FURNITURE_COLOR if large else color)
+        solid = (
+            self._mesh(shape.mesh)
+            if isinstance(shape, Triangulated)
+            else pybullet.createCollisionShape(**what, physicsClientId=self.client)
+        )
         return pybullet.createMultiBody(
-            baseCollisionShapeIndex=pybullet.createCollisionShape(**what, physicsClientId=self.client),
+            baseCollisionShapeIndex=solid,
             baseVisualShapeIndex=look,
             basePosition=xyz.tolist(),
             baseOrientation=[*wxyz[1:], wxyz[0]],
             physicsClientId=self.client,
         )
+
+    def _mesh(self, mesh: Mesh) -> int:
+        """The shape of a mesh, hollow as it may be, at the origin."""
+        key = mesh.vertices.tobytes(), mesh.faces.tobytes()
+        if key not in self._meshes:
+            file = Path(self._folder.name) / "obstacle.obj"
+            write_obj(file, mesh.vertices, mesh.faces)
+            self._meshes[key] = pybullet.createCollisionShape(
+                pybullet.GEOM_MESH,
+                fileName=str(file),
+                flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
+                physicsClientId=self.client,
+            )
+        return self._meshes[key]
 
     def _add_points(self, cloud: PointCloud, color: tuple[int, int, int]) -> int:
         """One body of as many spheres; only from a URDF does PyBullet take more than 16."""

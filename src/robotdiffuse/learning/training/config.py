@@ -8,7 +8,7 @@ from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import DenoiserSettings
 from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.encoders.base import EncoderSettings
-from robotdiffuse.learning.motion_model import ModelParts
+from robotdiffuse.learning.motion_model import MOST_WAYPOINTS, ModelParts
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.settings import (
@@ -103,7 +103,7 @@ class MotionTraining(TrainingSettings):
     """Folder of a data set of `robotdiffuse data generate`."""
     robot: str = "panda"
     """Bundled name, or path to a URDF: the robot that the data are for."""
-    waypoints: Annotated[int, Bound(least=3.0)] = 48
+    waypoints: Annotated[int, Bound(least=3.0, most=MOST_WAYPOINTS)] = 48
     """Waypoints of a trajectory (paper: 254)."""
     turns: Natural = 5
     """Copies of each trajectory turned about the vertical with their scenes, if the first joint is so."""

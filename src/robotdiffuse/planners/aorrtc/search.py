@@ -17,7 +17,7 @@ from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Count, Natural, Positive, Settings
-from robotdiffuse.types import FIRST, SHORT
+from robotdiffuse.types import FIRST, SHORT, Tree
 
 LEAST_CLEARANCE = 0.002
 """Tried even if none is wanted [m]: contact within that is costly to tell from none, and paths are hardly
@@ -53,6 +53,8 @@ class SearchSettings(Settings):
     """Random shortcuts after them."""
     iterations: Count = 20_000
     """Most iterations of a round; its trees hold at most as many nodes."""
+    keep_trees: bool = False
+    """Results hold the trees of the search, to be looked at."""
 
 
 class AnytimeSearch:
@@ -95,6 +97,8 @@ class AnytimeSearch:
         self._state = random_state(call.seed)
         self._rounds: list[_Round | None] = [None, None]
         """The one below the bound, and one without bound."""
+        self._grown: kernel.Trees | None = None
+        """Those that found the shortest path of the search, or that grow."""
         wanted = [share * call.clearance for share in (1.0, 0.5, 0.25)]
         usual = [*(kept for kept in wanted if kept > LEAST_CLEARANCE), LEAST_CLEARANCE, 0.0]
         self._clearances, self._tries = [*clearances] or usual, tries
@@ -118,6 +122,14 @@ class AnytimeSearch:
         """Whether no path to any goal can be shorter."""
         straight = np.linalg.norm(self.goals - self.start, axis=1).min()
         return bool(self.length <= straight * (1 + NO_SHORTER))
+
+    @property
+    def trees(self) -> tuple[Tree, ...]:
+        """See `PlanResult.trees`."""
+        if self._grown is None or not self.settings.keep_trees:
+            return ()
+        nodes, _, parents, sizes = self._grown
+        return tuple(Tree(nodes[i, :n].copy(), parents[i, :n].copy()) for i, n in enumerate(sizes))
 
     def first(self, until: float, help_out: Callable[[], None] | None = None, work: float = np.inf) -> bool:
         """Search until there is a path, or `until` [s since the call], or for so many more iterations;
@@ -215,10 +227,13 @@ class AnytimeSearch:
         longest = np.float32(settings.range)
         path = kernel.search(self.space, now.trees, self.goals, bound, longest, SLICE, self._state)
         self.work, self._tried, now.left = self.work + SLICE, self._tried + SLICE, now.left - SLICE
+        if self.best is None:
+            self._grown = now.trees
         if len(path):
             self.found += 1
             self._rounds[free] = None
-            self.offer(path, self.name)
+            if self.offer(path, self.name):
+                self._grown = now.trees
 
 
 @dataclass
@@ -294,4 +309,4 @@ def anytime(
                 break
         else:
             improve()
-    return answers.best or call.unsolved()
+    return replace(answers.best or call.unsolved(), trees=search.trees)
