@@ -38,10 +38,12 @@ from robotdiffuse.types import FIRST
 if TYPE_CHECKING:
     from robotdiffuse.planners.base import Planner
 
-CANDIDATES = 4
-"""First motions of a rung that the one of least probability is chosen from ..."""
-SAFE = 0.1
-"""... unless one sweeps no more than this."""
+CANDIDATES, FEW = 8, 4
+"""First motions of a rung that the one of least probability is chosen from, and how many of them at least,
+unless one is safe ..."""
+FAIR, SAFE = 2.0, 0.1
+"""Summed probability: no more than FEW are looked for if one sweeps no more than FAIR, none once one sweeps
+no more than SAFE."""
 AS_LIKELY = 0.01
 """A shorter motion is taken whose confidence is less by no more than this."""
 RESERVED = 0.3
@@ -155,7 +157,8 @@ class _Chain:
             if not result.solved:
                 break
             found.append(_Motion(result, rung, self.unseen))
-            if self.call.elapsed >= until or found[-1].safe:
+            least = min(motion.risk or 0.0 for motion in found)
+            if self.call.elapsed >= until or least <= (FAIR if len(found) >= FEW else SAFE):
                 break
         if self.request.until != FIRST and self.call.elapsed < until:
             result = self._attempt(problem, until, self.call.seed, self.request)
@@ -182,10 +185,6 @@ class _Motion:
         self._crossed = unseen.crossed(result.path)
         self.risk = self._crossed.risk
         self.likely = confidence(rung, self.risk)
-
-    @property
-    def safe(self) -> bool:
-        return self.risk is not None and self.risk <= SAFE
 
     @property
     def result(self) -> PlanResult:
