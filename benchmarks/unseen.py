@@ -1,7 +1,7 @@
 """What the camera does not see: motions planned on depth views, judged in the true scene.
 
     python benchmarks/unseen.py [--problems 300] [--views 1] [--noise] [--records unseen.jsonl]
-    python benchmarks/unseen.py --report --records unseen.jsonl
+    python benchmarks/unseen.py --report [--odd] --records unseen.jsonl
     python benchmarks/unseen.py --fit --records unseen.jsonl
 
 Problems are held-out ones of the families that the straight line does not solve and a search in the true
@@ -9,7 +9,8 @@ scene does. Cameras stand where a person would place them, 1.4 to 1.8 m away, in
 the floor is known, all else is seen. Every method plans with AORRTC and the same CPU time. A motion is free
 if the judge finds path and timed motion valid in the true scene. What was tried is kept in a file of records
 and not tried again; `--report` prints the tables that are kept in benchmarks/results/unseen.txt, and `--fit`
-the constants of planners/confidence.py, from the calibration half: problems with even numbers.
+the constants of planners/confidence.py, from the calibration half: problems with even numbers. Settings were
+chosen on them, too; `--odd` leaves them out of the report.
 """
 
 import argparse
@@ -181,8 +182,8 @@ def table(rows: list[Row], title: str) -> None:
 
 FIRST_RUNGS = {
     "padded": "points padded by 9 cm",
-    "imagined": "imagined, p > 0.05",
-    TRUE: "imagined, p > 0.05",
+    "imagined": "imagined, p > 0.1",
+    TRUE: "imagined, p > 0.1",
 }
 
 
@@ -228,13 +229,15 @@ def main() -> None:
     parser.add_argument("--noise", action="store_true")
     parser.add_argument("--records", default="unseen.jsonl", help="(unseen.jsonl)")
     parser.add_argument("--report", action="store_true")
+    parser.add_argument("--odd", action="store_true", help="report problems with odd numbers alone")
     parser.add_argument("--fit", action="store_true")
     arguments = parser.parse_args()
     if arguments.fit:
         fit(JsonLines(Path(arguments.records)).rows)
     elif arguments.report:
         print(header("numba", "numpy", "torch"))
-        report(JsonLines(Path(arguments.records)).rows)
+        rows = JsonLines(Path(arguments.records)).rows
+        report([row for row in rows if row["number"] % 2 or not arguments.odd])
     else:
         run(arguments, arguments.methods)
 

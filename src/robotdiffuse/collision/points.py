@@ -134,11 +134,8 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     run = np.full(int(np.prod(shape)), -1, np.int32)
     run[voxels[starts]] = np.arange(len(starts))
     ends = np.append(starts, len(points)).astype(np.int32)
-    from scipy.ndimage import distance_transform_edt  # which takes long to import, and only clouds need
-
-    found = distance_transform_edt((run < 0).reshape(shape), return_distances=False, return_indices=True)
-    nearest_voxel, sizes = np.asarray(found).reshape(3, -1), tuple(shape.tolist())
-    grid, nearest = make_grid(points, ends, run, nearest_voxel, low, voxel, sizes, band, np.float32(known))
+    sizes = tuple(shape.tolist())
+    grid, nearest = make_grid(points, ends, run, low, voxel, sizes, band, np.float32(known))
     frame = [*low, voxel, 2 * voxel, radii.max(), radii.min(), band, *shape, *cells]
     return PointGrid(
         points, by_sixteen(points, points[-1:]), first, grid, nearest, np.array(frame, np.float32)

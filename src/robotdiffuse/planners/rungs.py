@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.arrays import compile_scene_for, reach
-from robotdiffuse.planners.swept_kernel import mark
+from robotdiffuse.planners.swept_kernel import mark, surface
 from robotdiffuse.problems.problem import IMAGINED, OCCUPIED, PADDED, Problem
 from robotdiffuse.problems.seen_kernel import near_scene, sphere_distances
 from robotdiffuse.scenes.depth_view import SeenPoints, UnseenPoints
@@ -23,9 +23,9 @@ PADDED_SHARE, PADDED_MORE = 1.3, 0.01
 lets them grow."""
 THIRD = 1 / 3
 """Cells that one point is kept of, as a share of its padding."""
-THRESHOLDS = (0.05, 0.1, 0.2, 0.35, 0.5)
+THRESHOLDS = (0.1, 0.2, 0.35, 0.5)
 """Probabilities above which a voxel is an obstacle."""
-CARVED = 0.01
+CARVED = 0.02
 """Voxels nearer to an end's covering spheres than this are none [m]."""
 FINE = VOXEL / 2
 """Edge of an imagined voxel [m]."""
@@ -89,13 +89,7 @@ class Voxels(Rung):
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
         """Those at the surface, for the arm, which starts outside, cannot get within; without those that it
         cannot reach and those in shapes that are known."""
-        left = self.occupied & ~self._touched(spheres)
-        within = left.copy()
-        for axis in range(3):
-            rows = np.moveaxis(within, axis, 0), np.moveaxis(left, axis, 0)
-            rows[0][1:] &= rows[1][:-1]
-            rows[0][:-1] &= rows[1][1:]
-        points = (np.argwhere(left & ~within) + 0.5) * self.edge + LOW
+        points = (surface(self.occupied & ~self._touched(spheres)) + 0.5) * self.edge + LOW
         robot, known = self.problem.robot, self.problem.known_scene
         points = points[np.linalg.norm(points, axis=1) < reach(robot) + self.edge]
         if known.shapes:

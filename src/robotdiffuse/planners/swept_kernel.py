@@ -7,6 +7,8 @@ from robotdiffuse.collision.kernels.distance import frames_of, placed
 
 STEP = np.float32(0.05)
 """Largest motion of a joint between two looks [rad], [m] where it slides."""
+STILL = np.float32(0.1)
+"""A sphere that moved by no more since it was last looked at has not moved, as a share of a voxel's edge."""
 
 
 @njit(cache=True, nogil=True)
@@ -17,6 +19,7 @@ def sweep(robot, path, low, voxel, swept):
     """
     dof = path.shape[1]
     frames, q = np.zeros((dof + 1, 12), np.float32), np.empty(dof, np.float32)
+    last, still = np.full((len(robot.spheres), 3), np.inf, np.float32), (STILL * voxel) ** 2
     for i in range(max(len(path) - 1, 1)):
         a, b = path[i], path[min(i + 1, len(path) - 1)]
         steps = max(int(np.ceil(np.abs(b - a).max() / STEP)), 1)
@@ -30,6 +33,10 @@ def sweep(robot, path, low, voxel, swept):
                 for s in range(robot.first[g], robot.first[g + 1]):
                     sphere = robot.spheres[s]
                     x, y, z = placed(frames[robot.frame[g]], sphere[0], sphere[1], sphere[2])
+                    at = last[s]
+                    if (x - at[0]) ** 2 + (y - at[1]) ** 2 + (z - at[2]) ** 2 <= still:
+                        continue
+                    at[0], at[1], at[2] = x, y, z
                     _mark(x, y, z, sphere[3], low, voxel, swept)
 
 
@@ -41,20 +48,81 @@ def mark(spheres, low, voxel, marked):
 
 
 @njit(cache=True, nogil=True)
+def surface(marked):
+    """Indices int64[n, 3] of the marked voxels that share a face with one that is not, in order."""
+    nx, ny, nz = marked.shape
+    out, count = np.empty((marked.sum(), 3), np.int64), 0
+    for i in range(nx):
+        for j in range(ny):
+            for k in range(nz):
+                if not marked[i, j, k]:
+                    continue
+                within = (i == 0 or marked[i - 1, j, k]) and (i == nx - 1 or marked[i + 1, j, k])
+                within = within and (j == 0 or marked[i, j - 1, k]) and (j == ny - 1 or marked[i, j + 1, k])
+                within = within and (k == 0 or marked[i, j, k - 1]) and (k == nz - 1 or marked[i, j, k + 1])
+                if not within:
+                    out[count, 0], out[count, 1], out[count, 2] = i, j, k
+                    count += 1
+    return out[:count]
+
+
+@njit(cache=True, nogil=True)
 def _mark(x, y, z, radius, low, voxel, marked):
     nx, ny, nz = marked.shape
-    half = np.float32(0.5)
-    x, y, z, r = (
-        (x - low[0]) / voxel - half,
-        (y - low[1]) / voxel - half,
-        (z - low[2]) / voxel - half,
-        radius / voxel,
-    )
+    half, one = np.float32(0.5), np.float32(1.0)
+    x, y, z = (x - low[0]) / voxel - half, (y - low[1]) / voxel - half, (z - low[2]) / voxel - half
+    r = radius / voxel
     for i in range(max(int(np.ceil(x - r)), 0), min(int(np.floor(x + r)), nx - 1) + 1):
+        dx = np.float32(i) - x
         for j in range(max(int(np.ceil(y - r)), 0), min(int(np.floor(y + r)), ny - 1) + 1):
-            rest = r * r - (i - x) ** 2 - (j - y) ** 2
+            dy = np.float32(j) - y
+            rest = r * r - dx * dx - dy * dy
             if rest < 0:
                 continue
             reach = np.sqrt(rest)
-            for k in range(max(int(np.ceil(z - reach)), 0), min(int(np.floor(z + reach)), nz - 1) + 1):
+            first, beyond = max(int(np.ceil(z - reach)), 0), min(int(np.floor(z + reach + one)), nz)
+            for k in range(first, beyond):
                 marked[i, j, k] = True
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def summed(weights, marked):
+    """The sum of the weights of what is marked; both [nx, ny, nz]."""
+    total, weight, mark = 0.0, weights.ravel(), marked.ravel()
+    for i in range(len(mark)):
+        total += weight[i] if mark[i] else np.float32(0.0)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def heaviest_part(marked, weights):
+    """Corners int64[2, 3] of the box around the connected part of what is marked that weighs most: first and
+    one beyond the last voxel. Voxels are connected that share a face."""
+    todo, left = np.empty((marked.sum(), 3), np.int64), marked.copy()
+    best, most = np.zeros((2, 3), np.int64), -1.0
+    for i, j, k in np.argwhere(marked):
+        count, done, weight = _also(i, j, k, left, todo, 0), 0, 0.0
+        while done < count:
+            x, y, z = todo[done, 0], todo[done, 1], todo[done, 2]
+            done += 1
+            weight += weights[x, y, z]
+            for way in (-1, 1):
+                count = _also(x + way, y, z, left, todo, count)
+                count = _also(x, y + way, z, left, todo, count)
+                count = _also(x, y, z + way, left, todo, count)
+        if weight > most and count:
+            most = weight
+            for axis in range(3):
+                best[0, axis], best[1, axis] = todo[:count, axis].min(), todo[:count, axis].max() + 1
+    return best
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _also(i, j, k, left, todo, count):
+    """Put a voxel that is left on the list; how many there are now."""
+    nx, ny, nz = left.shape
+    if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and left[i, j, k]:
+        left[i, j, k] = False
+        todo[count, 0], todo[count, 1], todo[count, 2] = i, j, k
+        count += 1
+    return count

@@ -5,8 +5,8 @@ first; the first that has a motion answers. So every motion keeps clear of what 
 beside it as lets it pass:
 
 - padded: points seen, padded by 9 cm, by 6, by 4; then as seen.
-- imagined: voxels that the completing network finds occupied with a probability above 0.05, 0.1, 0.2, 0.35,
-  0.5; then as seen. Of several motions of a rung, one that sweeps little probability.
+- imagined: voxels that the completing network finds occupied with a probability above 0.1, 0.2, 0.35, 0.5;
+  then as seen. Of several motions of a rung, one that sweeps little probability.
 - occupied: every voxel that no view saw, and nothing after it.
 - optimistic: as seen.
 
@@ -18,30 +18,32 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Float, Float32
 from numpy import ndarray
 
-from robotdiffuse.collision.arrays import compile_robot, compile_scene_for
+from robotdiffuse.collision.arrays import compile_scene_for
 from robotdiffuse.planners.call import Call, Request
 from robotdiffuse.planners.confidence import confidence
 from robotdiffuse.planners.ends import usable_ends
-from robotdiffuse.planners.rungs import CARVED, FINE, FINE_SHAPE, Rung, Voxels, rungs, voxels_in
-from robotdiffuse.planners.swept_kernel import sweep
+from robotdiffuse.planners.rungs import Rung, Voxels, rungs
+from robotdiffuse.planners.unseen_space import UnseenSpace
 from robotdiffuse.problems.problem import IMAGINED, OCCUPIED, OPTIMISTIC, JointGoal, Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.scenes.depth_view import UnseenPoints
-from robotdiffuse.scenes.observed_volume import LOW, ObservedVolume, observe
+from robotdiffuse.scenes.observed_volume import observe
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.types import FIRST, Path
+from robotdiffuse.types import FIRST
 
 if TYPE_CHECKING:
     from robotdiffuse.planners.base import Planner
 
-CANDIDATES = 8
-"""First motions of a rung that the one of least probability is chosen from ..."""
-SAFE = 0.1
-"""... unless one sweeps no more than this."""
+CANDIDATES, FEW = 8, 4
+"""First motions of a rung that the one of least probability is chosen from, and how many of them at least,
+unless one is safe ..."""
+FAIR, SAFE = 2.0, 0.1
+"""Summed probability: no more than FEW are looked for if one sweeps no more than FAIR, none once one sweeps
+no more than SAFE."""
 AS_LIKELY = 0.01
 """A shorter motion is taken whose confidence is less by no more than this."""
 RESERVED = 0.3
@@ -71,14 +73,16 @@ def plan_beside_unseen(
     and which unseen space it crosses.
     """
     if problem.unseen == IMAGINED and imagined is None:
-        from robotdiffuse.learning.completion import imagine  # PyTorch, before the clock starts
+        from robotdiffuse.learning.completion import bundled, imagine  # PyTorch, before the clock starts
+
+        bundled()
     else:
         imagine = None
     call = Call(planner.name, problem, time_limit, seed, request)
     volume = observe(problem.views, problem.robot, problem.start)
     if imagine is not None:
         imagined = imagine(volume)
-    chain = _Chain(planner, call, request, _Unseen(problem, volume, imagined))
+    chain = _Chain(planner, call, request, UnseenSpace(problem, volume, imagined))
     as_seen = replace(problem, views=())
     if problem.unseen != OPTIMISTIC:
         goals = _goals(call, as_seen)
@@ -122,7 +126,7 @@ def _beside(problem: Problem, rung: Rung, goals: Float[ndarray, "n dof"]) -> Pro
     """The problem in the scene as seen with a rung's obstacles; of several goals, with those that need the
     least carving."""
     start, *ends = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))
-    needed = np.array([rung.touched(spheres) for spheres in ends])
+    needed = np.array([rung.touched(spheres) for spheres in ends] if len(ends) > 1 else [0])
     easiest = np.flatnonzero(needed == needed.min())
     obstacles = rung.obstacles(np.concatenate([start, *(ends[i] for i in easiest)]))
     scene = Scene([*problem.scene.shapes, obstacles])
@@ -132,7 +136,7 @@ def _beside(problem: Problem, rung: Rung, goals: Float[ndarray, "n dof"]) -> Pro
 class _Chain:
     """The calls of a planner within a call."""
 
-    def __init__(self, planner: "Planner", call: Call, request: Request, unseen: "_Unseen") -> None:
+    def __init__(self, planner: "Planner", call: Call, request: Request, unseen: UnseenSpace) -> None:
         self.planner, self.call, self.request, self.unseen = planner, call, request, unseen
 
     def best(self, problem: Problem, rung: str, until: float) -> PlanResult:
@@ -143,7 +147,7 @@ class _Chain:
         """
         if self.unseen.probability is None:
             result = self._attempt(problem, until, self.call.seed, self.request)
-            return self.unseen.judged(result, rung) if result.solved else result
+            return _Motion(result, rung, self.unseen).result if result.solved else result
         found = list[_Motion]()
         while len(found) < CANDIDATES:
             quick = replace(self.request, until=FIRST)
@@ -153,7 +157,8 @@ class _Chain:
             if not result.solved:
                 break
             found.append(_Motion(result, rung, self.unseen))
-            if self.call.elapsed >= until or found[-1].risk <= SAFE:
+            least = min(motion.risk or 0.0 for motion in found)
+            if self.call.elapsed >= until or least <= (FAIR if len(found) >= FEW else SAFE):
                 break
         if self.request.until != FIRST and self.call.elapsed < until:
             result = self._attempt(problem, until, self.call.seed, self.request)
@@ -161,7 +166,7 @@ class _Chain:
         likeliest = max(motion.likely for motion in found)
         likely = [motion for motion in found if motion.likely >= likeliest - AS_LIKELY]
         chosen = min(likely, key=lambda motion: motion.length)
-        return replace(self.unseen.judged(chosen.result, rung), planning_time=self.call.elapsed)
+        return replace(chosen.result, planning_time=self.call.elapsed)
 
     def _attempt(self, problem: Problem, until: float, seed: int, request: Request) -> PlanResult:
         call, began = self.call, self.call.elapsed
@@ -172,66 +177,22 @@ class _Chain:
 
 
 class _Motion:
-    """A motion of a rung where something is imagined."""
+    """A motion of a rung, and what it crosses of unseen space."""
 
-    def __init__(self, result: PlanResult, rung: str, unseen: "_Unseen") -> None:
+    def __init__(self, result: PlanResult, rung: str, unseen: UnseenSpace) -> None:
         assert result.path is not None
-        self.result, self.length = result, result.path.length
-        self.risk = unseen.risk(result.path)
+        self._result, self._rung, self.length = result, rung, result.path.length
+        self._crossed = unseen.crossed(result.path)
+        self.risk = self._crossed.risk
         self.likely = confidence(rung, self.risk)
 
-
-class _Unseen:
-    """Space that no view saw, and what motions cross of it."""
-
-    def __init__(
-        self, problem: Problem, volume: ObservedVolume, imagined: Float32[ndarray, "nx ny nz"] | None
-    ) -> None:
-        self.problem, self.volume = problem, volume
-        goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
-        ends = [placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals)]
-        unknown = volume.unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2) & ~voxels_in(
-            np.concatenate(ends), CARVED
-        )
-        self.unknown: Bool[ndarray, "nx ny nz"] = unknown
-        self.probability = None if imagined is None else np.where(unknown, imagined, np.float32(0))
-        """Of what is unknown, less what the arm fills at the ends."""
-
-    def swept(self, path: Path) -> Bool[ndarray, "nx ny nz"]:
-        """The unknown voxels that the arm passes through."""
-        out = np.zeros(FINE_SHAPE, np.bool_)
-        low, edge = np.array(LOW, np.float32), np.float32(FINE)
-        sweep(compile_robot(self.problem.robot), path.positions.astype(np.float32), low, edge, out)
-        return out & self.unknown
-
-    def risk(self, path: Path) -> float:
-        """Summed probability of the voxels that a motion sweeps; 0 where none is imagined."""
-        return 0.0 if self.probability is None else float(self.probability[self.swept(path)].sum())
-
-    def judged(self, result: PlanResult, rung: str) -> PlanResult:
-        """The result with what is known of its motion in unseen space."""
-        assert result.path is not None
-        risk = None if self.probability is None else self.risk(result.path)
+    @property
+    def result(self) -> PlanResult:
+        """With what is known of the motion in unseen space."""
         return replace(
-            result,
-            rung=rung,
-            confidence=confidence(rung, risk),
-            swept_probability=risk,
-            unseen_region=self.region(result.path),
+            self._result,
+            rung=self._rung,
+            confidence=self.likely,
+            swept_probability=self.risk,
+            unseen_region=self._crossed.region,
         )
-
-    def region(self, path: Path) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
-        """The corners of a box around that connected part of the unseen space that the arm passes through
-        which is likeliest to be occupied; the largest where nothing is imagined."""
-        from scipy.ndimage import find_objects, label  # which takes long to import
-
-        swept = self.swept(path)
-        if not swept.any():
-            return None
-        parts = np.zeros(swept.shape, np.int32)
-        label(swept, output=parts)
-        weights = None if self.probability is None else self.probability[swept]
-        part = int(np.bincount(parts[swept], weights).argmax())
-        box = find_objects(parts)[part - 1]
-        low, high = (np.array([getattr(side, end) for side in box]) for end in ("start", "stop"))
-        return tuple((low * FINE + LOW).round(3).tolist()), tuple((high * FINE + LOW).round(3).tolist())

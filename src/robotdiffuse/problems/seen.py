@@ -35,7 +35,7 @@ FEW = 3
 """Points in a cell, alone among empty ones, that are not taken for a sensor's mistake."""
 FARTHEST = 2.0
 """Where a camera is that is to see a cell well [m]."""
-CELLS = 1 << 15
+CELLS = 1 << 16
 """That there is room for at first."""
 
 

@@ -8,7 +8,8 @@ from robotdiffuse.collision.kernels.distance import scene_distance
 PIXELS, SHARE = np.float32(4.0), np.float32(0.01)
 """Neighbours whose depths differ by less than so many widths of a pixel there, or by less than this share of
 the depth, are on the same surface."""
-_AROUND = ((0, -1), (0, 1), (-1, 0), (1, 0), (-1, -1), (-1, 1), (1, -1), (1, 1))
+FARTHEST = np.float32(1e6)
+"""Depths beyond are none [m]."""
 _ZERO = np.float32(0.0)
 
 
@@ -23,54 +24,60 @@ def _slot(keys, key):
     return at
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _within(spheres, x, y, z, last):
-    """The sphere that a point is in, looked for from the `last` one that a point was in; -1: in none."""
-    for k in range(-1, len(spheres)):
-        s = last if k < 0 else k
-        if s < 0:
-            continue
-        dx, dy, dz = x - spheres[s, 0], y - spheres[s, 1], z - spheres[s, 2]
-        if dx * dx + dy * dy + dz * dz < spheres[s, 3] * spheres[s, 3]:
-            return s
-    return -1
+@njit(cache=True, nogil=True, fastmath=True, inline="never")
+def _within(x, y, z, xs, ys, zs, radii):
+    """Whether a point is in one of the spheres."""
+    inside = np.int32(0)
+    for s in range(len(xs)):
+        dx, dy, dz = x - xs[s], y - ys[s], z - zs[s]
+        inside |= np.int32(dx * dx + dy * dy + dz * dz < radii[s] * radii[s])
+    return inside != 0
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _add(keys, cells, sums, count, x, y, z, voxel):
-    """Add a point to its cell; the number of cells."""
+def _key(x, y, z, voxel):
+    """The number of a point's cell."""
     span = np.int64(1) << 20
     i, j, k = np.int64(np.floor(x / voxel)), np.int64(np.floor(y / voxel)), np.int64(np.floor(z / voxel))
-    key = ((i + span) << 42) | ((j + span) << 21) | (k + span)
+    return ((i + span) << 42) | ((j + span) << 21) | (k + span)
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _row(keys, cells, count, key):
+    """Which row of the sums is a cell's, and how many there are."""
     at = _slot(keys, key)
     if keys[at] == -1:
         keys[at], cells[at] = key, count
         count += 1
-    row = sums[cells[at]]
-    row[0] += x
-    row[1] += y
-    row[2] += z
-    row[3] += np.float32(1.0)
-    return count
+    return cells[at], count
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add(sums, row, x, y, z):
+    sums[row, 0] += x
+    sums[row, 1] += y
+    sums[row, 2] += z
+    sums[row, 3] += np.float32(1.0)
 
 
 @njit(cache=True, nogil=True)
 def gather_cloud(points, reach, spheres, voxel, keys, cells, sums, count):
     """Add a cloud to cells; as `gather_image`."""
-    box = _box(spheres)
-    last = -1
+    box, balls = _box(spheres), _parted(spheres)
+    before, row = np.int64(-1), np.int32(0)
     for p in range(len(points)):
         if count >= len(sums):
             return -1
         x, y, z = np.float32(points[p, 0]), np.float32(points[p, 1]), np.float32(points[p, 2])
         if not x * x + y * y + z * z <= reach * reach:
             continue
-        if _boxed(box, x, y, z):
-            hit = _within(spheres, x, y, z, last)
-            if hit >= 0:
-                last = hit
-                continue
-        count = _add(keys, cells, sums, count, x, y, z, voxel)
+        if _boxed(box, x, y, z) and _within(x, y, z, *balls):
+            continue
+        key = _key(x, y, z, voxel)
+        if key != before:  # most points are in the cell of the one before
+            before = key
+            row, count = _row(keys, cells, count, key)
+        _add(sums, row, x, y, z)
     return count
 
 
@@ -84,31 +91,57 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
-    box = _box(spheres)
-    last = -1
+    box, balls = _box(spheres), _parted(spheres)
+    around = np.full((h + 2, w + 2), np.nan, np.float32)
+    around[1:-1, 1:-1] = depth
+    x, y, z = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    kept, cell = np.empty(w, np.bool_), np.empty(w, np.int64)
+    # of the pixels above: most points are in the cell of a neighbour's
+    known, rows = np.full(w + 1, -1, np.int64), np.zeros(w + 1, np.int32)
     for v in range(h):
         b = (np.float32(v) - cy) / fy
+        _place_row(around[v : v + 3], b, fx, cx, T, reach, voxel, x, y, z, kept, cell)
         for u in range(w):
+            if not kept[u]:
+                continue
             if count >= len(sums):
                 return -1
-            d = depth[v, u]
-            if not (d > _ZERO and d < np.float32(1e6)):
+            if _boxed(box, x[u], y[u], z[u]) and _within(x[u], y[u], z[u], *balls):
                 continue
-            a = (np.float32(u) - cx) / fx
-            x = (T[0, 0] * a + T[0, 1] * b + T[0, 2]) * d + T[0, 3]
-            y = (T[1, 0] * a + T[1, 1] * b + T[1, 2]) * d + T[1, 3]
-            z = (T[2, 0] * a + T[2, 1] * b + T[2, 2]) * d + T[2, 3]
-            if x * x + y * y + z * z > reach * reach:
-                continue
-            if _flies(depth, v, u, d, max(PIXELS * d / fx, SHARE * d)):
-                continue
-            if _boxed(box, x, y, z):
-                hit = _within(spheres, x, y, z, last)
-                if hit >= 0:
-                    last = hit
-                    continue
-            count = _add(keys, cells, sums, count, x, y, z, voxel)
+            if known[u] == cell[u]:
+                rows[u + 1] = rows[u]
+            elif known[u + 1] != cell[u]:
+                rows[u + 1], count = _row(keys, cells, count, cell[u])
+            known[u + 1] = cell[u]
+            _add(sums, rows[u + 1], x[u], y[u], z[u])
     return count
+
+
+@njit(cache=True, nogil=True)
+def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
+    """Where the points of a row of pixels are, in which cells, and which of them count.
+
+    Those within reach do that are no flying pixels. Of these fewer than two of the eight neighbours are on
+    the same surface: at edges, sensors mix the depths of the near and the far one.
+    around [3, w + 2]: the row between those above and below, with a pixel more at either end.
+    """
+    above, middle, below = around[0], around[1], around[2]
+    rx, ry, rz = T[0, 1] * b + T[0, 2], T[1, 1] * b + T[1, 2], T[2, 1] * b + T[2, 2]
+    pixel, most = PIXELS / fx, reach * reach
+    for u in range(len(x)):
+        d, a = middle[u + 1], (np.float32(u) - cx) / fx
+        px = (T[0, 0] * a + rx) * d + T[0, 3]
+        py = (T[1, 0] * a + ry) * d + T[1, 3]
+        pz = (T[2, 0] * a + rz) * d + T[2, 3]
+        jump = max(pixel, SHARE) * d
+        alike = np.int32(0)
+        for row in (above, middle, below):
+            alike += np.int32(abs(row[u] - d) < jump)
+            alike += np.int32(abs(row[u + 1] - d) < jump)
+            alike += np.int32(abs(row[u + 2] - d) < jump)
+        x[u], y[u], z[u], cell[u] = px, py, pz, _key(px, py, pz, voxel)
+        # the pixel itself is the third
+        kept[u] = (alike > 2) & (d > _ZERO) & (d < FARTHEST) & (px * px + py * py + pz * pz <= most)
 
 
 @njit(cache=True, nogil=True)
@@ -129,22 +162,6 @@ def supported(keys, cells, sums, count, least):
     return out
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _flies(depth, v, u, d, jump):
-    """Whether fewer than two of the eight pixels around are on the same surface: at edges, sensors mix the
-    depths of the near and the far one."""
-    h, w = depth.shape
-    alike = 0
-    for k in range(8):
-        dv, du = _AROUND[k]
-        y, x = v + dv, u + du
-        if 0 <= y < h and 0 <= x < w and abs(depth[y, x] - d) < jump:
-            alike += 1
-            if alike == 2:
-                return False
-    return True
-
-
 @njit(cache=True, nogil=True)
 def _box(spheres):
     """Low and high corner of a box around spheres, one after the other."""
@@ -157,6 +174,12 @@ def _box(spheres):
     return box
 
 
+@njit(cache=True, nogil=True)
+def _parted(spheres):
+    """The columns of spheres [n, 4], each by itself in memory."""
+    return spheres[:, 0].copy(), spheres[:, 1].copy(), spheres[:, 2].copy(), spheres[:, 3].copy()
+
+
 @njit(cache=True, nogil=True, inline="always")
 def _boxed(box, x, y, z):
     return box[0] < x < box[3] and box[1] < y < box[4] and box[2] < z < box[5]
@@ -165,19 +188,21 @@ def _boxed(box, x, y, z):
 @njit(cache=True, nogil=True)
 def sphere_distances(points, spheres):
     """Signed distance of each point [n, 3] to the nearest sphere [m, 4], infinite where there is none."""
-    out = np.full(len(points), np.inf, np.float32)
+    out = np.empty(len(points), np.float32)
+    x, y, z, radii = _parted(spheres)
     for p in range(len(points)):
-        for s in range(len(spheres)):
-            dx, dy, dz = (
-                points[p, 0] - spheres[s, 0],
-                points[p, 1] - spheres[s, 1],
-                points[p, 2] - spheres[s, 2],
-            )
-            bound = out[p] + spheres[s, 3]
-            square = dx * dx + dy * dy + dz * dz
-            if bound > _ZERO and square < bound * bound:
-                out[p] = np.sqrt(square) - spheres[s, 3]
+        at = np.float32(points[p, 0]), np.float32(points[p, 1]), np.float32(points[p, 2])
+        out[p] = _nearest(at, x, y, z, radii)
     return out
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc", "nnan", "nsz"})
+def _nearest(at, x, y, z, radii):
+    least = np.float32(np.inf)
+    for s in range(len(x)):
+        dx, dy, dz = at[0] - x[s], at[1] - y[s], at[2] - z[s]
+        least = min(least, np.sqrt(dx * dx + dy * dy + dz * dz) - radii[s])
+    return least
 
 
 @njit(cache=True, nogil=True)

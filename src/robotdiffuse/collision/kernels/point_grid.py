@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.nearest_voxels import nearest_voxels
 from robotdiffuse.collision.kernels.simd import (
     W,
     first_lane,
@@ -34,27 +35,25 @@ _SLACK = np.float32(1e-5)
 
 
 @njit(fastmath=True, cache=True)
-def make_grid(points, starts, run, nearest_voxel, low, voxel, shape, band, known):
+def make_grid(points, starts, run, low, voxel, shape, band, known):
     """Distances from voxel centres to points, and a point each, from the nearest voxel that holds points.
 
     Exact below `band`; beyond, a lower bound, and a point wherever one may be within `known` [m]. The points
-    starts[b] to starts[b + 1] lie in the b-th voxel that holds any, which is b in run[nx * ny * nz];
-    nearest_voxel[3, nx * ny * nz] are its indices for every voxel.
+    starts[b] to starts[b + 1] lie in the b-th voxel that holds any, which is b in run[nx * ny * nz], -1 where
+    there are none.
     """
     nx, ny, nz = shape
     balls = _balls(points, starts)
     blur = _blur(points, low, voxel)
     distances = np.empty(nx * ny * nz, np.float32)
     nearest = np.full(nx * ny * nz, -1, np.int32)
+    squares, holders = nearest_voxels(run.reshape(nx, ny, nz))
     for i in range(nx):
         for j in range(ny):
             for k in range(nz):
-                v = (i * ny + j) * nz + k
-                u, w, t = nearest_voxel[0, v], nearest_voxel[1, v], nearest_voxel[2, v]
-                b = run[(u * ny + w) * nz + t]
-                steps = np.float32((u - i) ** 2 + (w - j) ** 2 + (t - k) ** 2)
+                v, b = (i * ny + j) * nz + k, holders[i, j, k]
                 # no voxel with points is nearer, and no point farther off its voxel's centre
-                lower = voxel * np.sqrt(steps) - blur
+                lower = voxel * np.sqrt(np.float32(squares[i, j, k])) - blur
                 distances[v] = max(band, lower)
                 if lower >= known:
                     continue

@@ -26,14 +26,15 @@ def imagine(
 
     from robotdiffuse.learning.training.batches import fast_bf16
 
-    network = _bundled() if network is None else network
+    network = bundled() if network is None else network
     seen, behind = (torch.from_numpy(array)[None] for array in pack(volume))
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
         return network.probabilities(seen, behind)[0].numpy()
 
 
 @cache
-def _bundled() -> "CompletionNetwork":
+def bundled() -> "CompletionNetwork":
+    """The network that comes with the package, loaded once."""
     from robotdiffuse.learning.checkpoint import load_completion
 
     return load_completion()

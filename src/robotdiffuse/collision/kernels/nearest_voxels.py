@@ -1,0 +1,73 @@
+"""The exact Euclidean distance transform of a grid, compiled: what is nearest to each voxel."""
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.collision.kernels.compiled import allocation_free
+
+_FAR = np.int32(1 << 30)
+"""Squared distance where there are no points at all [voxels²]."""
+_ROUNDED = 1e-6
+"""More than what rounding does to a place in a line, less than how far one that is no integer is from one."""
+
+
+@njit(fastmath=True, cache=True)
+def nearest_voxels(run):
+    """Of each voxel the nearest one with points: its squared distance in voxels, and its number in `run`.
+
+    run int32[nx, ny, nz] is -1 where there are none; at least one has some. Axis by axis (A. Meijster,
+    J. Roerdink, W. Hesselink, 2000).
+    """
+    nx, ny, nz = run.shape
+    squares, holders = np.full((nx, ny, nz), _FAR, np.int32), run.copy()
+    for i in range(nx):
+        for j in range(ny):
+            for way in (1, -1):
+                last = -1
+                for k in range(nz) if way == 1 else range(nz - 1, -1, -1):
+                    last = k if run[i, j, k] >= 0 else last
+                    square = (k - last) ** 2
+                    if last >= 0 and square < squares[i, j, k]:
+                        squares[i, j, k], holders[i, j, k] = square, run[i, j, last]
+    longest = max(nx, ny)
+    kept, since = np.empty(longest, np.int32), np.empty(longest, np.int32)
+    before, whose = np.empty(longest, np.int32), np.empty(longest, np.int32)
+    for i in range(nx):
+        for k in range(nz):
+            _nearest_in_line(squares[i, :, k], holders[i, :, k], kept, since, before, whose)
+    for j in range(ny):
+        for k in range(nz):
+            _nearest_in_line(squares[:, j, k], holders[:, j, k], kept, since, before, whose)
+    return squares, holders
+
+
+@allocation_free(fastmath=True)
+def _nearest_in_line(squares, holders, kept, since, before, whose):
+    """Let each voxel of a line know what others of it have nearer: the lower envelope of parabolas.
+
+    The first `top` + 1 of `kept` are voxels that are nearest to some, from `since` on.
+    """
+    n, top = len(squares), -1
+    for u in range(n):
+        before[u], whose[u] = squares[u], holders[u]
+        if before[u] == _FAR:
+            continue
+        while (
+            top >= 0 and before[kept[top]] + (since[top] - kept[top]) ** 2 > before[u] + (since[top] - u) ** 2
+        ):
+            top -= 1
+        from_here = 0
+        if top >= 0:
+            s = kept[top]
+            ahead = np.float64(u * u - s * s + before[u] - before[s])
+            from_here = 1 + int(ahead / np.float64(2 * (u - s)) + _ROUNDED)
+        if from_here < n:
+            top += 1
+            kept[top], since[top] = u, from_here
+    if top < 0:
+        return
+    for u in range(n - 1, -1, -1):
+        s = kept[top]
+        squares[u], holders[u] = before[s] + (u - s) ** 2, whose[s]
+        if u == since[top]:
+            top -= 1
