@@ -29,6 +29,7 @@ CHAIN = (
     "collision",
     "problems",
     "rates",
+    "tolerances",
     "verify",
     "violations",
     "paths",

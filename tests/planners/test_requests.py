@@ -70,6 +70,14 @@ ASKED: dict[str, Asked] = {
     "pose with room": Asked(_goal(rd.PoseGoal(HAND, T_GOAL, [0.02] * 3, [0.1, 0.1, np.pi]))),
     "any goal": Asked(_goal([rd.PoseGoal(HAND, T_GOAL), rd.JointGoal(GOAL)])),
     "waypoints": Asked(lambda: replace(PLAIN, waypoints=(rd.JointGoal((START + GOAL) / 2),))),
+    "blended": Asked(
+        lambda: replace(
+            PLAIN,
+            waypoints=(rd.JointGoal((START + GOAL) / 2 + 0.1), rd.PoseGoal(HAND, T_GOAL)),
+            goal=START,
+            blend=0.05,
+        )
+    ),
     "base": Asked(lambda: Problem.in_world(T_WORLD_BASE, PANDA, SCENE.moved(T_WORLD_BASE), START, GOAL)),
     "tool and attached": Asked(_held),
     "views": Asked(_seen),
@@ -134,7 +142,7 @@ def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> N
             planner.plan(problem, time_limit=3.0, **request)
         assert "\n" not in str(refused.value)
         return
-    result = planner.plan(problem, time_limit=3.0, **{"until": "first", **request})
+    result = planner.plan(problem, time_limit=10.0, **{"until": "first", **request})
     assert result.path is not None and result.trajectory is not None, result.reason
     assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
 

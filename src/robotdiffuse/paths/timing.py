@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
@@ -78,6 +78,7 @@ def time_parameterize(
     keeps: Callable[[ndarray], bool] = lambda _: True,
     start_speed: float = 0.0,
     pace: "Pace | None" = None,
+    deviations: Float[ndarray, "n"] | None = None,
 ) -> Trajectory:
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
 
@@ -91,6 +92,7 @@ def time_parameterize(
 
     With a start speed [rad/s, joint-space L2] it begins moving along the first straight line, which must be
     long enough to stop on. `pace` bounds further speeds, those of frames, of motions that begin at rest.
+    `deviations` says for each waypoint how far the motion may leave it, in place of the settings.
 
     A limit of jerk takes time at both ends of the motion and at each stop, and may cut corners a little more.
 
@@ -100,10 +102,12 @@ def time_parameterize(
     Raises InputError when a joint has no velocity or acceleration limit above 0.
     """
     _check_limits(robot)
-    waypoints = _distinct(path.positions)
-    if len(waypoints) == 1:
+    rows = _distinct(path.positions)
+    if len(rows) == 1:
         return _at_rest(path, settings)
-    return _rounded(robot, path, waypoints, valid, free, settings, keeps, start_speed, pace)[1]
+    most = np.full(len(rows), settings.corner_deviation) if deviations is None else deviations[rows]
+    given = path.positions[rows], most[1:-1]
+    return _rounded(robot, path, *given, valid, free, settings, keeps, start_speed, pace)[1]
 
 
 def rounded_corners(
@@ -116,14 +120,16 @@ def rounded_corners(
     """The waypoints of a path that differ, two at least, and how far `time_parameterize` would round each
     corner."""
     _check_limits(robot)
-    waypoints = _distinct(path.positions)
-    return waypoints, _rounded(robot, path, waypoints, valid, free, settings, lambda _: True, 0.0)[0]
+    waypoints = path.positions[_distinct(path.positions)]
+    most = np.full(len(waypoints) - 2, settings.corner_deviation)
+    return waypoints, _rounded(robot, path, waypoints, most, valid, free, settings, lambda _: True, 0.0)[0]
 
 
 def _rounded(
     robot: Robot,
     path: Path,
     waypoints: Float[ndarray, "n dof"],
+    deviations: Float[ndarray, "corners"],
     valid: Callable[[Trajectory], bool],
     free: Callable[[Path], bool],
     settings: TimingSettings,
@@ -131,8 +137,8 @@ def _rounded(
     start_speed: float,
     pace: "Pace | None" = None,
 ) -> tuple[Float[ndarray, "corners"], Trajectory]:
-    """How far each corner is rounded, and the motion then; see `time_parameterize`."""
-    deviations = np.full(len(waypoints) - 2, settings.corner_deviation)
+    """How far each corner is rounded, at most by the deviations, and the motion then; see
+    `time_parameterize`."""
     for shrink in SHRINKS:
         corners = zip(deviations, _corners(waypoints, deviations), strict=True)
         bad = [deviation > 0 and not keeps(corner) for deviation, corner in corners]
@@ -163,15 +169,15 @@ def _check_limits(robot: Robot) -> None:
                 raise InputError(f"{robot.name}: the {what} limit of {name} is {limit}; it must be above 0")
 
 
-def _distinct(positions: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
-    """Waypoints without repetitions; the first and the last survive exactly."""
-    kept = [positions[0]]
-    for q in positions[1:]:
-        if np.linalg.norm(q - kept[-1]) > SAME:
-            kept.append(q)
+def _distinct(positions: Float[ndarray, "n dof"]) -> Int[ndarray, "m"]:
+    """Rows that differ from those before them; the first and the last survive."""
+    kept = [0]
+    for i in range(1, len(positions)):
+        if np.linalg.norm(positions[i] - positions[kept[-1]]) > SAME:
+            kept.append(i)
     if len(kept) > 1:
-        kept[-1] = positions[-1]
-    return np.stack(kept)
+        kept[-1] = len(positions) - 1
+    return np.array(kept)
 
 
 def _at_rest(path: Path, settings: TimingSettings) -> Trajectory:

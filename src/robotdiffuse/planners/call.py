@@ -155,15 +155,16 @@ class Call:
         reason: str = "",
         notes: tuple[str, ...] = (),
         keeps: Callable[[ndarray], bool] = lambda _: True,
+        deviations: Float[ndarray, "n"] | None = None,
     ) -> PlanResult | None:
         """Judge the path through the waypoints and time it; None if it or its motion does not pass.
 
         `stage` is the part of the planner that the waypoints come from; `notes` are on this path alone;
-        `keeps` as in `time_parameterize`.
+        `keeps` and `deviations` as in `time_parameterize`.
         """
         began = self.elapsed
         try:
-            result = self._finished(waypoints, stage, reason, notes, keeps)
+            result = self._finished(waypoints, stage, reason, notes, keeps, deviations)
         except OutOfTimeError as error:
             self._no_time_for = str(error)
             return None
@@ -180,6 +181,7 @@ class Call:
         reason: str,
         notes: tuple[str, ...],
         keeps: Callable[[ndarray], bool],
+        deviations: Float[ndarray, "n"] | None,
     ) -> PlanResult | None:
         problem = self.problem
         path = Path(problem.robot.joint_names, np.asarray(waypoints, dtype=np.float64))
@@ -197,6 +199,7 @@ class Call:
             keeps,
             0.0 if problem.start_velocity is None else float(np.linalg.norm(problem.start_velocity)),
             self._pace,
+            deviations,
         )
         timed = motion.report(trajectory)
         if timed.violation is not None:

@@ -18,8 +18,8 @@ from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.tolerances import DEFAULT, goal_error
 from robotdiffuse.types import Status
-from robotdiffuse.verify import DEFAULT, goal_error
 
 GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""

@@ -46,7 +46,7 @@ from robotdiffuse.scenes.scene import Scene
 FIELDS = ("robot", "scene", "start", "goal")
 OPTIONAL = (
     *("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unseen"),
-    *("moving", "start_velocity"),
+    *("moving", "start_velocity", "blend"),
 )
 
 
@@ -144,6 +144,8 @@ def problem_record(
     if problem.waypoints:
         way = problem.waypoints if T is None else [moved_goal(goal, T) for goal in problem.waypoints]
         record["waypoints"] = as_given([goal_entry(goal) for goal in way])
+    if any(problem.blend):
+        record["blend"] = list(problem.blend)
     if problem.constraints:
         kept = [one if T is None else one.moved(T) for one in problem.constraints]
         record["constraints"] = as_given([constraint_entry(one) for one in kept])
@@ -303,7 +305,7 @@ def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot]
             notes += more
         views, more = read_views(values.get("views", []), folder)
         unseen = values.get("unseen", OPTIMISTIC)
-        for name in ("waypoints", "moving", "start_velocity"):
+        for name in ("waypoints", "blend", "moving", "start_velocity"):
             if requested and name in values:
                 raise InputError(f"{name} is for problems with start and goal in the file, not a request")
         kept = read_constraints(values.get("constraints", []))
@@ -318,6 +320,7 @@ def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot]
             "constraints": kept,
             "moving": read_moving(values.get("moving", []), folder),
             "start_velocity": values.get("start_velocity"),
+            "blend": values.get("blend", ()),
         }
         if base is None:
             return Problem(*asked, **more)
