@@ -67,7 +67,7 @@ EXTRAS = {
     "rerun": {"handover"},
     "rosbags": {"handover"},
     "roslibpy": {"handover"},
-    "pinocchio": set(),
+    "pinocchio": {"robots"},
     "example_robot_data": set(),
 }
 """Packages that the core install lacks, and the rooms that may import them."""

@@ -55,6 +55,11 @@ class VerifySettings(Settings, name="verify"):
     """... if the straight moves before and after it are both at least this long [rad, joint-space L2]."""
     reversals: Natural = 3
     """More sharp reversals than this are twitching."""
+    torque_step: Positive = 0.002
+    """Between the times at which torques of a payload are looked at [s]; they may exceed their limits by
+    `rate_slack`."""
+    torque_resolution: Positive = 0.02
+    """Between configurations of a path without times at which what holds it is [rad, joint-space L2]."""
     tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
     """Each clearance of a `Report` is at least this share of the least one that was measured, in (0, 1)."""
 
@@ -121,16 +126,24 @@ def passes(
 ) -> float | None:
     """Where the way through configurations, from a place on, first comes within `blend` of a goal: a row plus
     the share of the way to the next. None if it is not seen to at places `LOOKS` of the blend apart."""
-    steps = np.linalg.norm(np.diff(q, axis=0), axis=1)
-    counts = np.maximum(np.ceil(steps / (LOOKS * blend)), 1).astype(int)
-    shares = [np.arange(count) / count for count in counts]
-    places = np.append(np.repeat(np.arange(len(counts)), counts) + np.concatenate([[], *shares]), len(counts))
-    places, rows = places[places >= after], np.arange(len(q))
-    way = np.column_stack([np.interp(places, rows, joint) for joint in q.T])
+    places, way = looked_at(q, LOOKS * blend, after)
     for i in np.flatnonzero(_near(robot, goal, way, blend, settings)):
         if goal_error(robot, goal, way[i], settings, blend) is None:
             return float(places[i])
     return None
+
+
+def looked_at(
+    q: Float[ndarray, "n dof"], step: float, after: float = 0.0
+) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
+    """Places at most a step [rad, joint-space L2] apart on the way through configurations, from a place on:
+    rows plus shares of the way to the next; and the configurations there."""
+    steps = np.linalg.norm(np.diff(q, axis=0), axis=1)
+    counts = np.maximum(np.ceil(steps / step), 1).astype(int)
+    shares = [np.arange(count) / count for count in counts]
+    places = np.append(np.repeat(np.arange(len(counts)), counts) + np.concatenate([[], *shares]), len(counts))
+    places, rows = places[places >= after], np.arange(len(q))
+    return places, np.column_stack([np.interp(places, rows, joint) for joint in q.T])
 
 
 def _near(

@@ -19,8 +19,9 @@ from robotdiffuse.collision.moving import MovingCollision, TimedContact
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.rates import RateTolerances, between_rows, wrong_rates
-from robotdiffuse.tolerances import DEFAULT, VerifySettings, goal_error, passes
+from robotdiffuse.rates import RateTolerances, between_rows, states_between, wrong_rates
+from robotdiffuse.robots.dynamics import Dynamics
+from robotdiffuse.tolerances import DEFAULT, VerifySettings, goal_error, looked_at, passes
 from robotdiffuse.types import Path, Trajectory
 
 LONGEST = 1e5
@@ -32,8 +33,8 @@ class Violation:
     """The first thing along the motion that is wrong."""
 
     kind: str
-    """not_finite, start, limits, scene_collision, self_collision, constraint, twitch, waypoint or goal; for
-    trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
+    """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, waypoint or
+    goal; for trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
     time: float
     """Where: for a path, waypoint index plus fraction of the segment; for a trajectory, seconds."""
     message: str
@@ -92,7 +93,11 @@ class Verifier:
     def path(self, path: Path) -> Report:
         """See `verify`."""
         self._check_shape(path.joint_names, path.positions)
-        return self._report(path.positions, None, [])
+        found = []
+        if self.dynamics is not None and within(path.positions):
+            places, q = looked_at(path.positions, self.settings.torque_resolution)
+            found = self._torques(places, q, 0 * q, 0 * q)
+        return self._report(path.positions, None, found)
 
     def trajectory(self, trajectory: Trajectory) -> Report:
         """See `verify_trajectory`."""
@@ -126,6 +131,8 @@ class Verifier:
         times, positions = rows if found else between_rows(trajectory, self.settings.chord)
         still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
         along = None
+        if not found:
+            found += self._torques(*states_between(trajectory, self.settings.torque_step))
         if self.constraints is not None:
             found += self._too_fast(trajectory)
             along = between_rows(trajectory, self.settings.constraint_chord) if not found else None
@@ -243,6 +250,21 @@ class Verifier:
         message = f"{one.frame} moves at {speeds[i, k]:.4g} m/s; {one.kind} allows {most:.4g} m/s"
         return [Violation("speed", at, message, one.frame, one.kind, float(excess[:, k].max()))]
 
+    def _torques(self, clock: ndarray, q: ndarray, v: ndarray, a: ndarray) -> list[Violation]:
+        """Where a joint's torque is first beyond its effort limit, with the problem's payload."""
+        if self.dynamics is None:
+            return []
+        torques = np.abs(self.dynamics.torques(q, v, a))
+        excess = torques - self.dynamics.limits * (1 + self.settings.rate_slack)
+        bad = np.flatnonzero((excess > 0).any(axis=1))
+        if not len(bad):
+            return []
+        i, j = int(bad[0]), int(excess[bad[0]].argmax())
+        message = self.dynamics.words(j, torques[i, j])
+        what = f"{message}, with the payload" if v.any() else f"{message} to hold the payload"
+        name = self.robot.joint_names[j]
+        return [Violation("torque", float(clock[i]), what, name, None, float(excess[:, j].max()))]
+
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
         """More sharp reversals than allowed, counted on waypoints at least `reversal_step` apart."""
         settings = self.settings
@@ -290,6 +312,12 @@ class Verifier:
     def constraints(self) -> PathConstraints | None:
         """The problem's path constraints made ready; None if it has none."""
         return PathConstraints(self.problem) if self.problem.constraints else None
+
+    @cached_property
+    def dynamics(self) -> Dynamics | None:
+        """Of the robot with the problem's payload; None if it has none."""
+        payload = self.problem.payload
+        return None if payload is None else Dynamics(self.robot, payload, self.problem.T_world_base)
 
     @property
     def _rate_tolerances(self) -> RateTolerances:

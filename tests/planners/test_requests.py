@@ -83,6 +83,7 @@ ASKED: dict[str, Asked] = {
     "views": Asked(_seen),
     "first": Asked(lambda: PLAIN, {"until": "first"}),
     "scaling": Asked(lambda: PLAIN, {"velocity_scaling": 0.5, "acceleration_scaling": 0.3}),
+    "payload": Asked(lambda: replace(PLAIN, payload=rd.Payload(2.0, [0.0, 0.0, 0.1], HAND))),
     "jerk": Asked(lambda: PLAIN, {"jerk": 100.0}),
     "no clearance": Asked(lambda: PLAIN, {"clearance": 0.0}),
     "clearance": Asked(lambda: PLAIN, {"clearance": 0.03}, CLEARANCE),
@@ -112,6 +113,8 @@ def _all_of_it() -> Problem:
         GOAL,
         waypoints=[rd.JointGoal((START + GOAL) / 2)],
         constraints=[cone],
+        blend=0.1,
+        payload=rd.Payload(0.5, link="parcel"),
     )
 
 

@@ -199,7 +199,22 @@ def _usable_goals(call: Call, checker: CollisionChecker) -> Float[ndarray, "k do
     wrong = None if constraints is None else constraints.worst(start)
     if wrong is not None:
         return call.fail(Status.INVALID_START, f"the start does not keep the constraints: {wrong.message}")
-    return _goals(call, call.problem.goal, checker)
+    heavy = _too_heavy(call, start)
+    if heavy is not None:
+        return call.fail(Status.INVALID_START, f"the payload cannot be held at the start: {heavy}")
+    goals = _goals(call, call.problem.goal, checker)
+    if isinstance(goals, PlanResult):
+        return goals
+    held = [q for q in goals if _too_heavy(call, q) is None]
+    if not held:
+        reason = f"the payload cannot be held at the goal: {_too_heavy(call, goals[0])}"
+        return call.fail(Status.INVALID_GOAL, reason)
+    return goals if len(held) == len(goals) else np.stack(held)
+
+
+def _too_heavy(call: Call, q: Float[ndarray, "dof"]) -> str | None:
+    """Which joint cannot hold the problem's payload there."""
+    return None if call.judge.dynamics is None else call.judge.dynamics.too_much(q)
 
 
 def _goals(call: Call, goal: Goal, checker: CollisionChecker) -> Float[ndarray, "k dof"] | PlanResult:

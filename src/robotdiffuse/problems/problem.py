@@ -20,6 +20,8 @@ from robotdiffuse.problems.goals import AnyGoal as AnyGoal
 from robotdiffuse.problems.goals import Goal, check_pose, moved_goal
 from robotdiffuse.problems.goals import JointGoal as JointGoal
 from robotdiffuse.problems.goals import PoseGoal as PoseGoal
+from robotdiffuse.robots.dynamics import check_dynamics
+from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.moving import MovingObstacle
@@ -78,6 +80,8 @@ class Problem:
     """For each waypoint, within what distance of it the motion may pass without stopping: of configurations
     in joint space [rad, L2], of the position of a pose, or the box that it may be in [m]; 0: it stops there.
     May be given as one number for all; empty: it stops at all."""
+    payload: Payload | None = None
+    """What a link carries: the timed motion keeps within the effort limits, which None does not look at."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
@@ -93,6 +97,8 @@ class Problem:
             raise InputError(f"waypoints is {shown(self.waypoints)}; it must be a list of goals")
         fields = (f"waypoints[{i}]" for i in range(len(self.waypoints)))
         waypoints = tuple(_goal(self.robot, *of, notes) for of in zip(fields, self.waypoints, strict=True))
+        if self.payload is not None:
+            _check_payload(self.robot, self.payload)
         blend = _blend(self.blend, len(waypoints))
         constraints = _constraints(self.robot, self.constraints)
         if waypoints and any(isinstance(one, CartesianLine) for one in constraints):
@@ -108,6 +114,7 @@ class Problem:
             "constraints": constraints,
             "moving": moving,
             "start_velocity": () if start_velocity is None else (start_velocity,),
+            "payload": () if self.payload is None else (self.payload,),
         }
         for one in ("moving", "start_velocity"):
             others = [name for name, given in beside.items() if name != one and given]
@@ -157,6 +164,7 @@ class Problem:
             moving: Sequence[MovingObstacle] = (),
             start_velocity: ArrayLike | None = None,
             blend: ArrayLike = (),
+            payload: Payload | None = None,
         ) -> None: ...
 
     @classmethod
@@ -176,6 +184,7 @@ class Problem:
         moving: "Sequence[MovingObstacle]" = (),
         start_velocity: ArrayLike | None = None,
         blend: ArrayLike = (),
+        payload: Payload | None = None,
     ) -> "Problem":
         """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views,
         obstacles that move, constraints and the poses of goals are given.
@@ -193,7 +202,7 @@ class Problem:
         constraints = [one.moved(T_base_world) if isinstance(one, kinds) else one for one in constraints]
         moving = [one.moved(T_base_world) if isinstance(one, MovingObstacle) else one for one in moving]
         asked = robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints
-        return cls(*asked, constraints, moving, start_velocity, blend)
+        return cls(*asked, constraints, moving, start_velocity, blend, payload)
 
     def standing(self) -> tuple[Robot, Scene]:
         """Robot and scene as they stand in the world, for pictures and simulators: the robot's base is the
@@ -246,6 +255,13 @@ def _constraints(robot: Robot, constraints: object) -> tuple[Constraint, ...]:
     for i, one in enumerate(constraints):
         _check_moved(robot, f"constraints[{i}].frame", one.frame)
     return tuple(constraints)
+
+
+def _check_payload(robot: Robot, payload: object) -> None:
+    if not isinstance(payload, Payload):
+        raise InputError(f"payload is {shown(payload)}; it must be a rd.Payload")
+    check_dynamics(robot)
+    _check_moved(robot, "payload.link", robot.tip if payload.link is None else payload.link)
 
 
 def _blend(value: object, count: int) -> tuple[float, ...]:
