@@ -1,4 +1,4 @@
-"""What one timed motion gains and keeps: waypoints blended rather than stopped at.
+"""What one timed motion gains and keeps: waypoints blended rather than stopped at, payloads.
 
     python benchmarks/one_motion.py [--number 20] [--planner aorrtc]
 
@@ -6,6 +6,7 @@ Sequences in held-out scenes of the families shelf and table: from the problem's
 configurations to its goal, half of them as configurations, half as poses of the hand. Each is planned with
 stops and with blends, the same seed: the legs are the same. A motion goes before Coal on the exact meshes and
 PyBullet at each of its rows, and how near it comes to its waypoints is measured on the cubics between rows.
+Payloads: held-out problems with masses 10 cm before the hand's frame; torques at every row.
 """
 
 import argparse
@@ -25,12 +26,15 @@ from robotdiffuse.planners import call
 from robotdiffuse.problems.goals import JointGoal, PoseGoal
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.simulation.oracle import PyBulletOracle
 from robotdiffuse.types import Trajectory
 
 HAND = "panda_hand"
 BLENDS = (0.02, 0.05, 0.1, 0.2)
+MASSES = (0.0, 1.0, 2.0, 3.0)
+"""[kg]; a Panda is said to carry 3."""
 LIMIT = 5.0
 """Of a call, of CPU time [s]."""
 TOLERANCE = 0.001
@@ -130,6 +134,48 @@ def blended(number: int, name: str) -> None:
     )
 
 
+def lifted(number: int, name: str) -> None:
+    """Durations with payloads, and the torques of what is returned."""
+    planner, rows = rd.load_planner(name), []
+    for mass in MASSES:
+        ratios, shares, refused, spent = list[float](), list[float](), 0, list[float]()
+        for i in range(number):
+            free = held_out_problem(("shelf", "table")[i % 2], i // 2)
+            problem = replace(free, payload=rd.Payload(mass, [0.0, 0.0, 0.1], HAND))
+            bare = planner.plan(free, time_limit=LIMIT, seed=i)
+            began = time.process_time()
+            result = planner.plan(problem, time_limit=LIMIT, seed=i)
+            spent.append(1e3 * (time.process_time() - began))
+            refused += result.status.value in ("invalid_start", "invalid_goal")
+            if result.trajectory is None or bare.trajectory is None:
+                continue
+            motion = result.trajectory
+            dynamics = Dynamics(problem.robot, rd.Payload(mass, [0.0, 0.0, 0.1], HAND))
+            torques = dynamics.torques(motion.positions, motion.velocities, motion.accelerations)
+            ratios.append(motion.duration / bare.trajectory.duration)
+            shares.append(float((np.abs(torques) / dynamics.limits).max()))
+        rows.append(
+            (
+                f"{mass:g} kg",
+                f"{len(ratios)} of {number}",
+                str(refused),
+                f"{np.median(ratios):.3f}",
+                f"{max(ratios):.3f}",
+                f"{max(shares):.3f}",
+                f"{np.median(spent):.0f} ms",
+            )
+        )
+    columns = (
+        "solved",
+        "ends not held",
+        "duration over bare, median",
+        "most",
+        "torque over limit",
+        "CPU time",
+    )
+    print_table(f"Payloads, {name}", ("", *columns), rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Motions by waypoints, blended or stopped at.")
     parser.add_argument("--number", type=int, default=20, help="of sequences (20)")
@@ -138,6 +184,7 @@ def main() -> None:
     call.time = CpuClock  # type: ignore[attr-defined]
     print(header("numba", "numpy", "coal", "pybullet"))
     blended(arguments.number, arguments.planner)
+    lifted(arguments.number, arguments.planner)
 
 
 if __name__ == "__main__":
