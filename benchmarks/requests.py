@@ -42,9 +42,9 @@ from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.simulation.oracle import PyBulletOracle
 from robotdiffuse.simulation.world import World
+from robotdiffuse.tolerances import goal_error
 from robotdiffuse.transforms import inverse, rotation_from_rpy, transform
 from robotdiffuse.types import Path as JointPath
-from robotdiffuse.verify import goal_error
 
 SHORT, LONG = 1.0, 10.0
 """Time limits, of CPU time [s]; the longer one says what can be solved."""

@@ -29,6 +29,7 @@ CHAIN = (
     "collision",
     "problems",
     "rates",
+    "tolerances",
     "verify",
     "violations",
     "paths",
@@ -66,7 +67,7 @@ EXTRAS = {
     "rerun": {"handover"},
     "rosbags": {"handover"},
     "roslibpy": {"handover"},
-    "pinocchio": set(),
+    "pinocchio": {"robots"},
     "example_robot_data": set(),
 }
 """Packages that the core install lacks, and the rooms that may import them."""

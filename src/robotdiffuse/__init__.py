@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from robotdiffuse.results import PlanResult as PlanResult
     from robotdiffuse.results import load_result as load_result
     from robotdiffuse.robots import load_robot as load_robot
+    from robotdiffuse.robots.inertias import Payload as Payload
     from robotdiffuse.scenes.depth_view import DepthView as DepthView
     from robotdiffuse.scenes.moving import MovingObstacle as MovingObstacle
     from robotdiffuse.scenes.scene import Scene as Scene
@@ -75,6 +76,7 @@ _HOME = {
     "Scene": "robotdiffuse.scenes.scene",
     "DepthView": "robotdiffuse.scenes.depth_view",
     "MovingObstacle": "robotdiffuse.scenes.moving",
+    "Payload": "robotdiffuse.robots.inertias",
     "Box": "robotdiffuse.scenes.shapes",
     "Capsule": "robotdiffuse.scenes.shapes",
     "Cylinder": "robotdiffuse.scenes.shapes",

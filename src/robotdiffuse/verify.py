@@ -7,10 +7,8 @@ knows nothing of planners.
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from typing import Annotated, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from numba import njit
 from numpy import ndarray
 
@@ -19,63 +17,13 @@ from robotdiffuse.collision.hulls import describe_contact
 from robotdiffuse.collision.motion import Contact, ContinuousCollision
 from robotdiffuse.collision.moving import MovingCollision, TimedContact
 from robotdiffuse.errors import InputError
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal
 from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.rates import RateTolerances, between_rows, wrong_rates
-from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.settings import Bound, Natural, NotNegative, Positive, Settings
-from robotdiffuse.transforms import inverse, rotation_angle, rpy_from_rotation
+from robotdiffuse.rates import RateTolerances, between_rows, states_between, wrong_rates
+from robotdiffuse.robots.dynamics import Dynamics
+from robotdiffuse.tolerances import DEFAULT, VerifySettings, goal_error, looked_at, passes
 from robotdiffuse.types import Path, Trajectory
 
-
-@dataclass(frozen=True)
-class VerifySettings(Settings, name="verify"):
-    """What counts as a violation."""
-
-    contact: Positive = 1e-4
-    """Meshes closer than this [m] count as touching; at or above it, clearances are certified, the smaller it
-    is, the longer it takes."""
-    limit_slack: NotNegative = 1e-6
-    """Joint limits may be exceeded by this [rad] or [m]."""
-    start_tolerance: NotNegative = 1e-6
-    """Largest difference of any joint from the problem's start [rad] or [m]."""
-    goal_tolerance: NotNegative = 1e-4
-    """Largest difference of any joint from one of the goal configurations [rad] or [m]."""
-    goal_distance: NotNegative = 0.01
-    """Largest distance from the position of a goal pose [m] (the paper's 1 cm)."""
-    goal_angle: NotNegative = float(np.radians(15))
-    """Largest angle from the orientation of a goal pose [rad] (the paper's 15 degrees)."""
-    goal_slack: NotNegative = 1e-5
-    """Tolerances that a pose states may be exceeded by this [m] or [rad]."""
-    rest: NotNegative = 1e-6
-    """A motion stands still where no joint is faster than this [rad/s] or [m/s]."""
-    rate_slack: NotNegative = 0.01
-    """Share by which a trajectory may exceed velocity and acceleration limits; also the share of a velocity
-    limit by which the velocities that it says may be off, and at which it is at rest."""
-    rate_agreement: NotNegative = 0.5
-    """Share of the greatest acceleration of the joint by which one that a trajectory says may lie outside of
-    the mean ones before and after its row."""
-    jump: Positive = 1.5
-    """A step of a trajectory longer than this times what the velocity limit allows in its time is a jump."""
-    chord: Positive = 1e-3
-    """Between rows a trajectory is judged on straight lines, unless the cubic through their positions and
-    velocities, as controllers follow it, leaves them by more than this [rad] or [m]: then along the cubic."""
-    constraint_chord: Positive = 1e-6
-    """Path constraints are judged along that cubic always: on straight lines that leave it by no more than
-    this [rad] or [m], which is taken from their tolerances."""
-    reversal_angle: NotNegative = float(np.radians(150))
-    """A turn in joint space by more than this [rad] is a sharp reversal ..."""
-    reversal_step: NotNegative = 0.05
-    """... if the straight moves before and after it are both at least this long [rad, joint-space L2]."""
-    reversals: Natural = 3
-    """More sharp reversals than this are twitching."""
-    tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
-    """Each clearance of a `Report` is at least this share of the least one that was measured, in (0, 1)."""
-
-
-DEFAULT = VerifySettings()
 LONGEST = 1e5
 """Motion that is judged [s], about a day."""
 
@@ -85,8 +33,8 @@ class Violation:
     """The first thing along the motion that is wrong."""
 
     kind: str
-    """not_finite, start, limits, scene_collision, self_collision, constraint, twitch, waypoint or goal; for
-    trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
+    """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, waypoint or
+    goal; for trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
     time: float
     """Where: for a path, waypoint index plus fraction of the segment; for a trajectory, seconds."""
     message: str
@@ -145,7 +93,11 @@ class Verifier:
     def path(self, path: Path) -> Report:
         """See `verify`."""
         self._check_shape(path.joint_names, path.positions)
-        return self._report(path.positions, None, [])
+        found = []
+        if self.dynamics is not None and within(path.positions):
+            places, q = looked_at(path.positions, self.settings.torque_resolution)
+            found = self._torques(places, q, 0 * q, 0 * q)
+        return self._report(path.positions, None, found)
 
     def trajectory(self, trajectory: Trajectory) -> Report:
         """See `verify_trajectory`."""
@@ -179,6 +131,8 @@ class Verifier:
         times, positions = rows if found else between_rows(trajectory, self.settings.chord)
         still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
         along = None
+        if not found:
+            found += self._torques(*states_between(trajectory, self.settings.torque_step))
         if self.constraints is not None:
             found += self._too_fast(trajectory)
             along = between_rows(trajectory, self.settings.constraint_chord) if not found else None
@@ -296,6 +250,21 @@ class Verifier:
         message = f"{one.frame} moves at {speeds[i, k]:.4g} m/s; {one.kind} allows {most:.4g} m/s"
         return [Violation("speed", at, message, one.frame, one.kind, float(excess[:, k].max()))]
 
+    def _torques(self, clock: ndarray, q: ndarray, v: ndarray, a: ndarray) -> list[Violation]:
+        """Where a joint's torque is first beyond its effort limit, with the problem's payload."""
+        if self.dynamics is None:
+            return []
+        torques = np.abs(self.dynamics.torques(q, v, a))
+        excess = torques - self.dynamics.limits * (1 + self.settings.rate_slack)
+        bad = np.flatnonzero((excess > 0).any(axis=1))
+        if not len(bad):
+            return []
+        i, j = int(bad[0]), int(excess[bad[0]].argmax())
+        message = self.dynamics.words(j, torques[i, j])
+        what = f"{message}, with the payload" if v.any() else f"{message} to hold the payload"
+        name = self.robot.joint_names[j]
+        return [Violation("torque", float(clock[i]), what, name, None, float(excess[:, j].max()))]
+
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
         """More sharp reversals than allowed, counted on waypoints at least `reversal_step` apart."""
         settings = self.settings
@@ -321,21 +290,34 @@ class Verifier:
         return Violation("goal", time, f"the motion ends {off.message}", off.subject, None, off.excess)
 
     def _waypoints(self, q: ndarray, clock: ndarray, at_rest: ndarray | None) -> Violation | None:
-        """The first waypoint at which the motion does not stop after those before it."""
-        after = 0
-        for k, goal in enumerate(self.problem.waypoints):
-            rows = range(after, len(q)) if at_rest is None else after + np.flatnonzero(at_rest[after:])
-            stop = next((i for i in rows if goal_error(self.robot, goal, q[i], self.settings) is None), None)
-            if stop is None:
-                message = f"the motion does not stop at waypoints[{k}] after those before it"
+        """The first waypoint at which the motion does not stop, or that it does not pass within its blend,
+        after those before it."""
+        problem, after = self.problem, 0.0
+        for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
+            if blend:
+                place = passes(self.robot, goal, q, blend, self.settings, after)
+            else:
+                stops = np.arange(len(q)) if at_rest is None else np.flatnonzero(at_rest)
+                late = stops[stops >= after]
+                there = (i for i in late if goal_error(self.robot, goal, q[i], self.settings) is None)
+                place = next(there, None)
+            if place is None:
+                what = f"pass within {blend:g} of" if blend else "stop at"
+                message = f"the motion does not {what} waypoints[{k}] after those before it"
                 return Violation("waypoint", float(clock[-1]), message, f"waypoints[{k}]", None, None)
-            after = int(stop)
+            after = float(place)
         return None
 
     @cached_property
     def constraints(self) -> PathConstraints | None:
         """The problem's path constraints made ready; None if it has none."""
         return PathConstraints(self.problem) if self.problem.constraints else None
+
+    @cached_property
+    def dynamics(self) -> Dynamics | None:
+        """Of the robot with the problem's payload; None if it has none."""
+        payload = self.problem.payload
+        return None if payload is None else Dynamics(self.robot, payload, self.problem.T_world_base)
 
     @property
     def _rate_tolerances(self) -> RateTolerances:
@@ -353,57 +335,6 @@ class Verifier:
     def _moving(self) -> MovingCollision:
         settings = self.settings
         return MovingCollision(self.robot, self.problem.moving, settings.contact, settings.tightness)
-
-
-class GoalError(NamedTuple):
-    """How far a configuration is off a goal."""
-
-    message: str
-    subject: str | None
-    excess: float
-
-
-def goal_error(
-    robot: Robot, goal: Goal, q: Float[ndarray, "dof"], settings: VerifySettings = DEFAULT
-) -> GoalError | None:
-    """How far a configuration is off a goal, of several the nearest by its own measure; None at the goal."""
-    if isinstance(goal, AnyGoal):
-        errors = [goal_error(robot, one, q, settings) for one in goal.goals]
-        off = [error for error in errors if error is not None]
-        return min(off, key=lambda error: error.excess) if len(off) == len(errors) else None
-    if isinstance(goal, JointGoal):
-        differences = goal.positions - q
-        differences -= robot.turns(differences)
-        off = float(np.abs(differences).max(axis=1).min(initial=np.inf))
-        if off <= settings.goal_tolerance:
-            return None
-        return GoalError(f"{off:.3g} from the nearest goal configuration (largest joint error)", None, off)
-    T_goal_end = inverse(goal.T_base_frame) @ link_pose(robot, q, goal.frame)
-    distance, angle = float(np.linalg.norm(T_goal_end[:3, 3])), rotation_angle(T_goal_end[:3, :3])
-    xyz, rpy = goal.xyz_tolerance, goal.rpy_tolerance
-    slack = settings.goal_slack
-    there = distance <= settings.goal_distance if xyz is None else _within(T_goal_end[:3, 3], xyz, slack)
-    turned = angle <= settings.goal_angle if rpy is None else _turned(T_goal_end[:3, :3], rpy, slack)
-    if there and turned:
-        return None
-    beyond = "" if xyz is None and rpy is None else ", which is beyond its tolerances"
-    message = (
-        f"with {goal.frame} {distance * 100:.2f} cm and {np.degrees(angle):.1f} degrees off the goal "
-        f"pose{beyond}"
-    )
-    return GoalError(message, goal.frame, distance)
-
-
-def _within(values: ndarray, tolerance: ndarray, slack: float) -> bool:
-    return bool((np.abs(values) <= tolerance + slack).all())
-
-
-def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
-    """Whether roll, pitch and yaw are within the tolerance, by either of the two ways to give a rotation."""
-    roll, pitch, yaw = rpy_from_rotation(rotation)
-    other = np.array([roll + np.pi, np.pi - pitch, yaw + np.pi])
-    ways = np.array([roll, pitch, yaw]), (other + np.pi) % (2 * np.pi) - np.pi
-    return any(_within(way, tolerance, slack) for way in ways)
 
 
 @njit(cache=True)

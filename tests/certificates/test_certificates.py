@@ -260,11 +260,11 @@ def test_rates_are_checked_anew(planned: tuple[Problem, rd.PlanResult]) -> None:
 def test_what_certificates_do_not_prove_is_refused_by_name() -> None:
     problem, path = problem_of(SWING)
     certificate = certify(problem, path)
-    object.__setattr__(problem, "moving", ("a ball",))
-    with pytest.raises(InputError, match="the problem has moving, which certificates do not prove"):
+    object.__setattr__(problem, "payload", rd.Payload(1.0))
+    with pytest.raises(InputError, match="the problem has payload, which certificates do not prove"):
         certify(problem, path)
     assert (
-        "problem: certificates do not prove anything about moving" in certificate.check(problem).differences
+        "problem: certificates do not prove anything about payload" in certificate.check(problem).differences
     )
 
 

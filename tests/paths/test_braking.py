@@ -34,7 +34,7 @@ def test_steps_keep_limits_and_end_at_rest(seed: int) -> None:
 
 def test_fastest_motion_to_the_end_is_that_of_the_timing() -> None:
     """Within what the course spares of the limits, about 4 % of accelerations."""
-    from robotdiffuse.paths.timing import TimingSettings, timed_piece
+    from robotdiffuse.paths.speeds import TimingSettings, timed_piece
 
     waypoints = np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)])
     line = BlendedPolyline(waypoints, half_widths(waypoints, np.array([0.1])))

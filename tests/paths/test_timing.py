@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.blending import DEVIATION, BlendedPolyline, half_widths
-from robotdiffuse.paths.timing import SAME, TimingSettings, time_parameterize
+from robotdiffuse.paths.speeds import TimingSettings
+from robotdiffuse.paths.timing import SAME, time_parameterize
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.types import Path, Trajectory
 

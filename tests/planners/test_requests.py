@@ -70,11 +70,20 @@ ASKED: dict[str, Asked] = {
     "pose with room": Asked(_goal(rd.PoseGoal(HAND, T_GOAL, [0.02] * 3, [0.1, 0.1, np.pi]))),
     "any goal": Asked(_goal([rd.PoseGoal(HAND, T_GOAL), rd.JointGoal(GOAL)])),
     "waypoints": Asked(lambda: replace(PLAIN, waypoints=(rd.JointGoal((START + GOAL) / 2),))),
+    "blended": Asked(
+        lambda: replace(
+            PLAIN,
+            waypoints=(rd.JointGoal((START + GOAL) / 2 + 0.1), rd.PoseGoal(HAND, T_GOAL)),
+            goal=START,
+            blend=0.05,
+        )
+    ),
     "base": Asked(lambda: Problem.in_world(T_WORLD_BASE, PANDA, SCENE.moved(T_WORLD_BASE), START, GOAL)),
     "tool and attached": Asked(_held),
     "views": Asked(_seen),
     "first": Asked(lambda: PLAIN, {"until": "first"}),
     "scaling": Asked(lambda: PLAIN, {"velocity_scaling": 0.5, "acceleration_scaling": 0.3}),
+    "payload": Asked(lambda: replace(PLAIN, payload=rd.Payload(2.0, [0.0, 0.0, 0.1], HAND))),
     "jerk": Asked(lambda: PLAIN, {"jerk": 100.0}),
     "no clearance": Asked(lambda: PLAIN, {"clearance": 0.0}),
     "clearance": Asked(lambda: PLAIN, {"clearance": 0.03}, CLEARANCE),
@@ -104,6 +113,8 @@ def _all_of_it() -> Problem:
         GOAL,
         waypoints=[rd.JointGoal((START + GOAL) / 2)],
         constraints=[cone],
+        blend=0.1,
+        payload=rd.Payload(0.5, link="parcel"),
     )
 
 
@@ -134,7 +145,7 @@ def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> N
             planner.plan(problem, time_limit=3.0, **request)
         assert "\n" not in str(refused.value)
         return
-    result = planner.plan(problem, time_limit=3.0, **{"until": "first", **request})
+    result = planner.plan(problem, time_limit=10.0, **{"until": "first", **request})
     assert result.path is not None and result.trajectory is not None, result.reason
     assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
 

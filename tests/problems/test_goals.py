@@ -1,5 +1,6 @@
 """Goals with tolerances, of several, relative to objects; waypoints."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 import yaml
 from numpy import ndarray
+from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
@@ -14,11 +16,12 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.planners import PLANNERS
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
 from robotdiffuse.problems.goals import AnyGoal, JointGoal, PoseGoal
-from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.kinematics import link_origins, link_pose
+from robotdiffuse.tolerances import goal_error
 from robotdiffuse.transforms import inverse, rotation_from_rpy, rpy_from_rotation, transform
 from robotdiffuse.types import Path as JointPath
 from robotdiffuse.types import Status, Trajectory
-from robotdiffuse.verify import goal_error, verify, verify_trajectory
+from robotdiffuse.verify import verify, verify_trajectory
 
 ROBOT = rd.load_robot("panda")
 START, MIDDLE, END = (
@@ -129,6 +132,57 @@ def test_a_motion_that_only_passes_a_waypoint_does_not_stop_there() -> None:
     assert found is not None and found.kind == "waypoint"
 
 
+def nearest(trajectory: Trajectory, goal: PoseGoal | JointGoal) -> float:
+    """How near the motion comes to a goal, on the cubics between its rows."""
+    curve = CubicHermiteSpline(trajectory.times, trajectory.positions, trajectory.velocities)
+    q = curve(np.linspace(0, trajectory.duration, 20_000))
+    if isinstance(goal, JointGoal):
+        return float(np.linalg.norm(q - goal.positions[0], axis=1).min())
+    return float(np.linalg.norm(link_origins(ROBOT, q, goal.frame) - goal.T_base_frame[:3, 3], axis=1).min())
+
+
+@pytest.mark.parametrize("blend", [0.02, 0.1, 0.5])
+def test_blended_waypoints_are_passed_within_their_blend_without_a_stop(blend: float) -> None:
+    way = [JointGoal(MIDDLE), PoseGoal("panda_hand", DOWN, [0.0] * 3)]
+    stopped = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=way)
+    problem = replace(stopped, blend=blend)
+    one, other = (rd.plan(p, time_limit=10.0).trajectory for p in (problem, stopped))
+    assert one is not None and other is not None
+    assert verify_trajectory(problem, one).valid and verify_trajectory(stopped, other).valid
+    assert one.duration < other.duration
+    assert np.linalg.norm(one.velocities[1:-1], axis=1).min() > 1e-3
+    for k, goal in enumerate(way):
+        assert nearest(one, goal) <= blend + 1e-5
+        closer = [0.9 * nearest(one, goal) if i == k else 0.5 for i in range(2)]
+        found = verify_trajectory(replace(problem, blend=closer), one).violation
+        assert found is not None and found.message.startswith("the motion does not pass within ")
+    found = verify_trajectory(stopped, one).violation
+    assert found is not None and found.message == (
+        "the motion does not stop at waypoints[0] after those before it"
+    )
+
+
+def test_each_waypoint_has_its_own_blend() -> None:
+    problem = rd.Problem(
+        ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, START, MIDDLE], blend=[0, 0.1, 0]
+    )
+    result = rd.plan(problem, time_limit=10.0)
+    assert result.trajectory is not None and verify_trajectory(problem, result.trajectory).valid
+    assert stops(result.trajectory, np.array(MIDDLE)) and "4 legs" in result.reason
+    middle = result.trajectory.times[[0, -1]].mean()
+    moving = np.linalg.norm(result.trajectory.velocities, axis=1) > 1e-3
+    resting = result.trajectory.times[~moving]
+    assert len(resting) >= 4 and np.abs(resting - middle).min() > 0.1
+
+
+def test_a_waypoint_between_obstacles_is_blended_no_further_than_is_free() -> None:
+    hand = link_pose(ROBOT, np.array(MIDDLE), "panda_hand")[:3, 3]
+    wall = rd.Box(hand - [0.0, 0.0, 0.18], [0.02, 0.3, 0.1], name="wall")
+    problem = rd.Problem(ROBOT, rd.Scene([wall]), START, END, waypoints=[MIDDLE], blend=1.0)
+    result = rd.plan(problem, time_limit=10.0)
+    assert result.trajectory is not None and verify_trajectory(problem, result.trajectory).valid
+
+
 def test_the_leg_that_fails_is_named() -> None:
     blocked = PoseGoal(
         "panda_hand", transform(np.array([0.5, 0.0, 0.35]), rotation_from_rpy(np.pi, 0.0, 0.0))
@@ -148,6 +202,7 @@ def test_files_keep_goals_and_waypoints(tmp_path: Path) -> None:
             "any": [{"pose": pose | {"relative_to": "table", "rpy_tolerance": [0, 0, 3.1]}}, {"joints": END}]
         },
         "waypoints": [{"joints": MIDDLE}, {"pose": pose | {"xyz_tolerance": [0.1, 0.1, 0.0]}}],
+        "blend": [0.0, 0.05],
     }
     file = tmp_path / "problem.yaml"
     for base in ({}, {"base": {"xyz": [0.1, 0.2, 0.3], "wxyz": [0.6, 0.0, 0.0, 0.8]}}):
@@ -159,7 +214,7 @@ def test_files_keep_goals_and_waypoints(tmp_path: Path) -> None:
         T = problem.known_scene.shapes[0].solid()[0]
         seen = inverse(T) @ problem.goal.goals[0].T_base_frame
         assert np.allclose(seen[:3, 3], pose["xyz"])
-        assert len(problem.waypoints) == 2
+        assert len(problem.waypoints) == 2 and problem.blend == (0.0, 0.05) and kept["blend"] == [0.0, 0.05]
 
 
 POSE = {"frame": "panda_hand", "xyz": [0.4, 0, 0.4], "wxyz": [0, 1, 0, 0]}
@@ -177,6 +232,15 @@ WRONG = {
     "any": ({"goal": {"any": [{"pose": POSE}, {"joint": END}]}}, r"unknown field of goal.any\[1\]: 'joint'"),
     "waypoint": ({"waypoints": [{"joints": END[1:]}]}, r"waypoints\[0\] has 6 values"),
     "waypoints": ({"waypoints": {"joints": END}}, "waypoints is .*; it must be a list of goals"),
+    "blend": ({"blend": 0.1}, "blend is 0.1; there are no waypoints"),
+    "blends": (
+        {"waypoints": [{"joints": END}], "blend": [0.1, 0.1]},
+        r"blend is \[0.1, 0.1\]; it must be a number for all of 1 waypoints, or one for each: 0 to stop",
+    ),
+    "little blend": (
+        {"waypoints": [{"joints": END}], "blend": 1e-9},
+        "blend is 1e-09; .*, or from 0.001 to 10",
+    ),
     "frame": (
         {"waypoints": [{"pose": POSE | {"frame": "hand"}}]},
         r"unknown link in waypoints\[0\].frame: 'hand'",

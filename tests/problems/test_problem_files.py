@@ -184,7 +184,7 @@ WRONG: dict[str, tuple[object, str]] = {
     "empty": (None, "problem is None"),
     "unknown field": (
         GOOD | {"strat": []},
-        "unknown field of problem: 'strat'; known: attached, base, clearance, constraints, goal, locked",
+        "unknown field of problem: 'strat'; known: attached, base, blend, clearance, constraints, goal",
     ),
     "field not a text": (GOOD | {1: 2}, "unknown field of problem: '?1'?"),
     "no start": (without("start"), "problem has no start"),

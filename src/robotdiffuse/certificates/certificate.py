@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path as FilePath
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
 
 MARK, VERSION = "robotdiffuse certificate", 1
+AGREEMENT = 1e-6
+"""Bounds may be this far from what a certificate says [m] or [rad]: they are rounded there."""
 DECIMALS = 7
 """Of bounds in files [m]."""
 ROWS = ("times", "velocities", "accelerations")
@@ -78,7 +80,7 @@ class Certificate:
     tolerances: Tolerances
     motion: Path | Trajectory
     between: Float[ndarray, "k"]
-    """Times of further configurations on the cubics through the rows [s]."""
+    """Times of further configurations on the cubics through the rows [s]; of a path, rows plus shares."""
     scene_clearance: float
     """No point of a moving link is nearer to an obstacle all along the motion [m]."""
     self_clearance: float
@@ -86,6 +88,12 @@ class Certificate:
     proof: Proof
     problem: dict[str, Any] | None = None
     """As in a problem file, if the robot can be found again."""
+    request_parts: dict[str, str] = field(default_factory=dict)
+    """Content hashes of obstacles that move and path constraints."""
+    moving: Proof | None = None
+    """Stretches that are free of obstacles that move; None without such."""
+    constraints: tuple[tuple[str, float], ...] = ()
+    """For each quantity of a path constraint, what it is at most all along [m] or [rad]."""
 
     def check(self, problem: "Problem | None" = None, at_most: Tolerances | None = None) -> "Findings":
         """Re-check everything for a problem, by default the one that is in here, with tolerances of at most
@@ -141,6 +149,13 @@ def _record(certificate: Certificate) -> dict[str, Any]:
         },
         "between": certificate.between.tolist(),
         "proof": [_claim_record(proof, k, claim) for k, claim in enumerate(proof.claims)],
+        "request_parts": certificate.request_parts,
+        "moving": None
+        if certificate.moving is None
+        else [
+            _claim_record(certificate.moving, k, claim) for k, claim in enumerate(certificate.moving.claims)
+        ],
+        "constraints": [list(one) for one in certificate.constraints],
     }
 
 
@@ -183,6 +198,9 @@ def _certificate(record: dict[str, Any]) -> Certificate:
         _number("self_clearance", record["self_clearance"]),
         _proof(record["proof"]),
         problem,
+        _texts("request_parts", record.get("request_parts", {})),
+        None if record.get("moving") is None else _proof(record["moving"]),
+        tuple((str(name), _number(str(name), most)) for name, most in record.get("constraints", [])),
     )
 
 

@@ -9,18 +9,24 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import CAP, SCENE, Claim, Prover
-from robotdiffuse.certificates.certificate import Certificate, Tolerances
-from robotdiffuse.certificates.content import differences, motion_hash, robot_parts, scene_parts
+from robotdiffuse.certificates.certificate import AGREEMENT, Certificate, Proof, Tolerances
+from robotdiffuse.certificates.content import (
+    differences,
+    motion_hash,
+    request_parts,
+    robot_parts,
+    scene_parts,
+)
+from robotdiffuse.certificates.moving import MovingProver
 from robotdiffuse.certificates.requests import configurations, wrong
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.types import Path, Trajectory
 
 JUDGE = Tolerances()
-AGREEMENT = 1e-6
-"""Bounds may be this far from what a certificate says [m]: they are rounded there."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +59,7 @@ def check(certificate: Certificate, problem: Problem | None = None, at_most: Tol
     found = [
         *differences("robot", certificate.robot_parts, robot_parts(problem.robot)),
         *differences("scene", certificate.scene_parts, scene_parts(problem.scene)),
+        *differences("requests", certificate.request_parts, request_parts(problem)),
     ]
     for name, most in asdict(at_most).items():
         if getattr(certificate.tolerances, name) > most:
@@ -63,6 +70,7 @@ def check(certificate: Certificate, problem: Problem | None = None, at_most: Tol
     found += wrong(problem, certificate)
     if tuple(certificate.motion.joint_names) == problem.robot.joint_names:
         found += _unproved(problem, certificate)
+        found += _unproved_in_time(problem, certificate)
     return Findings(tuple(found))
 
 
@@ -73,9 +81,33 @@ def hash_of(motion: Path | Trajectory) -> str:
 
 
 def _unproved(problem: Problem, certificate: Certificate) -> Iterator[str]:
-    proof = certificate.proof
-    q = configurations(certificate.motion, certificate.between)
-    prover = Prover(problem.robot, problem.scene, q)
+    prover = Prover(problem.robot, problem.scene, configurations(certificate.motion, certificate.between))
+    proof, said = (
+        certificate.proof,
+        {"scene": certificate.scene_clearance, "self": certificate.self_clearance},
+    )
+    of_pairs = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
+    yield from _of_proof(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, said)
+
+
+def _unproved_in_time(problem: Problem, certificate: Certificate) -> Iterator[str]:
+    """Of obstacles that move."""
+    motion, proof = certificate.motion, certificate.moving
+    if not problem.moving or not isinstance(motion, Trajectory) or not (np.diff(motion.times) > 0).all():
+        return
+    if proof is None:
+        yield "proof: nothing is said of obstacles that move"
+        return
+    times = np.sort(np.concatenate([motion.times, certificate.between]), kind="stable")
+    prover = MovingProver(problem.robot, problem.moving, configurations(motion, certificate.between), times)
+    every, said = np.ones(len(proof.stretches.claim), bool), {"scene": certificate.scene_clearance}
+    yield from _of_proof(prover, proof, {"scene": every}, said)
+
+
+def _of_proof(
+    prover: Prover, proof: Proof, kinds: dict[str, ndarray], said: dict[str, float]
+) -> Iterator[str]:
+    """What is wrong with a proof that leaves so much of each kind of stretches."""
     stretches, known = proof.stretches, {claim: k for k, claim in enumerate(prover.claims)}
     for claim in proof.claims:
         if claim not in known:
@@ -86,7 +118,7 @@ def _unproved(problem: Problem, certificate: Certificate) -> Iterator[str]:
     if len(set(proof.claims)) < len(proof.claims):
         yield "proof: a claim is there twice"
         return
-    gaps = list(_gaps(certificate, float(len(q) - 1)))
+    gaps = list(_gaps(proof, float(len(prover.q) - 1)))
     if gaps or not len(stretches.claim):
         yield from gaps
         return
@@ -97,34 +129,31 @@ def _unproved(problem: Problem, certificate: Certificate) -> Iterator[str]:
     own = np.array([known[claim] for claim in proof.claims])[stretches.claim]
     bounds = prover.bounds(stretches._replace(claim=own), proof.by_planes, list(proof.planes))
     for what in ("clearance", "displacement"):
-        said, right = getattr(proof, what), getattr(bounds, what)
-        off = np.flatnonzero(np.abs(said - right) > AGREEMENT)
+        written, right = getattr(proof, what), getattr(bounds, what)
+        off = np.flatnonzero(np.abs(written - right) > AGREEMENT)
         if len(off):
             i = int(off[0])
             more = f" ({len(off) - 1} more)" if len(off) > 1 else ""
-            yield f"proof: {what} of {_place(certificate, i)} is {right[i]:.6f} m, not {said[i]:.6f} m{more}"
+            yield f"proof: {what} of {_place(proof, i)} is {right[i]:.6f} m, not {written[i]:.6f} m{more}"
     left = bounds.clearance - bounds.displacement
-    of_pairs = np.array([claim.against != SCENE for claim in proof.claims])[stretches.claim]
-    for what, said, which in (
-        ("scene", certificate.scene_clearance, ~of_pairs),
-        ("self", certificate.self_clearance, of_pairs),
-    ):
-        if not said > 0:
-            yield f"proof: a {what} clearance of {said:g} m is none"
-        unproved = np.flatnonzero(which & (left < min(said, CAP) - AGREEMENT))
+    for what, which in kinds.items():
+        least = said[what]
+        if not least > 0:
+            yield f"proof: a {what} clearance of {least:g} m is none"
+        unproved = np.flatnonzero(which & (left < min(least, CAP) - AGREEMENT))
         if len(unproved):
             i = int(unproved[0])
-            yield f"proof: {_place(certificate, i)} is clear by {left[i]:.6f} m, not by {said:.6f} m"
+            yield f"proof: {_place(proof, i)} is clear by {left[i]:.6f} m, not by {least:.6f} m"
         nothing = np.flatnonzero(which & ~(left > 0))
         if len(nothing):
             i = int(nothing[0])
-            yield f"proof: {_place(certificate, i)} is not shown to be free: {left[i]:.6f} m are left"
+            yield f"proof: {_place(proof, i)} is not shown to be free: {left[i]:.6f} m are left"
 
 
-def _gaps(certificate: Certificate, last: float) -> Iterator[str]:
+def _gaps(proof: Proof, last: float) -> Iterator[str]:
     """Where the stretches of a claim do not follow each other from the first row to the last."""
-    stretches = certificate.proof.stretches
-    for k, claim in enumerate(certificate.proof.claims):
+    stretches = proof.stretches
+    for k, claim in enumerate(proof.claims):
         rows = np.flatnonzero(stretches.claim == k)
         start, stop = stretches.start[rows], stretches.stop[rows]
         edges = np.concatenate([[0.0], stop]), np.concatenate([start, [last]])
@@ -138,7 +167,7 @@ def described(claim: Claim) -> str:
     return f"{claim.link} against {'the scene' if claim.against == SCENE else claim.against}"
 
 
-def _place(certificate: Certificate, i: int) -> str:
-    stretches = certificate.proof.stretches
-    claim = certificate.proof.claims[int(stretches.claim[i])]
+def _place(proof: Proof, i: int) -> str:
+    stretches = proof.stretches
+    claim = proof.claims[int(stretches.claim[i])]
     return f"{described(claim)} from row {stretches.start[i]:g} to row {stretches.stop[i]:g}"

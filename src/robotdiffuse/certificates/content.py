@@ -3,10 +3,12 @@
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import fields
 
 import numpy as np
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
@@ -45,6 +47,20 @@ def robot_parts(robot: Robot) -> dict[str, str]:
 def scene_parts(scene: Scene) -> dict[str, str]:
     """Each obstacle by its name."""
     return {shape.name: _hash(shape.kind, *_numbers(shape)) for shape in scene.shapes}
+
+
+def request_parts(problem: Problem) -> dict[str, str]:
+    """Obstacles that move, with their motions, and path constraints."""
+    parts = {}
+    for one in problem.moving:
+        ways = [np.zeros(0) if v is None else v for v in (one.velocity, one.times, one.poses, one.max_speed)]
+        parts[f"moving {one.name}"] = _hash(one.shape.kind, *_numbers(one.shape), *ways)
+    for i, one in enumerate(problem.constraints):
+        values = [getattr(one, f.name) for f in fields(one)]
+        texts = [one.kind, *(value for value in values if isinstance(value, str))]
+        rows = [np.zeros(0) if value is None else value for value in values if not isinstance(value, str)]
+        parts[f"constraints[{i}]"] = _hash(texts, *rows)
+    return parts
 
 
 def motion_hash(names: Iterable[str], *rows: np.ndarray | None) -> str:

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.certificates.certificate import Certificate, Tolerances
+from robotdiffuse.certificates.certificate import AGREEMENT, Certificate, Tolerances
+from robotdiffuse.certificates.constraints import kept, too_fast
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal
 from robotdiffuse.problems.problem import Problem
@@ -15,9 +16,14 @@ from robotdiffuse.types import Path, Trajectory
 
 
 def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> Float[ndarray, "n dof"]:
-    """The rows of a motion, and between them further ones on the cubics through positions and velocities."""
-    if not isinstance(motion, Trajectory) or not len(between):
+    """The rows of a motion, and between them further ones: on the cubics through positions and velocities at
+    times; of a path, on its straight lines at places, rows plus shares of the way to the next."""
+    if not len(between):
         return motion.positions
+    if not isinstance(motion, Trajectory):
+        rows = np.arange(len(motion.positions))
+        places = np.sort(np.concatenate([rows, between]))
+        return np.column_stack([np.interp(places, rows, joint) for joint in motion.positions.T])
     times = np.concatenate([motion.times, between])
     q = np.concatenate([motion.positions, _cubic(motion, between)])
     return q[np.argsort(times, kind="stable")]
@@ -38,20 +44,20 @@ def _cubic(motion: Trajectory, at: Float[ndarray, "k"]) -> Float[ndarray, "k dof
     )
 
 
-NOT_COVERED = ("moving", "start_velocity", "constraints")
-"""What problems may ask for beside, and no certificate proves."""
-
-
-def not_covered(problem: Problem) -> list[str]:
-    """Which of these a problem asks for."""
-    asked = ((name, getattr(problem, name)) for name in NOT_COVERED)
-    return [name for name, value in asked if value is not None and len(value)]
+def not_covered(problem: Problem, motion: Path | Trajectory) -> list[str]:
+    """What a problem asks for and no certificate of such a motion proves."""
+    untimed = not isinstance(motion, Trajectory)
+    asked = {
+        "payload": problem.payload is not None,
+        "moving, without times": untimed and len(problem.moving) > 0,
+    }
+    return [name for name, given in asked.items() if given]
 
 
 def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
     """A line for each thing that the motion does not do."""
     robot, motion, tolerances = problem.robot, certificate.motion, certificate.tolerances
-    for name in not_covered(problem):
+    for name in not_covered(problem, motion):
         yield f"problem: certificates do not prove anything about {name}"
     if tuple(motion.joint_names) != robot.joint_names:
         yield f"motion: its joints are {', '.join(motion.joint_names)}, not {', '.join(robot.joint_names)}"
@@ -67,10 +73,31 @@ def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
     if not at_goal(robot, problem.goal, motion.positions[-1], tolerances):
         yield "motion: it does not end at the goal"
     if isinstance(motion, Trajectory):
-        yield from _wrong_rates(robot, motion, certificate)
+        begins = np.zeros(robot.dof) if problem.start_velocity is None else problem.start_velocity
+        yield from _wrong_rates(robot, motion, certificate, begins)
+        yield from too_fast(problem, motion, tolerances.rate_slack)
+    yield from _not_kept(problem, certificate, q)
 
 
-def _wrong_rates(robot: Robot, motion: Trajectory, certificate: Certificate) -> Iterator[str]:
+def _not_kept(problem: Problem, certificate: Certificate, q: Float[ndarray, "n dof"]) -> Iterator[str]:
+    """What is not shown of path constraints, or not as the certificate says."""
+    if not problem.constraints and not certificate.constraints:
+        return
+    shown = kept(problem, q, certificate.tolerances.chord)
+    if [one.name for one in shown] != [name for name, _ in certificate.constraints]:
+        yield "constraints: the certificate is not about those of the problem"
+        return
+    for one, (_, said) in zip(shown, certificate.constraints, strict=True):
+        most = float(one.bounds.max())
+        if abs(most - said) > AGREEMENT:
+            yield f"constraints: {one.name} is at most {most:.6f}, not {said:.6f}"
+        if not most <= one.limit:
+            yield f"constraints: {one.name} is not shown to be kept: {most:.6f}, of {one.limit:.6f}"
+
+
+def _wrong_rates(
+    robot: Robot, motion: Trajectory, certificate: Certificate, begins: Float[ndarray, "dof"]
+) -> Iterator[str]:
     tolerances, step = certificate.tolerances, np.diff(motion.times)[:, None]
     if not (step > 0).all():
         yield "motion: its times do not increase"
@@ -96,8 +123,10 @@ def _wrong_rates(robot: Robot, motion: Trajectory, certificate: Certificate) -> 
             most = np.abs(values[:, j]).max()
             yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {most:.4g} > {limit[j]:.4g}"
     known = np.where(robot.velocity > 0, robot.velocity, np.abs(v).max(axis=0, initial=0.0))
-    if (np.abs(v[[0, -1]]) > tolerances.rate_slack * known + tolerances.rest).any():
-        yield "motion: it does not begin and end at rest"
+    off = np.abs(np.stack([v[0] - begins, v[-1]]))
+    if (off > tolerances.rate_slack * known + tolerances.rest).any():
+        how = "at the problem's start_velocity, or end" if begins.any() else "and end"
+        yield f"motion: it does not begin {how} at rest"
 
 
 def _widest_chord(motion: Trajectory, times: Float[ndarray, "n"]) -> float:

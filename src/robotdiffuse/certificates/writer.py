@@ -5,6 +5,7 @@ that the checker uses. Where spheres are too coarse, planes are laid through the
 points of convex bodies, which Coal finds.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,9 @@ from numpy import ndarray
 from robotdiffuse.certificates.bounds import CAP, SCENE, Plane, Prover, Stretches
 from robotdiffuse.certificates.certificate import DECIMALS, Certificate, Proof, Tolerances
 from robotdiffuse.certificates.checker import hash_of
-from robotdiffuse.certificates.content import robot_parts, scene_parts
+from robotdiffuse.certificates.constraints import kept
+from robotdiffuse.certificates.content import request_parts, robot_parts, scene_parts
+from robotdiffuse.certificates.moving import MovingProver
 from robotdiffuse.certificates.planes import PlaneFinder
 from robotdiffuse.certificates.requests import configurations, not_covered
 from robotdiffuse.errors import InputError
@@ -34,6 +37,8 @@ SPARE = 2e-6
 """What is left over at least, for rounding [m]."""
 MOST_STRETCHES = 200_000
 PLACE_DECIMALS = 7
+HALVINGS = 20
+"""Of the way between two configurations until path constraints are shown to be kept there."""
 
 
 class NotValidError(InputError):
@@ -46,7 +51,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     Raises `NotValidError`, an InputError, with what the judge found if it does not; and InputError for
     obstacles and requests that certificates do not know, and where no proof is found in reasonable size.
     """
-    beside = not_covered(problem)
+    beside = not_covered(problem, motion)
     if beside:
         raise InputError(
             f"the problem has {', '.join(beside)}, which certificates do not prove anything about"
@@ -58,22 +63,55 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
             f"the motion is not valid: {report.violation.message} (at {report.violation.time:.3f})"
         )
     least = {SCENE: SHARE * (report.scene_clearance or 0.0), "": SHARE * (report.self_clearance or 0.0)}
-    between = _between(motion, settings.chord)
-    prover = Prover(problem.robot, problem.scene, configurations(motion, between))
-    proof, left = _prove(prover, least)
+    tolerances = Tolerances(**{name: getattr(settings, name) for name in Tolerances.__dataclass_fields__})
+    if problem.constraints:
+        tolerances = replace(tolerances, chord=settings.constraint_chord)
+    between, bounds = _keeping(problem, motion, _between(motion, tolerances.chord), tolerances.chord)
+    q = configurations(motion, between)
+    proof, left = _prove(Prover(problem.robot, problem.scene, q), least)
+    moving = None
+    if problem.moving and isinstance(motion, Trajectory):
+        times = np.sort(np.concatenate([motion.times, between]), kind="stable")
+        moving, others = _prove(MovingProver(problem.robot, problem.moving, q, times), {"": 0.0})
+        left[SCENE] = min(left[SCENE], others[""])
     return Certificate(
         problem.robot.name,
         robot_parts(problem.robot),
         scene_parts(problem.scene),
         hash_of(motion),
-        Tolerances(**{name: getattr(settings, name) for name in Tolerances.__dataclass_fields__}),
+        tolerances,
         motion,
         between,
         left[SCENE],
         left[""],
         proof,
         _record(problem),
+        request_parts(problem),
+        moving,
+        bounds,
     )
+
+
+def _keeping(
+    problem: Problem, motion: Path | Trajectory, between: Float[ndarray, "k"], chord: float
+) -> tuple[Float[ndarray, "m"], tuple[tuple[str, float], ...]]:
+    """Times, or places of a path, between the rows from which to which all path constraints are shown to be
+    kept; and what they are at most."""
+    if not problem.constraints:
+        return between, ()
+    timed = isinstance(motion, Trajectory)
+    rows = motion.times if timed else np.arange(len(motion.positions), dtype=float)
+    for _ in range(HALVINGS):
+        shown = kept(problem, configurations(motion, between), chord)
+        open_ = np.any([one.bounds > one.limit for one in shown], axis=0)
+        if not open_.any():
+            return between, tuple((one.name, float(one.bounds.max())) for one in shown)
+        at = np.sort(np.concatenate([rows, between]), kind="stable")
+        more = (at[:-1] + at[1:])[open_[: len(at) - 1]] / 2
+        between = np.sort(np.concatenate([between, more]))
+        if len(between) > MOST_STRETCHES:
+            break
+    raise InputError("no proof was found for the path constraints: the motion is too near to their limits")
 
 
 def _record(problem: Problem) -> dict[str, object] | None:
@@ -113,8 +151,9 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
     count, last = len(prover.claims), float(len(prover.q) - 1)
     todo = Stretches(np.arange(count), np.zeros(count), np.full(count, last))
     against_scene = np.array([claim.against == SCENE for claim in prover.claims], bool)
-    targets = np.where(against_scene, least[SCENE], least[""]) + SPARE
-    tools = PlaneFinder(prover)
+    targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + SPARE
+    in_time = isinstance(prover, MovingProver)
+    tools = None if in_time else PlaneFinder(prover)
     done: list[_Found] = []
     total = 0
     while len(todo.claim):
@@ -123,7 +162,7 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
         clearance, displacement = _down(found.clearance), _up(found.displacement)
         by_planes, planes, target = np.zeros(n, bool), list[Plane](), targets[todo.claim]
         close = (clearance - displacement < target) & (clearance < PLANES_BELOW) & (displacement < DISPLACED)
-        if close.any():
+        if tools is not None and close.any():
             rows = np.flatnonzero(close)
             planes = tools.planes(todo, rows, displacement[rows] + target[rows])
             again = prover.bounds(todo.some(rows), np.ones(len(rows), bool), _renumbered(planes, rows))

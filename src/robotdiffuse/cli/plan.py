@@ -83,6 +83,13 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--jerk", type=positive, metavar="J", help="most jerk of any joint, in rad/s³ (default: no limit)"
     )
+    parser.add_argument(
+        "--blend",
+        type=positive,
+        metavar="R",
+        help="pass the problem's waypoints within this without stopping, in rad from configurations, in m "
+        "from poses (default: what the problem says, or stop)",
+    )
     parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
     parser.add_argument(
         "--out",
@@ -133,6 +140,8 @@ def run_plan(arguments: argparse.Namespace) -> int:
     problem = load_problem(arguments.problem, arguments.index)
     if arguments.unseen is not None:
         problem = with_policy(problem, arguments.unseen)
+    if arguments.blend is not None:
+        problem = replace(problem, blend=arguments.blend)
     result = solve(
         problem,
         name,

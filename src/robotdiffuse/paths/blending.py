@@ -55,3 +55,14 @@ def half_widths(
     turn = np.linalg.norm(np.diff(steps / lengths[:, None], axis=0), axis=1)
     room = 0.5 * np.minimum(lengths[:-1], lengths[1:])
     return np.minimum(room, deviations / np.maximum(DEVIATION * turn, 1e-12))
+
+
+def corner_middle(path: Float[ndarray, "n dof"], row: int, deviation: float) -> Float[ndarray, "dof"]:
+    """The middle of the rounded corner at an inner row: the mean of both ways from it, as far as they go."""
+    e, f = path[row] - path[row - 1], path[row + 1] - path[row]
+    lengths = np.linalg.norm(e), np.linalg.norm(f)
+    if min(lengths) == 0:
+        return path[row]
+    turn = f / lengths[1] - e / lengths[0]
+    width = half_widths(path[row - 1 : row + 2], np.array([deviation]))[0]
+    return path[row] + DEVIATION * width * turn

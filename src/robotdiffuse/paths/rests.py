@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.paths import timing
 from robotdiffuse.paths.blending import BlendedPolyline, half_widths
-from robotdiffuse.paths.timing import Rows, TimingSettings
+from robotdiffuse.paths.speeds import Rows, TimingSettings, timed_piece
+from robotdiffuse.paths.timing import rounded_corners
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, Trajectory
 
@@ -46,7 +46,7 @@ class Rests:
         """Every motion lasts a whole number of steps [s]. Corners are rounded where the path that is timed
         without stops is `valid` then; `free` as in `time_parameterize`."""
         self.joint_names, self.step = path.joint_names, step
-        waypoints, deviations = timing.rounded_corners(robot, path, valid, free, settings)
+        waypoints, deviations = rounded_corners(robot, path, valid, free, settings)
         self.line = BlendedPolyline(waypoints, half_widths(waypoints, deviations))
         self.places = self._places(deviations)
         self.motions = [
@@ -81,7 +81,7 @@ class Rests:
         part = BlendedPolyline(
             np.concatenate([ends[:1], line.waypoints[inner], ends[1:]]), line.half_widths[inner - 1]
         )
-        times, q, v, a = timing.timed_piece(robot, part, settings)
+        times, q, v, a = timed_piece(robot, part, settings)
         q = q.copy()
         q[[0, -1]] = ends
         found = []

@@ -71,7 +71,7 @@ def places(line, s, order):
 
 
 @njit(cache=True)
-def _bounds_of_u(first, second, i, width, x, most, acceleration):
+def _bounds_of_u(first, second, i, width, x, most, weakest, strongest):
     """The least and greatest u at x in interval i, as lines over x: values at 0 and slopes, since x may be so
     large that the values there cancel. `most` is the greatest next x."""
     high, high_slope = most / (2 * width), -1 / (2 * width)
@@ -82,18 +82,21 @@ def _bounds_of_u(first, second, i, width, x, most, acceleration):
             a = first[i + k, j] + (2 * width * curve if k else 0.0)
             if abs(a) < TINY:
                 continue
-            limit, slope = acceleration[j] / abs(a), -curve / a
-            if limit + slope * x < high + high_slope * x:
-                high, high_slope = limit, slope
-            if -limit + slope * x > low + low_slope * x:
-                low, low_slope = -limit, slope
+            up, down, slope = strongest[i + k, j] / a, weakest[i + k, j] / a, -curve / a
+            if a < 0:
+                up, down = down, up
+            if up + slope * x < high + high_slope * x:
+                high, high_slope = up, slope
+            if down + slope * x > low + low_slope * x:
+                low, low_slope = down, slope
     return low, low_slope, high, high_slope
 
 
 @njit(cache=True)
-def controllable(first, second, grid, velocity, acceleration):
+def controllable(first, second, grid, velocity, weakest, strongest):
     """The greatest ṡ² at each value of the grid s[m] from which the end can be reached at rest within the
-    limits, from q'[m, dof] and q''[m, dof] there."""
+    limits, from q'[m, dof] and q''[m, dof] there: velocities [dof], least and greatest accelerations
+    [m, dof]."""
     n, dof = first.shape
     x = np.empty(n)  # the most that limits of velocity, and of acceleration where no u helps, allow
     for i in range(n):
@@ -102,14 +105,15 @@ def controllable(first, second, grid, velocity, acceleration):
             if abs(first[i, j]) > TINY:
                 most = min(most, (velocity[j] / abs(first[i, j])) ** 2)
             elif abs(second[i, j]) > TINY:
-                most = min(most, acceleration[j] / abs(second[i, j]))
+                limit = strongest[i, j] if second[i, j] > 0 else weakest[i, j]
+                most = min(most, limit / second[i, j])
         x[i] = most
     x[n - 1] = 0.0
     for i in range(n - 2, -1, -1):
         width = grid[i + 1] - grid[i]
         for _ in range(64):
             low, low_slope, high, high_slope = _bounds_of_u(
-                first, second, i, width, x[i], x[i + 1], acceleration
+                first, second, i, width, x[i], x[i + 1], weakest, strongest
             )
             if low + low_slope * x[i] <= high + high_slope * x[i] or low_slope <= high_slope:
                 break
@@ -118,11 +122,11 @@ def controllable(first, second, grid, velocity, acceleration):
 
 
 @njit(cache=True)
-def fastest(first, second, grid, velocity, acceleration, begins=0.0):
-    """ṡ [m] at each value of the grid s[m], `begins` at the first and 0 at the last, from q'[m, dof] and
-    q''[m, dof] there; NaN where the end cannot be reached from so fast a beginning."""
+def fastest(first, second, grid, velocity, weakest, strongest, begins=0.0):
+    """ṡ [m] at each value of the grid s[m], `begins` at the first and 0 at the last, from what `controllable`
+    takes; NaN where the end cannot be reached from so fast a beginning."""
     n = len(grid)
-    x = controllable(first, second, grid, velocity, acceleration)
+    x = controllable(first, second, grid, velocity, weakest, strongest)
     speeds = np.zeros(n)
     now = begins * begins
     if now > x[0] * (1 + TINY):
@@ -131,7 +135,7 @@ def fastest(first, second, grid, velocity, acceleration, begins=0.0):
     for i in range(n - 1):
         speeds[i] = np.sqrt(now)
         width = grid[i + 1] - grid[i]
-        high, slope = _bounds_of_u(first, second, i, width, now, x[i + 1], acceleration)[2:]
+        high, slope = _bounds_of_u(first, second, i, width, now, x[i + 1], weakest, strongest)[2:]
         now = min(max(now + 2 * width * (high + slope * now), 0.0), x[i + 1])
     return speeds
 

@@ -67,10 +67,11 @@ class Planner(ABC, Generic[Own]):
         velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses.
         jerk: most jerk of any joint of the timed motion [rad/s³]. None: no limit, the fastest motion.
 
-        Where the problem has waypoints, the motion stops at each: `planners/legs.py`. Where obstacles move,
-        it waits, goes slower or draws back on its path: `planners/moving.py`. Where the problem has a start
-        velocity, it begins moving: `planners/in_motion.py`. Where cameras saw the scene, `problem.unseen`
-        says what the rest is taken for: `planners/unseen.py`. Path constraints are for aorrtc, rrt_connect
+        Where the problem has waypoints, the motion stops at each or passes within its blend:
+        `planners/legs.py`. Where obstacles move, it waits, goes slower or draws back on its path:
+        `planners/moving.py`. Where the problem has a start velocity, it begins moving:
+        `planners/in_motion.py`. Where cameras saw the scene, `problem.unseen` says what the rest is taken
+        for: `planners/unseen.py`. Path constraints are for aorrtc, rrt_connect
         and robotdiffuse: `planners/constrained`.
 
         Raises InputError for arguments that are none of these, for what the planner cannot keep, and where
@@ -129,7 +130,7 @@ class Planner(ABC, Generic[Own]):
         first = goal.positions[:1] if isinstance(goal, JointGoal) else []
         ways = [start + share * (end - start) for end in first for share in (0.5, 0.35)]
         balls = [Sphere(link_pose(robot, q, robot.tip)[:3, 3], RADIUS) for q in ways]
-        kinds = replace(problem, waypoints=(), moving=(), start_velocity=None)
+        kinds = replace(problem, waypoints=(), blend=(), moving=(), start_velocity=None)
         if not problem.views:
             kinds = replace(kinds, scene=one_of_each(problem.scene))
         easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]

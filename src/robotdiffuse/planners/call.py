@@ -13,7 +13,8 @@ from robotdiffuse.checks import LARGEST
 from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.deadline import OutOfTimeError
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.timing import DEFAULT, Pace, TimingSettings, time_parameterize
+from robotdiffuse.paths.speeds import DEFAULT, NOTHING, Beside, Pace, TimingSettings
+from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Bound, OneOf, Positive, Settings
@@ -155,15 +156,16 @@ class Call:
         reason: str = "",
         notes: tuple[str, ...] = (),
         keeps: Callable[[ndarray], bool] = lambda _: True,
+        deviations: Float[ndarray, "n"] | None = None,
     ) -> PlanResult | None:
         """Judge the path through the waypoints and time it; None if it or its motion does not pass.
 
         `stage` is the part of the planner that the waypoints come from; `notes` are on this path alone;
-        `keeps` as in `time_parameterize`.
+        `keeps` and `deviations` as in `time_parameterize`.
         """
         began = self.elapsed
         try:
-            result = self._finished(waypoints, stage, reason, notes, keeps)
+            result = self._finished(waypoints, stage, reason, notes, keeps, deviations)
         except OutOfTimeError as error:
             self._no_time_for = str(error)
             return None
@@ -180,6 +182,7 @@ class Call:
         reason: str,
         notes: tuple[str, ...],
         keeps: Callable[[ndarray], bool],
+        deviations: Float[ndarray, "n"] | None,
     ) -> PlanResult | None:
         problem = self.problem
         path = Path(problem.robot.joint_names, np.asarray(waypoints, dtype=np.float64))
@@ -196,7 +199,8 @@ class Call:
             self.timing,
             keeps,
             0.0 if problem.start_velocity is None else float(np.linalg.norm(problem.start_velocity)),
-            self._pace,
+            self._beside,
+            deviations,
         )
         timed = motion.report(trajectory)
         if timed.violation is not None:
@@ -226,12 +230,14 @@ class Call:
         )
 
     @property
-    def _pace(self) -> Pace | None:
-        """The speeds that constraints bound."""
-        constraints = self.judge.constraints
-        if constraints is None or not len(constraints.paced):
-            return None
-        return Pace(constraints.speeds, constraints.most_speeds)
+    def _beside(self) -> Beside:
+        """The speeds that constraints bound, and the torques of a payload."""
+        constraints, pace = self.judge.constraints, None
+        if constraints is not None and len(constraints.paced):
+            pace = Pace(constraints.speeds, constraints.most_speeds)
+        if pace is None and self.judge.dynamics is None:
+            return NOTHING
+        return Beside(pace, self.judge.dynamics)
 
     def _refuse(self, violation: Violation) -> None:
         self._refused = violation.kind

@@ -11,8 +11,9 @@ from numpy import ndarray
 
 from robotdiffuse.paths import braking
 from robotdiffuse.paths.blending import BlendedPolyline, half_widths
+from robotdiffuse.paths.speeds import TimingSettings, symmetric, timing_grid
 from robotdiffuse.paths.time_optimal import controllable, sampled
-from robotdiffuse.paths.timing import TimingSettings, rounded_corners, timing_grid
+from robotdiffuse.paths.timing import rounded_corners
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, Trajectory
 from robotdiffuse.verify import Verifier
@@ -94,7 +95,13 @@ class Course:
             one,
             two,
             grid,
-            controllable(one, two, grid, VELOCITY * self.robot.velocity, self._acceleration),
+            controllable(
+                one,
+                two,
+                grid,
+                VELOCITY * self.robot.velocity,
+                *symmetric(self._acceleration, len(grid)),
+            ),
         )
 
     @property

@@ -18,8 +18,8 @@ from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.tolerances import DEFAULT, goal_error
 from robotdiffuse.types import Status
-from robotdiffuse.verify import DEFAULT, goal_error
 
 GOAL_COUNT = 10
 """Configurations that are looked for when the goal is a pose (the paper's k)."""
@@ -199,7 +199,22 @@ def _usable_goals(call: Call, checker: CollisionChecker) -> Float[ndarray, "k do
     wrong = None if constraints is None else constraints.worst(start)
     if wrong is not None:
         return call.fail(Status.INVALID_START, f"the start does not keep the constraints: {wrong.message}")
-    return _goals(call, call.problem.goal, checker)
+    heavy = _too_heavy(call, start)
+    if heavy is not None:
+        return call.fail(Status.INVALID_START, f"the payload cannot be held at the start: {heavy}")
+    goals = _goals(call, call.problem.goal, checker)
+    if isinstance(goals, PlanResult):
+        return goals
+    held = [q for q in goals if _too_heavy(call, q) is None]
+    if not held:
+        reason = f"the payload cannot be held at the goal: {_too_heavy(call, goals[0])}"
+        return call.fail(Status.INVALID_GOAL, reason)
+    return goals if len(held) == len(goals) else np.stack(held)
+
+
+def _too_heavy(call: Call, q: Float[ndarray, "dof"]) -> str | None:
+    """Which joint cannot hold the problem's payload there."""
+    return None if call.judge.dynamics is None else call.judge.dynamics.too_much(q)
 
 
 def _goals(call: Call, goal: Goal, checker: CollisionChecker) -> Float[ndarray, "k dof"] | PlanResult:

@@ -1,8 +1,13 @@
-"""One motion by waypoints, at each of which it stops: legs that any planner plans, judged as a whole.
+"""One motion by waypoints: legs that any planner plans, timed as one where waypoints are blended, judged as a
+whole.
 
 A leg begins where the one before it ended. Where a goal has many configurations, the planner takes one, from
 which the next goal may be out of reach; so when a later leg has no path, all are planned again with another
 seed, as long as there is time.
+
+A waypoint that may be blended is a corner between two legs, which is rounded as corners of paths are: as
+widely as its blend allows, less where that is not free. Where nothing is, or it takes longer than stopping,
+as it may where the path turns back, the motion stops there after all.
 """
 
 from collections.abc import Sequence
@@ -11,20 +16,32 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from robotdiffuse.paths.blending import corner_middle
 from robotdiffuse.planners.call import Call, Request
-from robotdiffuse.problems.goals import JointGoal
+from robotdiffuse.problems.goals import Goal, JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
+from robotdiffuse.tolerances import DEFAULT, goal_error
 from robotdiffuse.types import Path, Status, Trajectory
+from robotdiffuse.verify import verifier
 
 if TYPE_CHECKING:
     from robotdiffuse.planners.base import Planner
+
+SHARE = 0.9
+"""Of a blend that is used, for the motion is judged at places."""
+WIDEST, NARROWER, NARROWINGS = 10.0, 0.9, 80
+"""Corners are first tried so many times as wide as the blend, for joints may move frames little [rad/m]; then
+narrower each time, so often."""
+SOON = 1e-3
+"""Time limit of what is judged when time has run out [s]."""
 
 
 def plan_by_waypoints(
     planner: "Planner", problem: Problem, time_limit: float, seed: int, request: Request
 ) -> PlanResult:
-    """A motion that stops at each of the problem's waypoints in order and ends at its goal.
+    """A motion that stops at each of the problem's waypoints in order, or passes within its blend, and ends
+    at its goal.
 
     Each leg has an equal share of the time that is left. The result's `planning_time` is that of all legs and
     of the last verdict, its `progress` the whole path's alone.
@@ -37,15 +54,15 @@ def plan_by_waypoints(
         legs: list[PlanResult] = []
         start = problem.start
         for k, goal in enumerate(goals):
-            left = max(time_limit - call.elapsed, 1e-3) / (len(goals) - k)
-            leg = replace(problem, start=start, goal=goal, waypoints=(), notes=())
+            left = max(time_limit - call.elapsed, SOON) / (len(goals) - k)
+            leg = replace(problem, start=start, goal=goal, waypoints=(), blend=(), notes=())
             legs.append(planner.attempt(leg, left, seed + attempt, request))
             path = legs[-1].path
             if path is None:
                 break
             start = path.positions[-1]
         else:
-            return _joined(call, legs)
+            return _joined(call, legs, _motions(call, request, legs))
         attempt += 1
         if not any(many_ways[: len(legs) - 1]) or call.remaining <= 0:
             failed = legs[-1]
@@ -55,13 +72,71 @@ def plan_by_waypoints(
             return call.fail(Status.NO_PATH if later else failed.status, what)
 
 
-def _joined(call: Call, legs: Sequence[PlanResult]) -> PlanResult:
-    """The legs as one motion, judged as one."""
+def _motions(call: Call, request: Request, legs: Sequence[PlanResult]) -> list[Trajectory]:
+    """The motions between stops: of each leg, or of those between which waypoints are blended."""
+    blend, motions, first = call.problem.blend, list[Trajectory](), 0
+    for k in range(len(legs)):
+        if k == len(blend) or blend[k] == 0:
+            run = legs[first : k + 1]
+            stopping = [leg.trajectory for leg in run if leg.trajectory is not None]
+            one = _without_stops(call, request, run, first) if len(run) > 1 else None
+            pays = one is not None and one.duration < sum(motion.duration for motion in stopping)
+            motions += [one] if one is not None and pays else stopping
+            first = k + 1
+    return motions
+
+
+def _without_stops(call: Call, request: Request, legs: Sequence[PlanResult], first: int) -> Trajectory | None:
+    """Legs from the first on as one motion, which does not stop in between; None if the judge refuses it."""
+    problem, last = call.problem, first + len(legs) - 1
+    goals, blend = (*problem.waypoints, problem.goal), problem.blend[first:last]
+    path = _path(legs)
+    part = replace(
+        problem,
+        start=path.positions[0],
+        goal=goals[last],
+        waypoints=goals[first:last],
+        blend=blend,
+        notes=(),
+    )
+    whole = Call(call.planner, part, max(call.remaining, SOON), call.seed, request)
+    whole.timing = replace(whole.timing, line_intervals=len(legs) * whole.timing.line_intervals)
+    corners = np.cumsum([len(leg.path.positions) - 1 for leg in legs[:-1] if leg.path is not None])
+    deviations = np.full(len(path.positions), whole.timing.corner_deviation)
+    for row, goal, radius in zip(corners, part.waypoints, blend, strict=True):
+        deviations[row] = _deviation(part, path, int(row), goal, radius)
+    kept = min(whole.clearance, *(leg.min_clearance for leg in legs if leg.min_clearance is not None))
+    closer = verifier(part, replace(DEFAULT, contact=max(kept, DEFAULT.contact)))
+    found = whole.finish(
+        path.positions,
+        call.planner,
+        keeps=lambda q: closer.collision_free(replace(path, positions=q)),
+        deviations=deviations,
+    )
+    return None if found is None else found.trajectory
+
+
+def _deviation(problem: Problem, path: Path, row: int, goal: Goal, blend: float) -> float:
+    """How far the motion may leave the path's corner at a row such that it passes a goal within its blend."""
+    q, deviation = path.positions, WIDEST * blend
+    for _ in range(NARROWINGS):
+        middle = corner_middle(q, row, deviation)
+        if goal_error(problem.robot, goal, middle, blend=SHARE * blend) is None:
+            return deviation
+        deviation *= NARROWER
+    return 0.0
+
+
+def _path(legs: Sequence[PlanResult]) -> Path:
+    """The legs' paths as one; rows at which one ends and the next begins are kept once."""
     paths = [leg.path for leg in legs if leg.path is not None]
-    timed = [leg.trajectory for leg in legs if leg.trajectory is not None]
     rows = np.concatenate([paths[0].positions, *(path.positions[1:] for path in paths[1:])])
-    path = Path(paths[0].joint_names, rows)
-    trajectory = _one_after_another(timed)
+    return Path(paths[0].joint_names, rows)
+
+
+def _joined(call: Call, legs: Sequence[PlanResult], motions: Sequence[Trajectory]) -> PlanResult:
+    """The legs as one motion, judged as one."""
+    path, trajectory = _path(legs), _one_after_another(motions)
     reports = call.judge.path(path), call.judge.trajectory(trajectory)
     for report in reports:
         if report.violation is not None:

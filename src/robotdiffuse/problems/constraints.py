@@ -4,8 +4,9 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 Places and directions are in the frame of the base.
 """
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar, no_type_check
+from dataclasses import dataclass, fields, replace
+from types import NoneType
+from typing import TYPE_CHECKING, ClassVar, get_args, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +19,14 @@ from robotdiffuse.problems.goals import check_pose
 
 LEAST_TOLERANCE, LEAST_ANGLE = 1e-4, 1e-3
 """The tightest constraints [m], [rad]."""
+SIZES = {
+    "angle": (LEAST_ANGLE, np.pi, "rad"),
+    "tolerance": (LEAST_TOLERANCE, LARGEST, "m"),
+    "speed": (1e-4, LARGEST, "m/s"),
+}
+"""Fields that are sizes: least, greatest, unit."""
+DIRECTIONS = ("axis", "direction", "normal")
+"""Fields whose length does not matter."""
 AROUND = np.eye(4)
 
 
@@ -37,10 +46,7 @@ class AxisCone:
     """The largest angle between them [rad], up to pi."""
 
     def __post_init__(self) -> None:
-        _check_frame(self)
-        for name in ("axis", "direction"):
-            object.__setattr__(self, name, _unit(self, name))
-        _check_size(self, "angle", LEAST_ANGLE, np.pi, "rad")
+        _check(self)
 
     if TYPE_CHECKING:
 
@@ -67,16 +73,14 @@ class PositionBox:
     """None: the frame of the base."""
 
     def __post_init__(self) -> None:
-        _check_frame(self)
-        low, high = (vector(self.kind, name, getattr(self, name), 3) for name in ("low", "high"))
-        if not (high - low >= 2 * LEAST_TOLERANCE).all():
+        _check(self)
+        if not (self.high - self.low >= 2 * LEAST_TOLERANCE).all():
             raise InputError(
-                f"{self.kind}.low is {shown(low)} and its high {shown(high)}; each high must be above "
-                f"its low by at least {2 * LEAST_TOLERANCE:g} m"
+                f"{self.kind}.low is {shown(self.low)} and its high {shown(self.high)}; each high must be "
+                f"above its low by at least {2 * LEAST_TOLERANCE:g} m"
             )
         T = AROUND if self.T_base_box is None else check_pose(f"{self.kind}.T_base_box", self.T_base_box)
-        for name, value in (("low", low), ("high", high), ("T_base_box", T)):
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "T_base_box", T)
 
     if TYPE_CHECKING:
 
@@ -105,10 +109,7 @@ class OnPlane:
     """Largest distance from it, on either side [m]."""
 
     def __post_init__(self) -> None:
-        _check_frame(self)
-        object.__setattr__(self, "point", vector(self.kind, "point", self.point, 3))
-        object.__setattr__(self, "normal", _unit(self, "normal"))
-        _check_size(self, "tolerance", LEAST_TOLERANCE, LARGEST, "m")
+        _check(self)
 
     if TYPE_CHECKING:
 
@@ -135,10 +136,7 @@ class OnLine:
     """Largest distance from it [m]."""
 
     def __post_init__(self) -> None:
-        _check_frame(self)
-        object.__setattr__(self, "point", vector(self.kind, "point", self.point, 3))
-        object.__setattr__(self, "direction", _unit(self, "direction"))
-        _check_size(self, "tolerance", LEAST_TOLERANCE, LARGEST, "m")
+        _check(self)
 
     if TYPE_CHECKING:
 
@@ -170,12 +168,7 @@ class CartesianLine:
     """Most speed of the frame's origin [m/s]; None: as fast as the joints can."""
 
     def __post_init__(self) -> None:
-        _check_frame(self)
-        _check_size(self, "tolerance", LEAST_TOLERANCE, LARGEST, "m")
-        if self.angle is not None:
-            _check_size(self, "angle", LEAST_ANGLE, np.pi, "rad")
-        if self.speed is not None:
-            _check_size(self, "speed", 1e-4, LARGEST, "m/s")
+        _check(self)
 
     if TYPE_CHECKING:
 
@@ -198,27 +191,26 @@ CONSTRAINTS: dict[str, type[Constraint]] = {
 }
 
 
-def _check_frame(constraint: Constraint) -> None:
-    if not isinstance(constraint.frame, str):
-        raise InputError(
-            f"{constraint.kind}.frame is {shown(constraint.frame)}; it must be the name of a link"
-        )
-
-
-def _unit(constraint: Constraint, name: str) -> Float[ndarray, "3"]:
-    given = vector(constraint.kind, name, getattr(constraint, name), 3)
-    length = float(np.linalg.norm(given))
-    if length < 1e-6:
-        raise InputError(f"{constraint.kind}.{name} is {shown(given)}; it must not be zero")
-    return given if abs(length - 1) < 1e-15 else given / length
-
-
-def _check_size(constraint: Constraint, name: str, least: float, most: float, unit: str) -> None:
-    given = getattr(constraint, name)
-    value = numbers(given)
-    if value is None or value.ndim != 0 or not least <= value <= most:
-        raise InputError(
-            f"{constraint.kind}.{name} is {shown(given)}; it must be a number from {least:g} to {most:.6g} "
-            f"[{unit}]"
-        )
-    object.__setattr__(constraint, name, float(value))
+def _check(constraint: Constraint) -> None:
+    """Each field by its name: the frame, vectors, directions of any length, and sizes within bounds."""
+    for field in fields(constraint):
+        name, given = field.name, getattr(constraint, field.name)
+        where = f"{constraint.kind}.{name}"
+        if name == "frame" and not isinstance(given, str):
+            raise InputError(f"{where} is {shown(given)}; it must be the name of a link")
+        if name in ("point", "low", "high", *DIRECTIONS):
+            given = vector(constraint.kind, name, given, 3)
+        if name in DIRECTIONS:
+            length = float(np.linalg.norm(given))
+            if length < 1e-6:
+                raise InputError(f"{where} is {shown(given)}; it must not be zero")
+            given = given if abs(length - 1) < 1e-15 else given / length
+        if name in SIZES and not (given is None and NoneType in get_args(field.type)):
+            least, most, unit = SIZES[name]
+            value = numbers(given)
+            if value is None or value.ndim != 0 or not least <= value <= most:
+                raise InputError(
+                    f"{where} is {shown(given)}; it must be a number from {least:g} to {most:.6g} [{unit}]"
+                )
+            given = float(value)
+        object.__setattr__(constraint, name, given)

@@ -4,6 +4,7 @@ base: {xyz: [0, 0, 0.7], wxyz: [1, 0, 0, 0]}
 tool: {link: panda_hand, xyz: [0, 0, 0.15], shapes: [{cylinder: {...}}]}
 attached:
   - {link: panda_hand, box: {center: [0, 0, 0.12], size: [0.05, 0.05, 0.1], name: cup}}
+payload: {mass: 1.5, com: [0, 0, 0.12], link: panda_hand}
 """
 
 from pathlib import Path
@@ -15,6 +16,7 @@ from numpy import ndarray
 from robotdiffuse.checks import unit_quaternion, vector
 from robotdiffuse.errors import InputError, shown
 from robotdiffuse.robots.bodies import TOOL
+from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
@@ -118,3 +120,20 @@ def _names(where: str, value: object) -> tuple[str, ...]:
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
         raise InputError(f"{where} is {shown(value)}; it must be a list of links")
     return tuple(value)
+
+
+def read_payload(data: object) -> Payload:
+    """{mass: 3.0, com: [0, 0, 0.1], link: panda_hand, moments: [...]}, all but the mass optional; InputError
+    for anything else."""
+    values = check_fields("payload", data, ("mass",), ("com", "link", "moments"))
+    return Payload(**values)  # type: ignore[arg-type]
+
+
+def payload_entry(payload: Payload) -> dict[str, object]:
+    """The payload as `read_payload` takes it."""
+    data: dict[str, object] = {"mass": payload.mass, "com": payload.com.tolist()}
+    if payload.link is not None:
+        data["link"] = payload.link
+    if payload.moments.any():
+        data["moments"] = payload.moments.tolist()
+    return data

@@ -14,7 +14,9 @@ from robotdiffuse.problems.constraint_files import constraint_entry, read_constr
 from robotdiffuse.problems.equipment import (
     equipment_entries,
     equipped,
+    payload_entry,
     pose_entry,
+    read_payload,
     read_pose,
     rounded,
 )
@@ -46,7 +48,7 @@ from robotdiffuse.scenes.scene import Scene
 FIELDS = ("robot", "scene", "start", "goal")
 OPTIONAL = (
     *("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unseen"),
-    *("moving", "start_velocity"),
+    *("moving", "start_velocity", "blend", "payload"),
 )
 
 
@@ -144,6 +146,8 @@ def problem_record(
     if problem.waypoints:
         way = problem.waypoints if T is None else [moved_goal(goal, T) for goal in problem.waypoints]
         record["waypoints"] = as_given([goal_entry(goal) for goal in way])
+    if any(problem.blend):
+        record["blend"] = list(problem.blend)
     if problem.constraints:
         kept = [one if T is None else one.moved(T) for one in problem.constraints]
         record["constraints"] = as_given([constraint_entry(one) for one in kept])
@@ -152,6 +156,8 @@ def problem_record(
         record["moving"] = as_given([moving_entry(one, folder) for one in moving])
     if problem.start_velocity is not None:
         record["start_velocity"] = problem.start_velocity.tolist()
+    if problem.payload is not None:
+        record["payload"] = payload_entry(problem.payload)
     if problem.clearance is not None:
         record["clearance"] = problem.clearance
     if views:
@@ -303,14 +309,15 @@ def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot]
             notes += more
         views, more = read_views(values.get("views", []), folder)
         unseen = values.get("unseen", OPTIMISTIC)
-        for name in ("waypoints", "moving", "start_velocity"):
+        for name in ("waypoints", "blend", "moving", "start_velocity"):
             if requested and name in values:
                 raise InputError(f"{name} is for problems with start and goal in the file, not a request")
         kept = read_constraints(values.get("constraints", []))
+        payload = read_payload(values["payload"]) if "payload" in values else None
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
             asked = _requested(robot, scene, request, clearance, views, unseen)
-            return replace(asked, constraints=kept) if kept else asked
+            return replace(asked, constraints=kept, payload=payload) if kept or payload else asked
         goal, notes = read_goal("goal", values["goal"], scene), (*notes, *more)
         asked = robot, scene, values["start"], goal, notes, clearance, views, unseen
         more = {
@@ -318,6 +325,8 @@ def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot]
             "constraints": kept,
             "moving": read_moving(values.get("moving", []), folder),
             "start_velocity": values.get("start_velocity"),
+            "blend": values.get("blend", ()),
+            "payload": payload,
         }
         if base is None:
             return Problem(*asked, **more)

@@ -20,6 +20,8 @@ from robotdiffuse.problems.goals import AnyGoal as AnyGoal
 from robotdiffuse.problems.goals import Goal, check_pose, moved_goal
 from robotdiffuse.problems.goals import JointGoal as JointGoal
 from robotdiffuse.problems.goals import PoseGoal as PoseGoal
+from robotdiffuse.robots.dynamics import check_dynamics
+from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.moving import MovingObstacle
@@ -28,6 +30,8 @@ from robotdiffuse.transforms import inverse
 
 LIMIT_SLACK = 1e-5
 """Configurations that exceed a joint limit by no more than this are clamped, with a note [rad]."""
+LEAST_BLEND, MOST_BLEND = 1e-3, 10.0
+"""Of `Problem.blend`, but for 0 [rad] or [m]."""
 OPTIMISTIC, PADDED, IMAGINED, OCCUPIED = "optimistic", "padded", "imagined", "occupied"
 UNSEEN = (OPTIMISTIC, PADDED, IMAGINED, OCCUPIED)
 """What space that no view saw is taken for: free; free but near what was seen; as the completing network
@@ -65,13 +69,19 @@ class Problem:
     """Where the base stands in the world, for files and pictures: scene, goal and views are in the base's
     frame all the same. `in_world` takes them in the world's. None: the base's frame is the world's."""
     waypoints: tuple[Goal, ...] = ()
-    """Where the motion stops on its way, in this order."""
+    """Where the motion stops on its way, in this order, or what it passes by: see `blend`."""
     constraints: tuple[Constraint, ...] = ()
     """What holds all along the motion."""
     moving: tuple[MovingObstacle, ...] = ()
     """Obstacles that move, from time 0 of the motion on; `scene` holds those that stand still."""
     start_velocity: Float[ndarray, "dof"] | None = None
     """Of the joints when the motion begins [rad/s] or [m/s]; None: it begins at rest."""
+    blend: tuple[float, ...] = ()
+    """For each waypoint, within what distance of it the motion may pass without stopping: of configurations
+    in joint space [rad, L2], of the position of a pose, or the box that it may be in [m]; 0: it stops there.
+    May be given as one number for all; empty: it stops at all."""
+    payload: Payload | None = None
+    """What a link carries: the timed motion keeps within the effort limits, which None does not look at."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
@@ -87,6 +97,9 @@ class Problem:
             raise InputError(f"waypoints is {shown(self.waypoints)}; it must be a list of goals")
         fields = (f"waypoints[{i}]" for i in range(len(self.waypoints)))
         waypoints = tuple(_goal(self.robot, *of, notes) for of in zip(fields, self.waypoints, strict=True))
+        if self.payload is not None:
+            _check_payload(self.robot, self.payload)
+        blend = _blend(self.blend, len(waypoints))
         constraints = _constraints(self.robot, self.constraints)
         if waypoints and any(isinstance(one, CartesianLine) for one in constraints):
             raise InputError("cartesian_line goes from start to goal: plan from one waypoint to the next")
@@ -101,6 +114,7 @@ class Problem:
             "constraints": constraints,
             "moving": moving,
             "start_velocity": () if start_velocity is None else (start_velocity,),
+            "payload": () if self.payload is None else (self.payload,),
         }
         for one in ("moving", "start_velocity"):
             others = [name for name, given in beside.items() if name != one and given]
@@ -128,6 +142,7 @@ class Problem:
             "constraints": constraints,
             "moving": moving,
             "start_velocity": start_velocity,
+            "blend": blend,
         }.items():
             object.__setattr__(self, key, value)
 
@@ -148,6 +163,8 @@ class Problem:
             constraints: Sequence[Constraint] = (),
             moving: Sequence[MovingObstacle] = (),
             start_velocity: ArrayLike | None = None,
+            blend: ArrayLike = (),
+            payload: Payload | None = None,
         ) -> None: ...
 
     @classmethod
@@ -166,6 +183,8 @@ class Problem:
         constraints: "Sequence[Constraint]" = (),
         moving: "Sequence[MovingObstacle]" = (),
         start_velocity: ArrayLike | None = None,
+        blend: ArrayLike = (),
+        payload: Payload | None = None,
     ) -> "Problem":
         """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views,
         obstacles that move, constraints and the poses of goals are given.
@@ -183,7 +202,7 @@ class Problem:
         constraints = [one.moved(T_base_world) if isinstance(one, kinds) else one for one in constraints]
         moving = [one.moved(T_base_world) if isinstance(one, MovingObstacle) else one for one in moving]
         asked = robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints
-        return cls(*asked, constraints, moving, start_velocity)
+        return cls(*asked, constraints, moving, start_velocity, blend, payload)
 
     def standing(self) -> tuple[Robot, Scene]:
         """Robot and scene as they stand in the world, for pictures and simulators: the robot's base is the
@@ -236,6 +255,33 @@ def _constraints(robot: Robot, constraints: object) -> tuple[Constraint, ...]:
     for i, one in enumerate(constraints):
         _check_moved(robot, f"constraints[{i}].frame", one.frame)
     return tuple(constraints)
+
+
+def _check_payload(robot: Robot, payload: object) -> None:
+    if not isinstance(payload, Payload):
+        raise InputError(f"payload is {shown(payload)}; it must be a rd.Payload")
+    check_dynamics(robot)
+    _check_moved(robot, "payload.link", robot.tip if payload.link is None else payload.link)
+
+
+def _blend(value: object, count: int) -> tuple[float, ...]:
+    """One for each waypoint."""
+    blends = numbers(value)
+    if blends is not None and blends.ndim == 0 and count:
+        blends = np.full(count, blends)
+    given = blends is not None and blends.size > 0
+    if given and not count:
+        raise InputError(f"blend is {shown(value)}; there are no waypoints")
+    if blends is None or (given and blends.shape != (count,)) or not _may_blend(blends).all():
+        raise InputError(
+            f"blend is {shown(value)}; it must be a number for all of {count} waypoints, or one for each: 0 "
+            f"to stop there, or from {LEAST_BLEND:g} to {MOST_BLEND:g}"
+        )
+    return tuple(blends.tolist()) if given else (0.0,) * count
+
+
+def _may_blend(blends: ndarray) -> ndarray:
+    return (blends == 0) | ((blends >= LEAST_BLEND) & (blends <= MOST_BLEND))
 
 
 def _check_moved(robot: Robot, field: str, frame: str) -> None:

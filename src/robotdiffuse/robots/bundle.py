@@ -13,6 +13,7 @@ from numpy import ndarray
 from robotdiffuse.checks import LARGEST, unit_quaternion, within
 from robotdiffuse.errors import InputError, shortened, shown
 from robotdiffuse.reading import read_arrays, read_json
+from robotdiffuse.robots.inertias import inertia_of
 from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 
@@ -62,8 +63,9 @@ def read_bundle(folder: str | Path) -> Robot:
         robot = _from_json(data, meshes)
         _check_tree(robot)
         robot.frame_offsets  # noqa: B018  (walks the tree: fails if a joint has no parent)
-        if robot.dof == 0 or not set(robot.spheres) <= set(robot.link_names):
-            raise ValueError("no planned joints, or spheres of an unknown link")
+        of_links = {*robot.spheres, *robot.inertias}
+        if robot.dof == 0 or not of_links <= set(robot.link_names):
+            raise ValueError("no planned joints, or spheres or inertias of an unknown link")
     except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
         raise InputError(
             f"{Path(folder) / ROBOT_FILE} is damaged: {type(error).__name__}: {shortened(str(error))}"
@@ -103,7 +105,8 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
         "format": FORMAT,
         "name": robot.name,
         "source": source,
-        "units": "metres, radians, seconds; quaternions wxyz; spheres are x y z radius in the link's frame",
+        "units": "metres, radians, seconds, kilograms; quaternions wxyz; spheres are x y z radius in the "
+        "link's frame; inertias mass x y z of its centre xx xy xz yy yz zz about it, along the link's axes",
         "base": robot.base,
         "tip": robot.tip,
         "root": robot.root or robot.base,
@@ -112,6 +115,7 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
         "poses": robot.poses,
         "joints": [_joint_to_json(joint) for joint in robot.joints],
         "spheres": {link: np.round(spheres, 6).tolist() for link, spheres in robot.spheres.items()},
+        "inertias": {link: inertia.values for link, inertia in robot.inertias.items()},
         "allowed_collisions": sorted(sorted(pair) for pair in robot.allowed_collisions),
         "notes": list(robot.notes),
     }
@@ -127,6 +131,8 @@ def _joint_to_json(joint: Joint) -> dict:
     }
     if joint.kind in MOVING_KINDS:
         data |= {"axis": joint.axis.tolist()} | {name: getattr(joint, name) for name in LIMITS}
+    if joint.effort:
+        data["effort"] = joint.effort
     if joint.mimic is not None:
         data["mimic"] = list(joint.mimic)
     return data
@@ -150,6 +156,9 @@ def _dump(data: dict) -> str:
                 for link, rows in value.items()
             ]
             text = "{\n" + ",\n".join(links) + "\n  }"
+        elif key == "inertias" and value:
+            rows = [f"    {compact(link)}: {compact(row)}" for link, row in value.items()]
+            text = "{\n" + ",\n".join(rows) + "\n  }"
         elif isinstance(value, list) and value:
             text = "[\n" + ",\n".join(f"    {compact(item)}" for item in value) + "\n  ]"
         else:
@@ -184,6 +193,7 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
             str(name): {str(joint): float(value) for joint, value in pose.items()}
             for name, pose in data.get("poses", {}).items()
         },
+        inertias={str(link): inertia_of(row) for link, row in data.get("inertias", {}).items()},
     )
 
 
@@ -209,8 +219,11 @@ def _joint_from_json(data: dict) -> Joint:
     if "mimic" in data:
         master, multiplier, offset = data["mimic"]
         mimic = Mimic(str(master), float(multiplier), float(offset))
+    effort = float(data.get("effort", 0.0))
+    if not 0 <= effort <= LARGEST:
+        raise ValueError(f"joint {name}: effort")
     ends, limits = (str(data["parent"]), str(data["child"])), (lower, upper, velocity, acceleration, jerk)
-    return Joint(name, kind, *ends, T, axis, *limits, mimic)
+    return Joint(name, kind, *ends, T, axis, *limits, mimic, effort)
 
 
 def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:

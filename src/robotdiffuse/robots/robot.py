@@ -12,6 +12,7 @@ from numpy import ndarray
 from robotdiffuse.checks import LARGEST
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
+from robotdiffuse.robots.inertias import Inertia
 from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
@@ -56,6 +57,8 @@ class Joint:
     jerk: float = 0.0
     mimic: Mimic | None = None
     """The joint that this one follows, held as that one is."""
+    effort: float = 0.0
+    """Greatest torque [N m] or force [N]; 0: none is given."""
 
     def motion(self, q: float) -> Float[ndarray, "4 4"]:
         """T_joint_child for the joint value q."""
@@ -103,6 +106,8 @@ class Robot:
     """A tool and objects that are held; each is a link too."""
     bare: "Robot | None" = None
     """The robot without these; None if there are none. See `arm`."""
+    inertias: dict[str, Inertia] = field(default_factory=dict)
+    """Of the links whose URDF gives them."""
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
@@ -163,6 +168,11 @@ class Robot:
     @cached_property
     def jerk(self) -> Float[ndarray, "dof"]:
         return self._limit("jerk")
+
+    @cached_property
+    def effort(self) -> Float[ndarray, "dof"]:
+        """Greatest torques [N m] or forces [N]; 0 where none is given."""
+        return self._limit("effort")
 
     @cached_property
     def prismatic(self) -> tuple[bool, ...]:

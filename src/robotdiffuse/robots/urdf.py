@@ -15,11 +15,13 @@ from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.reading import parse_xml, read_triangles
 from robotdiffuse.robots.convex_parts import Surface, convex_hull
 from robotdiffuse.robots.groups import passive_notes, planned_joints, refuse_linkages
+from robotdiffuse.robots.inertias import Inertia, inertia_of
 from robotdiffuse.robots.packages import Packages, urdf_text
 from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
 from robotdiffuse.robots.srdf import Srdf
 from robotdiffuse.transforms import inverse, rotation_from_rpy, transform
 
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 KINDS = (*MOVING_KINDS, "fixed")
 MOST_LINKS = 500
 """Of a robot; humanoids with hands have about 100."""
@@ -125,7 +127,7 @@ class UrdfTree:
         joints = self.below(base)
         names = [base, *(joint.child for joint in joints)]
         planned, end = planned_joints(self.path, base, joints, tip, group, srdf)
-        meshes = self.geometry(names)
+        meshes, inertias = self.geometry(names), self.inertias(names)
         robot = Robot(
             name=self.name,
             base=base,
@@ -136,6 +138,7 @@ class UrdfTree:
             root=self.root,
             above=self.above(base),
             poses={} if srdf is None else dict(srdf.poses),
+            inertias=inertias,
         )
         resting = {} if srdf is None else srdf.resting()
         rest = {
@@ -286,8 +289,49 @@ class UrdfTree:
         acceleration = ACCELERATION_PER_VELOCITY * velocity
         jerk = JERK_PER_ACCELERATION * acceleration
         return replace(
-            joint, lower=lower, upper=upper, velocity=velocity, acceleration=acceleration, jerk=jerk
+            joint,
+            lower=lower,
+            upper=upper,
+            velocity=velocity,
+            acceleration=acceleration,
+            jerk=jerk,
+            effort=self._effort(joint.name, limit),
         )
+
+    def _effort(self, name: str, limit: ET.Element | None) -> float:
+        """0 where none is given, or one that cannot be used: most robots are planned without."""
+        if limit is None or limit.get("effort") is None:
+            return 0.0
+        try:
+            effort = self._numbers(limit.get("effort", ""), 1, f"joint {name}: effort limit")[0]
+        except InputError:
+            return 0.0
+        return max(float(effort), 0.0)
+
+    def inertias(self, links: list[str]) -> dict[str, Inertia]:
+        """Of the links that have a mass; those that no body can have are left out, with a note."""
+        found = {}
+        for link in links:
+            element = self.links[link].find("inertial")
+            mass = None if element is None else element.find("mass")
+            if element is None or mass is None or mass.get("value", "").strip() in ("0", "0.0"):
+                continue
+            try:
+                found[link] = self._inertia(element, f"link {link}: inertial")
+            except (InputError, ValueError):
+                self.notes.append(f"link {link} has an inertia that no body has; left out")
+        return found
+
+    def _inertia(self, element: ET.Element, what: str) -> Inertia:
+        mass, inertia = element.find("mass"), element.find("inertia")
+        value = "" if mass is None else mass.get("value", "")
+        mass = self._numbers(value, 1, what)[0]
+        of = {} if inertia is None else inertia.attrib
+        xx, xy, xz, yy, yz, zz = (self._numbers(of.get(name, ""), 1, what)[0] for name in MOMENTS)
+        T = self._origin(element, what)
+        R = T[:3, :3]
+        moments = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
+        return inertia_of([mass, *T[:3, 3], *moments[np.triu_indices(3)]])
 
     def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
         """Hulls of the links' collision elements by link, in its frame; of their visual ones if no link of

@@ -1,0 +1,194 @@
+"""Path constraints along a motion: the checker's own proof, from one configuration to the next.
+
+Between two configurations joints move by dq at constant rates. A frame's origin p then leaves the chord by
+at most an eighth of its second derivative, which is at most sum_jk |dq_j dq_k| L_max(j,k), L_k being the
+distance of p from axis k all along. The distance to a convex body is convex, so the greater of both ends and
+that bound it; an axis of the frame leaves its chord by at most (sum_j |dq_j|)² / 8; and an angle between
+orientations grows no faster than both turn.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.certificates.kinematics import Linkage, Postures
+from robotdiffuse.errors import InputError
+from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
+from robotdiffuse.problems.goals import JointGoal, PoseGoal
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.types import Trajectory
+
+
+class Kept(NamedTuple):
+    """What is said of one quantity of a constraint."""
+
+    name: str
+    limit: float
+    """[m] or [rad]"""
+    bounds: Float[ndarray, "n"]
+    """From each configuration to the next."""
+
+
+class _Body(NamedTuple):
+    """A box, without extent or without end along some of its axes."""
+
+    center: ndarray
+    R: ndarray
+    half: ndarray
+
+    def distances(self, points: ndarray) -> ndarray:
+        """Negative within."""
+        beyond = np.abs((points - self.center) @ self.R) - self.half
+        return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+
+
+class _Along(NamedTuple):
+    """A frame from each of n + 1 configurations to the next."""
+
+    p: Float[ndarray, "n1 3"]
+    R: Float[ndarray, "n1 3 3"]
+    turn: Float[ndarray, "n"]
+    """At most [rad], ..."""
+    went: Float[ndarray, "n"]
+    """... the way of its origin [m], ..."""
+    sag: Float[ndarray, "n"]
+    """... and how far that leaves the chord [m]."""
+    slack: Float[ndarray, "n"]
+    """What a joint off by 1 rad or m each moves the origin [m]."""
+    joints: int
+
+
+def kept(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[Kept]:
+    """Bounds along the straight lines through configurations, and along motions which those leave by at most
+    `chord`, each joint [rad] or [m]. Raises InputError for a line whose goal does not say one pose."""
+    linkage = Linkage(problem.robot)
+    q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
+    postures = linkage.place(q)
+    found = []
+    for constraint in problem.constraints:
+        along = _along(linkage, postures, q, constraint.frame)
+        name = f"{constraint.kind} of {constraint.frame}"
+        if isinstance(constraint, AxisCone):
+            cosines = along.R @ constraint.axis @ constraint.direction
+            least = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
+            bounds = np.arccos(np.clip(least, -1.0, 1.0)) + chord * along.joints
+            found.append(Kept(name, constraint.angle, bounds))
+            continue
+        if isinstance(constraint, CartesianLine):
+            T_start, T_goal = _ends(problem, linkage, constraint)
+            body = _segment(T_start[:3, 3], T_goal[:3, 3])
+        else:
+            body = _body(constraint)
+        limit = 0.0 if isinstance(constraint, PositionBox) else constraint.tolerance
+        apart = body.distances(along.p)
+        bounds = np.maximum(apart[1:], apart[:-1]) + along.sag + chord * along.slack
+        found.append(Kept(name, limit, bounds))
+        if isinstance(constraint, CartesianLine) and constraint.angle is not None:
+            bounds = _turned(along, T_start, T_goal, chord)
+            found.append(Kept(f"{name}, its angle", constraint.angle, bounds))
+    return found
+
+
+def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
+    """A line for each frame that is faster than its constraint allows, by more than a share, at some row."""
+    linkage, lines = Linkage(problem.robot), []
+    for one in problem.constraints:
+        if not isinstance(one, CartesianLine) or one.speed is None:
+            continue
+        postures = linkage.place(motion.positions)
+        level = int(linkage.levels[linkage.links.index(one.frame)])
+        p = postures.T[:, linkage.links.index(one.frame), :3, 3]
+        rates = np.cross(postures.axes[:, :level], p[:, None] - postures.origins[:, :level])
+        rates[:, linkage.slides[:level]] = postures.axes[:, :level][:, linkage.slides[:level]]
+        speeds = np.linalg.norm((rates * motion.velocities[:, :level, None]).sum(axis=1), axis=1)
+        if speeds.max() > one.speed * (1 + slack):
+            lines.append(f"motion: {one.frame} moves at {speeds.max():.4g} m/s, of {one.speed:g} allowed")
+    return lines
+
+
+def _along(linkage: Linkage, postures: Postures, q: ndarray, frame: str) -> _Along:
+    k = linkage.links.index(frame)
+    level, T = int(linkage.levels[k]), postures.T[:, k]
+    step = np.abs(np.diff(q, axis=0))[:, :level]
+    across = np.cross(T[:-1, None, :3, 3] - postures.origins[:-1, :level], postures.axes[:-1, :level])
+    lengths = np.linalg.norm(across, axis=2)
+    lengths[:, linkage.slides[:level]] = 1.0
+    went, sag = np.zeros(len(step)), np.zeros(len(step))
+    for j in reversed(range(level)):
+        if not linkage.slides[j]:
+            lengths[:, j] += went  # what later joints have moved it
+        went = went + step[:, j] * lengths[:, j]
+        before = step[:, :j].sum(axis=1)
+        sag += lengths[:, j] * step[:, j] * (step[:, j] + 2 * before) / 8
+    turn = step[:, ~linkage.slides[:level]].sum(axis=1)
+    return _Along(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), level)
+
+
+def _body(constraint: Constraint) -> _Body:
+    if isinstance(constraint, PositionBox):
+        T = constraint.T_base_box
+        assert T is not None  # the constructor sees to it
+        middle, half = (constraint.low + constraint.high) / 2, (constraint.high - constraint.low) / 2
+        return _Body(T[:3, :3] @ middle + T[:3, 3], T[:3, :3], half)
+    assert not isinstance(constraint, AxisCone | CartesianLine)
+    flat = isinstance(constraint, OnPlane)
+    along = constraint.normal if isinstance(constraint, OnPlane) else constraint.direction
+    half = np.array([np.inf, np.inf, 0.0] if flat else [0.0, 0.0, np.inf])
+    return _Body(constraint.point, _with_z(along), half)
+
+
+def _segment(start: ndarray, goal: ndarray) -> _Body:
+    length = float(np.linalg.norm(goal - start))
+    return _Body((start + goal) / 2, _with_z((goal - start) / length), np.array([0.0, 0.0, length / 2]))
+
+
+def _with_z(z: ndarray) -> Float[ndarray, "3 3"]:
+    """A rotation whose third column is a unit vector."""
+    x = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def _ends(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndarray, ndarray]:
+    """T_base_frame at start and goal."""
+    k = linkage.links.index(line.frame)
+    start, goal = linkage.place(problem.start[None]).T[0], problem.goal
+    if isinstance(goal, JointGoal):
+        return start[k], linkage.place(goal.positions[:1]).T[0, k]
+    if isinstance(goal, PoseGoal):
+        other = linkage.links.index(goal.frame)
+        if linkage.levels[k] == linkage.levels[other]:
+            return start[k], goal.T_base_frame @ np.linalg.inv(start[other]) @ start[k]
+    raise InputError(f"cartesian_line of {line.frame}: the goal does not say one pose of it")
+
+
+def _turned(along: _Along, T_start: ndarray, T_goal: ndarray, chord: float) -> ndarray:
+    """The angle from the orientation that belongs to the frame's share of the segment."""
+    way = T_goal[:3, 3] - T_start[:3, 3]
+    length = float(np.linalg.norm(way))
+    turn = _rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
+    whole = float(np.linalg.norm(turn))
+    share = np.clip((along.p - T_start[:3, 3]) @ way / length**2, 0.0, 1.0)
+    axis = turn / whole if whole > 0 else np.array([0.0, 0.0, 1.0])
+    x, y, z = axis
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angles = (share * whole)[:, None, None]
+    wanted = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
+    # by the chord between rotations, which is exact near 0 too
+    chords = np.linalg.norm(along.R - wanted, axis=(1, 2))
+    off = 2 * np.arcsin(np.clip(chords / np.sqrt(8), 0.0, 1.0))
+    reach = whole / length
+    return (off[1:] + off[:-1] + along.turn + reach * along.went) / 2 + chord * (
+        along.joints + reach * along.slack
+    )
+
+
+def _rotation_vector(R: ndarray) -> ndarray:
+    angle = 2 * np.arcsin(np.clip(np.linalg.norm(R - np.eye(3)) / np.sqrt(8), 0.0, 1.0))
+    if angle < 1e-12:
+        return np.zeros(3)
+    axis = np.linalg.eigh(R + R.T)[1][:, -1]
+    skew = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return angle * axis * (-1.0 if skew @ axis < 0 else 1.0)

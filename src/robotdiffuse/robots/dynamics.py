@@ -1,0 +1,86 @@
+"""Torques of a robot's joints, by Pinocchio; see `inertias.py` for what they come from."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.inertias import Inertia, Payload
+from robotdiffuse.robots.robot import Robot
+
+GRAVITY = 9.81
+"""Along -z of the world [m/s²]."""
+MASSLESS = 1e-9
+"""Links of less hang in the air [kg]."""
+
+
+class Dynamics:
+    """Inverse dynamics of a robot with a payload; joints' friction and motors' inertia are not known."""
+
+    def __init__(self, robot: Robot, payload: Payload, T_world_base: ndarray | None = None) -> None:
+        """Raises InputError for a robot without inertias or effort limits, an unknown link, and where
+        Pinocchio is not installed."""
+        try:
+            import pinocchio as installed
+        except ImportError:
+            raise InputError(
+                "payload needs Pinocchio, which is not installed: pip install robotdiffuse[dynamics]"
+            ) from None
+        pinocchio: Any = installed  # compiled, without types
+        check_dynamics(robot)
+        link = payload.link or robot.tip
+        self.robot, self.limits = robot, robot.effort
+        self._rnea, model = pinocchio.rnea, pinocchio.Model()
+        joint = 0
+        for j, T in enumerate(robot.frame_offsets):
+            kind = pinocchio.JointModelPZ() if robot.prismatic[j] else pinocchio.JointModelRZ()
+            joint = model.addJoint(joint, kind, pinocchio.SE3(T[:3, :3], T[:3, 3]), robot.joint_names[j])
+        moments = np.diag(payload.moments)
+        carried = [(link, Inertia(payload.mass, payload.com, moments))] if payload.mass > MASSLESS else []
+        for name, inertia in (*robot.inertias.items(), *carried):
+            T, frame = robot.T_frame_link(name), robot.link_frame(name)
+            body = pinocchio.Inertia(inertia.mass, inertia.com, inertia.moments)
+            model.appendBodyToJoint(frame, body, pinocchio.SE3(T[:3, :3], T[:3, 3]))
+        up = np.array([0.0, 0.0, 1.0]) if T_world_base is None else T_world_base[2, :3]
+        model.gravity.linear = -GRAVITY * up
+        self._model, self._data = model, model.createData()
+
+    def torques(
+        self, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
+    ) -> Float[ndarray, "n dof"]:
+        """Of motions through configurations at velocities and accelerations [N m] or [N]."""
+        out = np.empty(q.shape)
+        for i in range(len(q)):
+            out[i] = self._rnea(self._model, self._data, q[i], v[i], a[i])
+        return out
+
+    def holding(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+        """Torques of standing still."""
+        still = np.zeros_like(q)
+        return self.torques(q, still, still)
+
+    def too_much(self, q: Float[ndarray, "dof"]) -> str | None:
+        """In words, which joint's torque is beyond its limit at rest, the worst; None if none is."""
+        torques = np.abs(self.holding(q[None])[0])
+        j = int((torques / self.limits).argmax())
+        return None if torques[j] <= self.limits[j] else self.words(j, torques[j])
+
+    def words(self, j: int, torque: float) -> str:
+        """A torque beyond its limit."""
+        unit = "N" if self.robot.prismatic[j] else "N m"
+        name, limit = self.robot.joint_names[j], self.limits[j]
+        return f"{name} needs {torque:.3g} {unit}, its effort limit is {limit:.3g} {unit}"
+
+
+def check_dynamics(robot: Robot) -> None:
+    """InputError for a robot whose URDF gave no inertias or effort limits."""
+    heavy = {robot.link_frame(link) for link in robot.inertias}
+    for j, name in enumerate(robot.joint_names):
+        lacks = "inertia of what moves with" if j + 1 not in heavy else "effort limit of"
+        if not robot.effort[j] > 0 or j + 1 not in heavy:
+            raise InputError(
+                f"payload: {robot.name} has no {lacks} joint {name}; its URDF must give inertias and "
+                f"effort limits, and the robot be made from it by: robotdiffuse robot add"
+            )

@@ -1,0 +1,211 @@
+"""Certificates of motions with path constraints, among moving obstacles, and that begin moving."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from helpers.box_arm import box_arm
+from robotdiffuse.certificates.bounds import Stretches
+from robotdiffuse.certificates.certificate import Certificate, load_certificate
+from robotdiffuse.certificates.checker import hash_of
+from robotdiffuse.certificates.constraints import kept
+from robotdiffuse.certificates.content import request_parts
+from robotdiffuse.certificates.moving import MovingProver
+from robotdiffuse.certificates.writer import certify
+from robotdiffuse.errors import InputError
+from robotdiffuse.problems.path_constraints import PathConstraints
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.types import Trajectory
+
+PANDA, HAND = rd.load_robot("panda"), "panda_hand"
+START, GOAL = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2], [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
+TABLE = rd.Box([0.55, 0.0, 0.0], [0.5, 1.0, 0.2], name="table")
+POST = rd.Cylinder([0.42, 0.35, 0.4], 0.06, 0.6, name="post")
+ACROSS = rd.MovingObstacle(POST, velocity=[0.25, -0.1, 0.0])
+CONE = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.1745)
+LINE = rd.CartesianLine(HAND, 0.002, 0.02, 0.2)
+ASKED: dict[str, dict[str, Any]] = {
+    "cone": {"constraints": [CONE]},
+    "line": {"constraints": [LINE]},
+    "moving": {"moving": [ACROSS]},
+    "greatest speed": {"moving": [rd.MovingObstacle(rd.Sphere([0.6, 1.8, 0.5], 0.1, "ball"), max_speed=0.3)]},
+    "start velocity": {"start_velocity": [0.5, 0, 0, 0, 0, 0, 0]},
+}
+
+
+@cache
+def certified(asked: str) -> tuple[Problem, Certificate]:
+    problem = Problem(PANDA, rd.Scene([TABLE]), START, GOAL, **ASKED[asked])
+    result = rd.load_planner("aorrtc").plan(problem, time_limit=20.0)
+    assert result.trajectory is not None, result.reason
+    return problem, certify(problem, result.trajectory)
+
+
+@pytest.mark.parametrize("asked", ASKED)
+def test_each_is_proved_and_its_file_holds(asked: str, tmp_path: FilePath) -> None:
+    problem, certificate = certified(asked)
+    certificate.save(tmp_path / "certificate.json")
+    read = load_certificate(tmp_path / "certificate.json")
+    assert read.check().differences == () and read.check(problem).differences == ()
+    assert (read.moving is not None) == bool(problem.moving)
+    assert len(read.constraints) == (2 if asked == "line" else len(problem.constraints))
+
+
+def slower(certificate: Certificate) -> Certificate:
+    motion = certificate.motion
+    assert isinstance(motion, Trajectory)
+    late = replace(motion, velocities=0.5 * motion.velocities)
+    return replace(certificate, motion=late, motion_hash=hash_of(late))
+
+
+def without_moving(certificate: Certificate) -> Certificate:
+    return replace(certificate, moving=None)
+
+
+def nearer(certificate: Certificate) -> Certificate:
+    assert certificate.moving is not None
+    proof = certificate.moving
+    return replace(certificate, moving=replace(proof, displacement=0.5 * proof.displacement))
+
+
+def shorter(certificate: Certificate) -> Certificate:
+    assert certificate.moving is not None
+    proof = certificate.moving
+    stop = proof.stretches.stop.copy()
+    stop[-1] -= 1
+    stretches = proof.stretches._replace(stop=stop)
+    return replace(certificate, moving=replace(proof, stretches=stretches))
+
+
+def tighter(certificate: Certificate) -> Certificate:
+    return replace(certificate, constraints=tuple((name, most / 2) for name, most in certificate.constraints))
+
+
+def unconstrained(certificate: Certificate) -> Certificate:
+    return replace(certificate, constraints=())
+
+
+def coarser(certificate: Certificate) -> Certificate:
+    return replace(certificate, between=certificate.between[:0])
+
+
+TAMPERED: dict[str, tuple[str, Callable[[Certificate], Certificate], str]] = {
+    "no proof": ("moving", without_moving, "proof: nothing is said of obstacles that move"),
+    "displacement": ("moving", nearer, "proof: displacement of .* against post from row .* is "),
+    "a gap": ("moving", shorter, "proof: (clearance|displacement|nothing is said) .*post from row"),
+    "bounds": ("cone", tighter, "constraints: axis_cone of panda_hand is at most "),
+    "no bounds": ("line", unconstrained, "constraints: the certificate is not about those of the problem"),
+    "chords": ("cone", coarser, "motion: its cubics leave the straight lines that were certified"),
+    "beginning": ("start velocity", slower, "motion: it does not begin at the problem's start_velocity"),
+}
+
+
+@pytest.mark.parametrize("case", TAMPERED)
+def test_tampering_is_caught(case: str) -> None:
+    asked, tampered, wanted = TAMPERED[case]
+    problem, certificate = certified(asked)
+    found = tampered(certificate).check(problem).differences
+    assert any(re.match(wanted, line) for line in found), found
+
+
+FORGED: dict[str, tuple[str, dict[str, Any], str]] = {
+    "faster": (
+        "moving",
+        {"moving": [rd.MovingObstacle(POST, velocity=[0.0, -0.7, 0.0])]},
+        "is not shown to be free",
+    ),
+    "in the way": (
+        "moving",
+        {"moving": [rd.MovingObstacle(rd.Sphere([0.5, 0.0, 0.45], 0.2, "post"), velocity=[0, 0, 0.01])]},
+        "is not shown to be free",
+    ),
+    "a narrower cone": (
+        "cone",
+        {"constraints": [rd.AxisCone(HAND, [0, 0, 1], [0, 0.3, -1], 0.1)]},
+        "is not shown to be kept",
+    ),
+    "another line": (
+        "line",
+        {"constraints": [rd.CartesianLine(HAND, 0.0005, 0.02, 0.2)]},
+        "is not shown to be kept",
+    ),
+    "a slower line": ("line", {"constraints": [rd.CartesianLine(HAND, 0.002, 0.02, 0.1)]}, "moves at 0.2"),
+}
+
+
+@pytest.mark.parametrize("case", FORGED)
+def test_whoever_forges_the_hashes_too_still_needs_a_proof(case: str) -> None:
+    asked, other, wanted = FORGED[case]
+    problem, certificate = certified(asked)
+    problem = replace(problem, **other)
+    found = certificate.check(problem).differences
+    assert any(line.startswith("requests: ") for line in found)
+    found = replace(certificate, request_parts=request_parts(problem)).check(problem).differences
+    assert any(wanted in line for line in found), found
+    assert not any(line.startswith("requests: ") for line in found)
+
+
+def test_bounds_of_constraints_are_bounds() -> None:
+    """Against the judge's own values, densely, for arms that slide too."""
+    rng = np.random.default_rng(0)
+    for k in range(40):
+        robot = PANDA if k % 2 else box_arm()
+        frame = HAND if k % 2 else robot.tip
+        rows = rng.uniform(robot.lower, robot.upper, (4, robot.dof))
+        rows[1:] = rows[0] + 10 ** rng.uniform(-1, 0) * (rows[1:] - rows[0])
+        rows = np.clip(rows, robot.lower, robot.upper)
+        normal = rng.normal(size=3)
+        constraints: list[Any] = [
+            rd.AxisCone(frame, rng.normal(size=3), rng.normal(size=3), 0.1),
+            rd.PositionBox(frame, [-0.1] * 3, [0.3] * 3),
+            rd.OnPlane(frame, rng.normal(size=3), normal, 0.1),
+            rd.OnLine(frame, rng.normal(size=3), normal, 0.1),
+            rd.CartesianLine(frame, 0.1, 0.1),
+        ]
+        problem = Problem(robot, rd.Scene(), rows[0], rows[-1], constraints=constraints)
+        shown = kept(problem, rows, 0.0)
+        s = np.linspace(0, 1, 60)[:, None]
+        dense = np.concatenate([rows[i] + s * (rows[i + 1] - rows[i]) for i in range(3)])
+        values = PathConstraints(problem).values(dense).reshape(3, 60, -1).max(axis=1)
+        bounds = np.stack([one.bounds for one in shown], axis=1)
+        assert (values <= bounds + 1e-7).all(), (k, (values - bounds).max(axis=0))
+
+
+def test_bounds_in_time_are_bounds() -> None:
+    """No sphere is nearer to a turning box than clearance less displacement anywhere on a stretch."""
+    rng, times = np.random.default_rng(1), np.linspace(0.0, 1.0, 6)
+    poses = np.tile(np.eye(4), (3, 1, 1))
+    poses[:, :3, 3] = [[0.5, 0.5, 0.5], [0.5, 0.0, 0.6], [0.3, -0.4, 0.4]]
+    poses[1, :3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    poses[2, :3, :3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]]
+    bar = rd.MovingObstacle(
+        rd.Box(poses[0, :3, 3], [0.4, 0.1, 0.1], name="bar"), times=[0, 0.4, 1], poses=poses
+    )
+    ways = (bar, ACROSS, rd.MovingObstacle(rd.Sphere([0.7, 0.3, 0.5], 0.1, "ball"), max_speed=0.0))
+    q = np.array(START) + 0.2 * rng.normal(size=(6, 7)).cumsum(axis=0)
+    prover = MovingProver(PANDA, ways, q, times)
+    count = len(prover.claims)
+    whole = Stretches(np.arange(count), np.full(count, 1.2), np.full(count, 1.9))
+    found = prover.bounds(whole, np.zeros(count, bool), [])
+    for place in np.linspace(1.2, 1.9, 15):
+        point = Stretches(np.arange(count), np.full(count, place), np.full(count, place))
+        there = prover.bounds(point, np.zeros(count, bool), [])
+        assert (there.clearance >= found.clearance - found.displacement - 1e-9).all()
+
+
+def test_paths_with_constraints_are_certified_and_with_moving_obstacles_refused() -> None:
+    problem, _ = certified("cone")
+    path = rd.load_planner("aorrtc").plan(problem, time_limit=20.0).path
+    assert path is not None
+    certificate = certify(problem, path)
+    assert certificate.check(problem).valid and len(certificate.between)
+    problem, _ = certified("moving")
+    with pytest.raises(InputError, match="the problem has moving, without times, which certificates do not"):
+        certify(problem, path)
