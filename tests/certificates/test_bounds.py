@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.box_arm import box_arm
+from helpers.example_robots import example_robot
 from robotdiffuse.certificates.bounds import SCENE, Prover, Stretches
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.certificates.obstacles import CAP, Obstacles, Rounded, Surface
@@ -36,15 +37,22 @@ def shapes() -> list[Shape]:
     ]
 
 
-@pytest.mark.parametrize("name", ["panda", "box arm"])
+ROBOTS = {
+    "panda": lambda: load_robot("panda"),
+    "box arm": box_arm,
+    "two arms": lambda: example_robot("two_arms"),
+}
+
+
+@pytest.mark.parametrize("name", ROBOTS)
 def test_links_are_where_the_judge_has_them(name: str) -> None:
-    robot = load_robot("panda") if name == "panda" else box_arm()
+    robot = ROBOTS[name]()
     rng = np.random.default_rng(0)
     q = rng.uniform(robot.lower, robot.upper, (5, robot.dof))
     linkage = Linkage(robot)
     T = linkage.place(q).T
     for k, link in enumerate(linkage.links):
-        assert linkage.levels[k] == robot.link_frame(link)
+        assert (linkage.moved[k] == robot.moved_by[robot.link_frame(link)]).all()
         for row in range(len(q)):
             np.testing.assert_allclose(T[row, k], link_pose(robot, q[row], link), atol=1e-12)
 
@@ -149,7 +157,7 @@ def test_no_point_goes_further_against_a_normal_than_its_approach(seed: int) -> 
         # where the hand comes to stand, as seen from where the base stands in the middle
         T = places.T[0, base] @ np.linalg.inv(places.T[:, base]) @ places.T[:, k]
         points = mesh.vertices @ np.swapaxes(T[:, :3, :3], 1, 2) + T[:, None, :3, 3]
-        moved_by = range(int(linkage.levels[base]), int(linkage.levels[k]))
+        moved_by = np.flatnonzero(linkage.moved[k] & ~linkage.moved[base])
         origins, axes = places.origins[0], places.axes[0]
         bound = linkage.approach(origins, axes, points[0], moved_by, steps, normals)
         went = (points[0] - points) @ normals.T

@@ -108,10 +108,10 @@ def with_spheres(name: str) -> Robot:
 
 
 def _nearby(robot: Robot, a: str, b: str) -> bool:
-    return abs(robot.link_frame(a) - robot.link_frame(b)) < 2
+    return (robot.moved_by[robot.link_frame(a)] != robot.moved_by[robot.link_frame(b)]).sum() < 2
 
 
-ROBOTS = ("panda", "box_arm", "awkward", "ur5")
+ROBOTS = ("panda", "box_arm", "awkward", "ur5", "two_arms")
 
 
 def rows(robot: Robot, count: int, seed: int = 0) -> ndarray:

@@ -23,15 +23,22 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
-LINKS = ("turret", "arm", "wrist", "flange", "tool")
+LINKS = {
+    "awkward": (("turret", "arm", "wrist", "flange", "tool"),),
+    "two_arms": (
+        ("torso", "left_upper", "left_lower", "left_hand"),
+        ("torso", "right_upper", "right_lower", "right_hand"),
+    ),
+}
+"""The links of each arm."""
 
 
 @cache
-def clad_arm() -> Robot:
+def clad_arm(name: str) -> Robot:
     """Skew joints, one of them prismatic; each link is two boxes side by side, covered by spheres."""
-    rng, robot = np.random.default_rng(0), example_robot("awkward")
+    rng, robot = np.random.default_rng(0), example_robot(name)
     meshes, spheres = {}, {}
-    for link in LINKS:
+    for link in dict.fromkeys(link for arm in LINKS[name] for link in arm):
         low, parts, covers = rng.uniform(-0.06, 0.0, 3), [], []
         for _ in range(2):
             size = rng.uniform(0.02, 0.1, 3)
@@ -39,7 +46,7 @@ def clad_arm() -> Robot:
             covers.append([*(low + size / 2), 0.5 * float(np.linalg.norm(size)) + 1e-6])
             low = low + np.array([size[0], 0.0, 0.0])
         meshes[link], spheres[link] = tuple(parts), np.array(covers)
-    near = frozenset(frozenset(pair) for pair in pairwise(LINKS))
+    near = frozenset(frozenset(pair) for arm in LINKS[name] for pair in pairwise(arm))
     return replace(robot, meshes=meshes, spheres=spheres, allowed_collisions=near)
 
 
@@ -77,9 +84,12 @@ def curve(rng: np.random.Generator, robot: Robot, width: float) -> ndarray:
 seeds = st.integers(0, 2**31)
 
 
-@given(seeds, st.sampled_from([0.01, 0.05, 0.2]), st.booleans())
-def test_bounds_hold_along_the_whole_piece(seed: int, width: float, cloud: bool) -> None:
-    rng, robot = np.random.default_rng(seed), clad_arm()
+robots = st.sampled_from(list(LINKS))
+
+
+@given(robots, seeds, st.sampled_from([0.01, 0.05, 0.2]), st.booleans())
+def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, cloud: bool) -> None:
+    rng, robot = np.random.default_rng(seed), clad_arm(name)
     scene, q = scene_of(rng, cloud), curve(rng, robot, width)
     judge, checker, exact = (
         ContinuousCollision(robot, scene, 1e-4, 0.5),
@@ -116,10 +126,10 @@ def test_bounds_hold_along_the_whole_piece(seed: int, width: float, cloud: bool)
     assert (found.clearance[0] <= distances[5] + 1e-6).all()
 
 
-@given(seeds)
-def test_planes_part_as_far_as_coal_says(seed: int) -> None:
+@given(robots, seeds)
+def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
     """From any guess; 2 % is where the search for the plane ends."""
-    rng, robot = np.random.default_rng(seed), clad_arm()
+    rng, robot = np.random.default_rng(seed), clad_arm(name)
     scene = scene_of(rng, False)
     q = rng.uniform(robot.lower, robot.upper)
     exact, arrays, (arm, parts) = (
@@ -129,7 +139,8 @@ def test_planes_part_as_far_as_coal_says(seed: int) -> None:
     )
     posture = hulls.make_posture(arm, arrays, robot.dof)
     slides = np.array(robot.prismatic, np.bool_)
-    hulls.pose(np.ascontiguousarray(robot.frame_offsets), slides, q, np.zeros(robot.dof), posture)
+    offsets, parents = np.ascontiguousarray(robot.frame_offsets), robot.branching
+    hulls.pose(offsets, parents, slides, q, np.zeros(robot.dof), posture)
     for found in exact.link_distances(q):
         guess = rng.normal(size=3)
         planes = [
@@ -143,11 +154,11 @@ def test_planes_part_as_far_as_coal_says(seed: int) -> None:
         assert least >= 0.98 * found.distance - 1e-6 if found.distance > 1e-5 else least <= 2e-5
 
 
-@given(seeds, st.booleans())
-def test_the_certificate_of_curved_motions(seed: int, cloud: bool) -> None:
+@given(robots, seeds, st.booleans())
+def test_the_certificate_of_curved_motions(name: str, seed: int, cloud: bool) -> None:
     """Among them those of links of several parts, of which the first alone may be clear: bounds that were
     read off it settled pieces in which the others hit."""
-    rng, robot = np.random.default_rng(seed), clad_arm()
+    rng, robot = np.random.default_rng(seed), clad_arm(name)
     scene = scene_of(rng, cloud)
     q = np.concatenate([curve(rng, robot, 0.15), curve(rng, robot, 0.02)])
     found = ContinuousCollision(robot, scene, 1e-4, 0.5).sweep(q)
@@ -173,7 +184,7 @@ def test_the_certificate_of_curved_motions(seed: int, cloud: bool) -> None:
 
 @pytest.mark.parametrize("count", [1, 5])
 def test_a_motion_that_stays_where_it_is(count: int) -> None:
-    robot = clad_arm()
+    robot = clad_arm("awkward")
     q = np.tile(0.5 * (robot.lower + robot.upper), (count, 1))
     found = ContinuousCollision(robot, Scene(), 1e-4, 0.5).sweep(q)
     assert found.scene_clearance == pytest.approx(1.0, abs=1e-4)

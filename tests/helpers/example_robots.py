@@ -12,7 +12,14 @@ from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.robots.urdf import read_urdf
 from robotdiffuse.transforms import transform
 
-TIPS = {"panda": "panda_hand", "iiwa": "lbr_iiwa_link_7", "xarm7": "link7", "ur5": "tool0", "awkward": "tool"}
+TIPS = {
+    "panda": "panda_hand",
+    "iiwa": "lbr_iiwa_link_7",
+    "xarm7": "link7",
+    "ur5": "tool0",
+    "awkward": "tool",
+    "two_arms": "left_hand",
+}
 DESCRIPTIONS = {
     "panda": "panda_description/urdf/panda.urdf",
     "xarm7": "xarm_description/urdf/xarm7.urdf",
@@ -49,11 +56,44 @@ AWKWARD = """<robot name="awkward">
 """Skew axes, a prismatic and two continuous joints, a fixed joint within the chain and a branch beside it."""
 
 
+def _limb(side: str, y: float, wrist: str) -> str:
+    """An arm of three joints of boxes in a row, from the torso on."""
+    joints = (
+        ("shoulder", "torso", "upper", f"0.05 {y} 0.3", "0.2 -0.1 1", "revolute", 1.8),
+        ("elbow", f"{side}_upper", "lower", "0.3 0 0.02", "0 1 0.3", "revolute", 2.2),
+        ("wrist", f"{side}_lower", "hand", "0.25 0 0", "1 0 0", wrist, 0.1 if wrist == "prismatic" else 2.5),
+    )
+    return "".join(
+        f'''<link name="{side}_{child}"><collision><origin xyz="{0.12 if child != "hand" else 0.05} 0 0"/>
+          <geometry><box size="{0.24 if child != "hand" else 0.1} 0.06 0.08"/></geometry></collision></link>
+        <joint name="{side}_{name}" type="{kind}"><parent link="{parent}"/><child link="{side}_{child}"/>
+          <origin xyz="{xyz}" rpy="0 0.1 {-2 * y}"/><axis xyz="{axis}"/>
+          <limit lower="{-limit}" upper="{limit}" velocity="2" effort="1"/></joint>'''
+        for name, parent, child, xyz, axis, kind, limit in joints
+    )
+
+
+TWO_ARMS = f"""<robot name="two_arms">
+  <link name="pedestal"><collision><geometry><box size="0.3 0.3 0.1"/></geometry></collision></link>
+  <link name="torso"><collision><origin xyz="0 0 0.2"/>
+    <geometry><box size="0.16 0.2 0.3"/></geometry></collision></link>
+  <link name="lamp_head"/>
+  <joint name="waist" type="revolute"><parent link="pedestal"/><child link="torso"/>
+    <origin xyz="0 0 0.06"/><axis xyz="0 0 1"/>
+    <limit lower="-1.5" upper="1.5" velocity="2" effort="1"/></joint>
+  {_limb("left", 0.16, "revolute")} {_limb("right", -0.16, "prismatic")}
+  <joint name="lamp" type="revolute"><parent link="pedestal"/><child link="lamp_head"/>
+    <origin xyz="0.3 0 0.4"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" velocity="2" effort="1"/></joint>
+</robot>
+"""
+"""Two arms that reach each other, on a torso that a planned joint turns: a tree."""
+
+
 def urdf_file(name: str, folder: Path) -> Path:
     """The URDF of a robot in TIPS; skips the test if the package that holds it is not installed."""
-    if name == "awkward":
-        file = folder / "awkward.urdf"
-        file.write_text(AWKWARD)
+    if name in ("awkward", "two_arms"):
+        file = folder / f"{name}.urdf"
+        file.write_text(AWKWARD if name == "awkward" else TWO_ARMS)
         return file
     if name == "iiwa":
         return Path(pytest.importorskip("pybullet_data").getDataPath()) / "kuka_iiwa" / "model.urdf"
@@ -66,7 +106,8 @@ def urdf_file(name: str, folder: Path) -> Path:
 def example_robot(name: str) -> Robot:
     base = "base" if name == "awkward" else None
     with TemporaryDirectory() as folder:
-        return read_urdf(urdf_file(name, Path(folder)), base=base, tip=TIPS[name])
+        group, tip = ("both", None) if name == "two_arms" else (None, TIPS[name])
+        return read_urdf(urdf_file(name, Path(folder)), base=base, tip=tip, group=group)
 
 
 def planar_arm(*lengths: float) -> Robot:

@@ -83,7 +83,7 @@ def test_two_arms_are_listed_and_asked_about(tmp_path: Path) -> None:
         assert robot.joint_names == tuple(row("right_", 7))
         assert robot.locked.keys() == {*row("left_", 7), "head"}
         assert "left_7_link" in robot.meshes  # held, and still there to be hit
-    with pytest.raises(InputError, match=r"unknown group of .* 'middle'; known: left, right"):
+    with pytest.raises(InputError, match=r"unknown group of .* 'middle'; known: all, both, left, right"):
         read_urdf(file, group="middle")
 
 

@@ -36,7 +36,7 @@ def sampled_radii(robot: Robot, count: int) -> np.ndarray:
         points = (
             np.einsum("nik,sk->nsi", T_base_link[:, :3, :3], spheres[:, :3]) + T_base_link[:, None, :3, 3]
         )
-        for j in range(last):
+        for j in robot.chain(link):
             axis, origin = frames[:, j + 1, :3, 2], frames[:, j + 1, :3, 3]
             lever = np.linalg.norm(np.cross(axis[:, None], points - origin[:, None]), axis=-1)
             out[i, j] = 1.0 if robot.prismatic[j] else (lever + spheres[:, 3]).max()

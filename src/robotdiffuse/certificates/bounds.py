@@ -2,8 +2,9 @@
 
 A stretch is free for a check, a link against the scene or two links, if in the middle of the stretch the
 clearance is more than any point of the link can be displaced from there to anywhere on it. Clearances are
-those of the robot's spheres, or of its convex meshes by planes that part them from what is near. Of two
-links, the further one is seen from the nearer one, so only the joints between them count.
+those of the robot's spheres, or of its convex meshes by planes that part them from what is near. Two links
+are seen from where the joints that move them part, so only the joints between them count: those of the
+further link, and of links on two arms those of both.
 """
 
 from collections.abc import Sequence
@@ -83,7 +84,7 @@ class Prover:
         self.linkage, self.obstacles = Linkage(robot), Obstacles(scene)
         self.links = [link for link in self.linkage.links if _has_geometry(robot, link)]
         self._of = {link: k for k, link in enumerate(self.linkage.links)}
-        self._levels = self.linkage.levels
+        self._moved = self.linkage.moved
         balls = [_balls(robot, link) for link in self.linkage.links]
         self._balls = np.concatenate([np.zeros((0, 4)), *balls])
         counts = [len(rows) for rows in balls]
@@ -93,12 +94,14 @@ class Prover:
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
         """Moving links against the scene; pairs of links that move against each other and may not touch."""
-        level = {link: self._levels[self._of[link]] for link in self.links}
+        moved = {link: self._moved[self._of[link]] for link in self.links}
+        level = {link: int(joints.sum()) for link, joints in moved.items()}
         moving = [Claim(link, SCENE) for link in self.links if level[link] > 0]
         pairs = []
         for i, a in enumerate(self.links):
             for b in self.links[i + 1 :]:
-                if level[a] != level[b] and frozenset((a, b)) not in self.robot.allowed_collisions:
+                apart = (moved[a] != moved[b]).any()
+                if apart and frozenset((a, b)) not in self.robot.allowed_collisions:
                     pairs.append(Claim(a, b) if level[a] > level[b] else Claim(b, a))
         return (*moving, *pairs)
 
@@ -167,16 +170,33 @@ class Prover:
         row, ball, begin = self._expand(further)
         at, radius = posture[row], self._balls[ball, 3]
         centers = self._placed(postures, at, further[row], self._balls[ball, :3])
-        levels, seen_from = self._levels[further], np.zeros(len(claim), int)
+        moved, others = self._moved[further], np.zeros(len(claim))
         if pairs:
             nearer = np.array([self._of.get(c.against, 0) for c in self.claims])[claim]
-            seen_from = self._levels[nearer]
+            others = self._displaced(postures, posture, nearer, self._moved[nearer] & ~moved, spans)
+            moved = moved & ~self._moved[nearer]
             distances = self._to_links(postures, at, centers, nearer[row])
         else:
             distances = self.obstacles.distances(centers).min(axis=1, initial=CAP)
-        went = self.linkage.displacement(postures, at, centers, radius, levels[row], seen_from[row], spans)
+        went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
         clearance = np.minimum.reduceat(distances - radius, begin)
-        return np.minimum(clearance, CAP), np.maximum.reduceat(went, begin)
+        return np.minimum(clearance, CAP), np.maximum.reduceat(went, begin) + others
+
+    def _displaced(
+        self, postures: Postures, posture: ndarray, links: ndarray, moved: ndarray, spans: ndarray
+    ) -> Float[ndarray, "n"]:
+        """How far links go at most by these joints; of two links on one chain the nearer has none."""
+        went = np.zeros(len(links))
+        some = np.flatnonzero(moved.any(axis=1))
+        if len(some):
+            row, ball, begin = self._expand(links[some])
+            at, link = posture[some][row], links[some][row]
+            centers = self._placed(postures, at, link, self._balls[ball, :3])
+            moves = self.linkage.displacement(
+                postures, at, centers, self._balls[ball, 3], moved[some][row], spans
+            )
+            went[some] = np.maximum.reduceat(moves, begin)
+        return went
 
     def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
         """From points to the spheres of a link each."""
@@ -212,8 +232,11 @@ class Prover:
         centers = [part.center for k in in_scene for part in standing[k]]
         to_scene = iter(self.obstacles.distances(np.array(centers).reshape(-1, 3)))
         for k, (claim, T) in enumerate(places):
-            base = 0 if claim.against == SCENE else int(self._levels[self._of[claim.against]])
-            moved_by = range(base, int(self._levels[self._of[claim.link]]))
+            mine, theirs = self._moved[self._of[claim.link]], np.zeros(len(self.linkage.slides), bool)
+            if claim.against != SCENE:
+                other = self._moved[self._of[claim.against]]
+                mine, theirs = mine & ~other, other & ~mine
+            mine, theirs = np.flatnonzero(mine), np.flatnonzero(theirs)
             at = which[marked[k]]
             for p, part in enumerate(standing[k]):
                 bodies = self.others(claim, T, part)
@@ -227,11 +250,16 @@ class Prover:
                     if shown is not None:
                         n = np.array(shown)
                         n /= np.sqrt((n**2).sum(axis=1, keepdims=True))
-                        nearer = self.linkage.approach(
-                            postures.origins[at], postures.axes[at], part.vertices, moved_by, ways[k], n
-                        )
+                        axes = postures.origins[at], postures.axes[at]
+                        nearer = self.linkage.approach(*axes, part.vertices, mine, ways[k], n)
+                        against = np.zeros(len(n))
+                        if len(theirs):
+                            assert isinstance(body, Part)
+                            comes = self.linkage.approach(*axes, body.vertices, theirs, ways[k], -n)
+                            heights = n @ body.vertices.T
+                            against = (heights + comes).max(axis=1) - heights.max(axis=1)
                         widest = gaps(part, body, n).max(axis=-1)
-                        remaining = gaps(part, body, n, nearer).max(axis=-1)
+                        remaining = (gaps(part, body, n, nearer) - against).max(axis=-1)
                         least_of, left_of = np.maximum(apart[o], widest), np.maximum(along[o], remaining)
                         beyond = BEYOND if isinstance(body, Surface) else CAP
                         apart[o] = max(apart[o], least_of.min(initial=beyond))

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.robots.robot import Robot
@@ -34,12 +34,14 @@ class Linkage:
         self._planned = {joint.name: j for j, joint in enumerate(robot.planned_joints)}
 
     @cached_property
-    def levels(self) -> Int[ndarray, "links"]:
-        """How many planned joints move each link: these are the first ones."""
-        levels = {self.robot.base: 0}
+    def moved(self) -> Bool[ndarray, "links dof"]:
+        """Which planned joints move each link."""
+        moved = {self.robot.base: np.zeros(len(self._planned), bool)}
         for joint in self.robot.joints:
-            levels[joint.child] = levels[joint.parent] + (joint.name in self._planned)
-        return np.array([levels[link] for link in self.links])
+            moved[joint.child] = moved[joint.parent].copy()
+            if joint.name in self._planned:
+                moved[joint.child][self._planned[joint.name]] = True
+        return np.stack([moved[link] for link in self.links])
 
     def place(self, q: Float[ndarray, "n dof"]) -> Postures:
         """The arm at configurations."""
@@ -64,16 +66,15 @@ class Linkage:
         rows: Int[ndarray, "m"],
         centers: Float[ndarray, "m 3"],
         radii: Float[ndarray, "m"],
-        levels: Int[ndarray, "m"],
-        seen_from: Int[ndarray, "m"],
+        moved: Bool[ndarray, "m dof"],
         spans: Float[ndarray, "n dof"],
     ) -> Float[ndarray, "m"]:
         """How far any point of balls can go at most [m] when joints leave their postures by up to `spans`.
 
-        Balls are given where they are in the postures of `rows`, `levels` joints move them, and they are seen
-        from a body that the first `seen_from` joints move. The last joint is turned first: joint j turns a
-        ball, which the later ones have taken d away, on a circle of at most its distance from the axis plus
-        d, so by at most spans_j times that. Axes of earlier joints are still where they are in the posture.
+        Balls are given where they are in the postures of `rows`, and `moved` are the joints that move them,
+        seen from a body before these. The last joint is turned first: joint j turns a ball, which the later
+        ones have taken d away, on a circle of at most its distance from the axis plus d, so by at most
+        spans_j times that. Axes of earlier joints are still where they are in the posture.
         """
         went = np.zeros(len(rows))
         for j in reversed(range(len(self.slides))):
@@ -81,7 +82,7 @@ class Linkage:
             if not self.slides[j]:
                 across = np.cross(centers - postures.origins[rows, j], postures.axes[rows, j])
                 arm = np.sqrt((across**2).sum(axis=1)) + radii + went
-            went += np.where((seen_from <= j) & (j < levels), spans[rows, j] * arm, 0.0)
+            went += np.where(moved[:, j], spans[rows, j] * arm, 0.0)
         return went
 
     def approach(
@@ -89,18 +90,19 @@ class Linkage:
         origins: Float[ndarray, "dof 3"],
         axes: Float[ndarray, "dof 3"],
         points: Float[ndarray, "v 3"],
-        moved_by: range,
+        moved_by: Int[ndarray, "joints"],
         steps: Float[ndarray, "rows dof"],
         normals: Float[ndarray, "k 3"],
     ) -> Float[ndarray, "k v"]:
         """How far points go against unit vectors at most [m], when joints leave their posture for anything on
-        the straight lines through `steps` from it; only the joints `moved_by` count.
+        the straight lines through `steps` from it; only the joints `moved_by`, each behind the one before,
+        count.
 
         To first order a point goes along the normal as a linear function of the joints, whose least value is
         at one of the steps. The rest is at most sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), where the joints'
         second derivatives of the point, by j <= k, are at most its greatest distance L_k from axis k.
         """
-        which, spans = list(moved_by), np.abs(steps).max(axis=0)
+        which, spans = moved_by.tolist(), np.abs(steps).max(axis=0)
         rates = np.cross(axes[which, None], points[None] - origins[which, None])
         rates[self.slides[which]] = axes[which, None][self.slides[which]]
         lengths = np.sqrt((rates**2).sum(axis=2))

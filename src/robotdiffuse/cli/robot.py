@@ -45,7 +45,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     make.add_argument("--name", metavar="NAME", help="name that problems use (default: the URDF's)")
     make.add_argument("--out", metavar="FOLDER", help="where to write it (default: the user's robots)")
     make.add_argument(
-        "--group", metavar="NAME", help="group of the SRDF, or arm, that is planned (default: the only arm)"
+        "--group",
+        metavar="NAME",
+        help="group of the SRDF, or arm, that is planned; 'both' or 'all' arms as one robot (default: the "
+        "only arm)",
     )
     make.add_argument("--base", metavar="LINK", help="first link of the arm (default: the root)")
     make.add_argument("--tip", metavar="LINK", help="last link of the arm (default: where a gripper begins)")
@@ -183,7 +186,8 @@ def print_robot(robot: "Robot") -> None:
     joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]
     spheres = sum(len(rows) for rows in robot.spheres.values())
     meshes = sum(len(pieces) for pieces in robot.meshes.values())
-    pairs = [("base, tip", f"{robot.base}, {robot.tip}")]
+    ends = [("tip", tip) for tip in robot.tips] if robot.other_tips else []
+    pairs = [("base", robot.base), *ends] if ends else [("base, tip", f"{robot.base}, {robot.tip}")]
     if robot.root not in ("", robot.base):
         at = "on a joint that moves it" if robot.T_base_root is None else _place(inverse(robot.T_base_root))
         pairs.append((f"base in {robot.root}", at))

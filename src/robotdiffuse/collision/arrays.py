@@ -54,6 +54,8 @@ class RobotArrays(NamedTuple):
     """[pairs, 4] groups that are checked against each other, a row of `near` or -1, and a bit there."""
     near: ndarray
     """[tables, ...] where pairs close to each other along the arm may touch: see `near_pairs.py`."""
+    parents: ndarray | None
+    """[dof] `Robot.parents`; None of a chain, for which code is compiled apart."""
 
 
 class SceneArrays(NamedTuple):
@@ -118,6 +120,7 @@ def compile_robot(robot: Robot) -> RobotArrays:
         bounds=np.array([group.bounds for group in placed], np.float32).reshape(-1, 4),
         pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
         near=no_tables(),
+        parents=robot.branching,
     )
     if not pairs:
         return arrays

@@ -76,7 +76,8 @@ class _Obstacle(NamedTuple):
 
 def forward_frames(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n frames 4 4"]:
     """T_base_frame of frames 0 to dof, in float64 and independent of the PyTorch kinematics."""
-    return kernel.forward(robot.frame_offsets, np.array(robot.prismatic), np.asarray(q, np.float64))
+    slides = np.array(robot.prismatic, np.bool_)
+    return kernel.forward(robot.frame_offsets, robot.branching, slides, np.asarray(q, np.float64))
 
 
 def _convex(vertices: ndarray, faces: ndarray) -> coal.Convex:

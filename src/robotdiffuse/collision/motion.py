@@ -203,17 +203,19 @@ def _groups(robot: Robot) -> tuple[dict[str, int], dict[frozenset[str | None], i
 @once_per_robot
 def _arm(robot: Robot) -> Arm:
     slides = np.array(robot.prismatic, np.bool_)
-    return Arm(compile_robot(robot), hulls_of(robot)[0], np.ascontiguousarray(robot.frame_offsets), slides)
+    offsets = np.ascontiguousarray(robot.frame_offsets)
+    return Arm(compile_robot(robot), hulls_of(robot)[0], offsets, robot.branching, slides)
 
 
 @once_per_robot
 def _checks(robot: Robot) -> Checks:
-    """What compiled code reads of the checks. Levers are seen from what the link is checked against."""
+    """What compiled code reads of the checks. Levers are seen from where the chains of the links part: from
+    the nearer link, if both are on one."""
     groups, pairs = _groups(robot)
     whole, parts = covered(robot), hulls_of(robot)[1]
     links = [link for link in whole.link_names if link in whole.spheres]
     radii, checks = motion_radii(whole), checks_of(robot)
-    kind, where, of_parts, base = [], [], [], []
+    kind, where, of_parts, base, common, second = [], [], [], [], [], []
     levers = np.zeros((len(checks), robot.dof))
     for k, (link, other) in enumerate(checks):
         kind.append(SCENE if other is None else PAIR)
@@ -221,8 +223,16 @@ def _checks(robot: Robot) -> Checks:
         where.append(known)
         nearer, further = sorted((other or robot.base, link), key=robot.link_frame)
         low, high = robot.link_frame(nearer), robot.link_frame(further)
-        levers[k, low:high] = radii[links.index(further), low:high]
+        shared = robot.moved_by[low] & robot.moved_by[high]
+        for one, joints in (
+            (nearer, robot.moved_by[low] & ~shared),
+            (further, robot.moved_by[high] & ~shared),
+        ):
+            if joints.any():
+                levers[k, joints] = radii[links.index(one), joints]
         base.append(low)
+        common.append(int(np.flatnonzero(shared).max(initial=-1)) + 1)
+        second.append(int(np.flatnonzero(robot.moved_by[high] & ~shared)[0]) if common[-1] != low else 0)
         others = range(0) if other is None else parts[nearer]
         of_parts.append((parts[further].start, parts[further].stop, others.start, others.stop))
     return Checks(
@@ -230,6 +240,8 @@ def _checks(robot: Robot) -> Checks:
         np.array(where, np.int64),
         np.array(of_parts, np.int64).reshape(-1, 4),
         np.array(base, np.int64),
+        np.array(common, np.int64),
+        np.array(second, np.int64),
         levers,
     )
 

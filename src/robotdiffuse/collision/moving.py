@@ -189,6 +189,7 @@ def links_of(robot: Robot) -> tuple[tuple[str, ...], Links]:
         bounds[i, 3] = far.max()
     links = Links(
         np.ascontiguousarray(robot.frame_offsets, np.float64),
+        robot.branching,
         np.array(robot.prismatic, np.bool_),
         np.array([whole.link_frame(link) for link in names], np.int64),
         bounds,

@@ -39,15 +39,18 @@ def tabulate(
     cells: sums of the bits of the pairs that may touch there. `arrays` are the RobotArrays without tables;
     `levers` how far a point of each group moves at most per unit of each joint [m].
     """
+    parents = np.arange(len(lower)) if arrays.parents is None else arrays.parents
     pairs_found, tables = arrays.pairs.copy(), [no_tables()]
     by_joint: dict[int, list[int]] = {}
     for p, (a, b) in enumerate(arrays.pairs[:, :2].tolist()):
         near, far = sorted((int(arrays.frame[a]), int(arrays.frame[b])))
         pairs = by_joint.setdefault(far - 1, [])
-        if far - near <= 2 and len(pairs) < MOST_PAIRS:
+        before = int(parents[far - 1])
+        if near in (before, parents[before - 1] if before else 0) and len(pairs) < MOST_PAIRS:
             pairs.append(p)
     for last, pairs in by_joint.items():
-        joints = np.array([max(last - 1, 0), last])
+        before = int(parents[last]) - 1
+        joints = np.array([before if before >= 0 else last, last])
         if not pairs or not (upper[joints] > lower[joints]).all():
             continue
         width = (upper[joints] - lower[joints]) / CELLS

@@ -339,7 +339,7 @@ def _reached(
     robot: Robot, link: str, T_base_link: Float[ndarray, "4 4"], near: Float[ndarray, "dof"]
 ) -> Float[ndarray, "dof"] | None:
     rng = np.random.default_rng(0)
-    found = inverse_kinematics(robot, link, T_base_link, 1, rng=rng, settings=QUICK, near=near)
+    found = inverse_kinematics(robot, link, T_base_link, 1, rng=rng, settings=QUICK, near=near, rest=near)
     return found[0] if len(found) else None
 
 

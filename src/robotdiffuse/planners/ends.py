@@ -274,7 +274,9 @@ def _pose_goals(
             break
     xyz = ", ".join(f"{value:.3f}" for value in goal.T_base_frame[:3, 3])
     if not collisions and call.judge.constraints is not None:
-        any_of_it = inverse_kinematics(robot, goal.frame, goal.T_base_frame, 1, rng=call.rng)
+        any_of_it = inverse_kinematics(
+            robot, goal.frame, goal.T_base_frame, 1, rng=call.rng, rest=call.problem.start
+        )
         wrong = call.judge.constraints.worst(any_of_it[0]) if len(any_of_it) else None
         if wrong is not None:
             what = f"no configuration was found for the pose of {goal.frame} at ({xyz}) m that keeps the"
@@ -300,17 +302,21 @@ def _by_turns(call: Call, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:
 def _reaching(
     call: Call, goal: PoseGoal, accept: Callable[[ndarray], ndarray] | None
 ) -> Float[ndarray, "k dof"]:
-    """Configurations that bring the link to the pose; where it has tolerances, to some poses within them."""
+    """Configurations that bring the link to the pose; where it has tolerances, to some poses within them.
+    Another arm stays where it starts."""
     robot, rng, constraints = call.problem.robot, call.rng, call.judge.constraints
     if constraints is not None:
         return _reaching_constrained(call, goal, constraints, accept)
+    rest = call.problem.start
     if not goal.tolerant:
-        return inverse_kinematics(robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=accept)
+        return inverse_kinematics(
+            robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=accept, rest=rest
+        )
     found = np.zeros((0, robot.dof))
     for i in range(POSES):
         T_base_frame = goal.draw(rng) if i else goal.T_base_frame
         few = inverse_kinematics(
-            robot, goal.frame, T_base_frame, OF_EACH, rng=rng, accept=accept, settings=SOME_ROUNDS
+            robot, goal.frame, T_base_frame, OF_EACH, rng=rng, accept=accept, settings=SOME_ROUNDS, rest=rest
         )
         found = np.concatenate([found, few])
         if len(found) >= GOAL_COUNT:
@@ -335,7 +341,14 @@ def _reaching_constrained(
     def reached(T_base_frame: ndarray, count: int, accept: Callable[[ndarray], ndarray] | None) -> ndarray:
         robot, settings = problem.robot, FEW_ROUNDS
         return inverse_kinematics(
-            robot, goal.frame, T_base_frame, count, rng=call.rng, accept=accept, settings=settings
+            robot,
+            goal.frame,
+            T_base_frame,
+            count,
+            rng=call.rng,
+            accept=accept,
+            settings=settings,
+            rest=problem.start,
         )
 
     if not goal.tolerant:

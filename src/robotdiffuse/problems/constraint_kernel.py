@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, damped_step, forward, pose_error
+from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step, forward, pose_error
 
 DISTANCE, CONE, TURN = 0, 1, 2
 ANGLE_WEIGHT = 0.3
@@ -30,12 +30,16 @@ DAMPING, MOST_STEP, ITERATIONS = 1e-5, 1.0, 30
 
 
 class Rows(NamedTuple):
-    """Constraints of one robot as rows, and its chain."""
+    """Constraints of one robot as rows, each with the chain of joints that move its frame."""
 
+    joints: np.ndarray
+    """[m, dof] the joints of the chain, `last` of them."""
     offsets: np.ndarray
-    """[dof, 4, 4] `Robot.frame_offsets`."""
+    """[m, dof, 4, 4] of these, of `Robot.frame_offsets`."""
     kinds: np.ndarray
-    """[dof] as in `robots.ik_kernel`."""
+    """[m, dof] of these, as in `robots.ik_kernel`."""
+    endless: np.ndarray
+    """[dof] whether a joint turns without limits."""
     lower: np.ndarray
     upper: np.ndarray
     what: np.ndarray
@@ -63,13 +67,16 @@ class Rows(NamedTuple):
     room: np.ndarray
     """[m] size of the range of values, for shares of it."""
     reach: np.ndarray
-    """[m, dof] bounds of the distance from each joint's axis to the frame's origin, 1 for sliding joints."""
+    """[m, dof] of the chain's joints, bounds of the distance from each one's axis to the frame's origin, 1
+    for sliding joints."""
 
 
 class Work(NamedTuple):
     """Memory."""
 
     T: np.ndarray
+    q: np.ndarray
+    """[dof] values of a chain's joints."""
     axes: np.ndarray
     origins: np.ndarray
     values: np.ndarray
@@ -94,6 +101,7 @@ def make_work(rows):
     most = 3 * m
     return Work(
         np.empty((3, 4)),
+        np.empty(dof),
         np.empty((dof, 3)),
         np.empty((dof, 3)),
         np.empty((2, m)),
@@ -114,7 +122,11 @@ def make_work(rows):
 @njit(cache=True)
 def _pose(rows, m, q, work):
     """The pose of the frame of row m into work.T, with the axes and origins of the joints before it."""
-    forward(q, rows.offsets, rows.tool[m], rows.kinds, rows.last[m], work.T, work.axes, work.origins)
+    for k in range(rows.last[m]):
+        work.q[k] = q[rows.joints[m, k]]
+    forward(
+        work.q, rows.offsets[m], rows.tool[m], rows.kinds[m], rows.last[m], work.T, work.axes, work.origins
+    )
 
 
 @njit(cache=True)
@@ -188,7 +200,7 @@ def evaluate(rows, q, end, work):
             for k in range(rows.last[m]):
                 velocity = work.y
                 velocity[0] = velocity[1] = velocity[2] = 0.0
-                _add_velocity(rows, k, 1.0, work, velocity)
+                _add_velocity(rows, m, k, 1.0, work, velocity)
                 work.levers[end, m, k] = np.sqrt(velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2)
 
 
@@ -212,16 +224,16 @@ def speeds(rows, m, q, rates):
         _pose(rows, m, q[i], work)
         total = np.zeros(3)
         for k in range(rows.last[m]):
-            _add_velocity(rows, k, rates[i, k], work, total)
+            _add_velocity(rows, m, k, rates[i, rows.joints[m, k]], work, total)
         out[i] = np.sqrt((total * total).sum())
     return out
 
 
 @njit(cache=True)
-def _add_velocity(rows, k, rate, work, total):
-    """Adds the velocity of the frame's origin by joint k."""
+def _add_velocity(rows, m, k, rate, work, total):
+    """Adds the velocity of the origin of the frame of row m by joint k of its chain."""
     a, b, c = work.axes[k, 0], work.axes[k, 1], work.axes[k, 2]
-    if rows.kinds[k] == PRISMATIC:
+    if rows.kinds[m, k] == PRISMATIC:
         x, y, z = a, b, c
     else:
         dx, dy = work.T[0, 3] - work.origins[k, 0], work.T[1, 3] - work.origins[k, 1]
@@ -240,20 +252,23 @@ def _unproved(rows, limits, a, b, share, first, second, work):
         u, v = work.values[first, m], work.values[second, m]
         turn = 0.0
         for k in range(rows.last[m]):
-            if rows.kinds[k] != PRISMATIC:
-                turn += share * abs(b[k] - a[k])
+            if rows.kinds[m, k] != PRISMATIC:
+                j = rows.joints[m, k]
+                turn += share * abs(b[j] - a[j])
         if rows.what[m] == CONE:
             if limits[m] < np.pi and min(np.cos(u), np.cos(v)) - turn * turn / 8 < np.cos(limits[m]):
                 return m
             continue
         beyond, before, travel, bend = 0.0, 0.0, 0.0, 0.0
         for k in range(rows.last[m]):
-            beyond += rows.reach[m, k] * share * abs(b[k] - a[k])
+            j = rows.joints[m, k]
+            beyond += rows.reach[m, k] * share * abs(b[j] - a[j])
         for k in range(rows.last[m]):
-            d = share * abs(b[k] - a[k])
+            j = rows.joints[m, k]
+            d = share * abs(b[j] - a[j])
             beyond -= rows.reach[m, k] * d
             lever = max(work.levers[first, m, k], work.levers[second, m, k])
-            if rows.kinds[k] != PRISMATIC:
+            if rows.kinds[m, k] != PRISMATIC:
                 lever += 0.5 * max(beyond, 0.0)
             travel += lever * d
             bend += lever * d * (d + 2 * before)
@@ -331,23 +346,24 @@ def _residuals(rows, limits, q, work):
                 work.e[count] = ANGLE_WEIGHT * (value - rows.inner[m])
             else:
                 work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * keep
-            for k in range(dof):
+            for j in range(dof):
+                work.J[count, j] = 0.0
+            for k in range(rows.last[m]):
                 entry = 0.0
-                if k < rows.last[m]:
-                    if rows.what[m] == DISTANCE:
-                        moved = work.y
-                        moved[0] = moved[1] = moved[2] = 0.0
-                        _add_velocity(rows, k, 1.0, work, moved)
-                        for i in range(3):
-                            entry += rows.place[m, i, r] * moved[i]
-                    elif rows.kinds[k] != PRISMATIC and rows.what[m] == TURN:
-                        entry = ANGLE_WEIGHT * work.axes[k, r]
-                    elif rows.kinds[k] != PRISMATIC and sine > 1e-9:
-                        for i in range(3):
-                            entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
-                    elif rows.kinds[k] != PRISMATIC:  # opposite: any way to turn
-                        entry = ANGLE_WEIGHT * work.axes[k, 0]
-                work.J[count, k] = entry
+                if rows.what[m] == DISTANCE:
+                    moved = work.y
+                    moved[0] = moved[1] = moved[2] = 0.0
+                    _add_velocity(rows, m, k, 1.0, work, moved)
+                    for i in range(3):
+                        entry += rows.place[m, i, r] * moved[i]
+                elif rows.kinds[m, k] != PRISMATIC and rows.what[m] == TURN:
+                    entry = ANGLE_WEIGHT * work.axes[k, r]
+                elif rows.kinds[m, k] != PRISMATIC and sine > 1e-9:
+                    for i in range(3):
+                        entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
+                elif rows.kinds[m, k] != PRISMATIC:  # opposite: any way to turn
+                    entry = ANGLE_WEIGHT * work.axes[k, 0]
+                work.J[count, rows.joints[m, k]] = entry
             count += 1
     return count
 
@@ -366,9 +382,7 @@ def project(rows, limits, q, work):
         again = False
         for k in range(dof):
             low, high = q[k] <= rows.lower[k], q[k] >= rows.upper[k]
-            if rows.kinds[k] != CONTINUOUS and (
-                (low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)
-            ):
+            if not rows.endless[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
                 work.held[k] = again = True
         if again:
             damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
@@ -378,6 +392,6 @@ def project(rows, limits, q, work):
             return False
         for k in range(dof):
             q[k] += scale * work.step[k]
-            if rows.kinds[k] != CONTINUOUS:
+            if not rows.endless[k]:
                 q[k] = min(max(q[k], rows.lower[k]), rows.upper[k])
     return _residuals(rows, limits, q, work) == 0

@@ -241,15 +241,21 @@ def _rotation_vector(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
 
 def _arrays(robot: Robot, owners: list[Constraint], rows: list[_Row]) -> Rows:
     frames = [owner.frame for owner in owners]
-    last = [robot.link_frame(frame) for frame in frames]
+    chains = [robot.chain(frame) for frame in frames]
+    joints = np.zeros((len(chains), robot.dof), np.int64)
+    for row, chain in zip(joints, chains, strict=True):
+        row[: len(chain)] = chain
+    kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
     tools = [robot.T_frame_link(frame) for frame in frames]
     return Rows(
-        offsets=np.ascontiguousarray(robot.frame_offsets),
-        kinds=np.array([KINDS[joint.kind] for joint in robot.planned_joints]),
+        joints=joints,
+        offsets=robot.frame_offsets[joints],
+        kinds=kinds[joints],
+        endless=robot.continuous,
         lower=robot.lower,
         upper=robot.upper,
         what=np.array([row.what for row in rows]),
-        last=np.array(last),
+        last=np.array([len(chain) for chain in chains]),
         again=np.array([False, *(a == b for a, b in pairwise(frames))]),
         tool=np.stack(tools),
         place=np.stack([row.place for row in rows]),
@@ -260,20 +266,20 @@ def _arrays(robot: Robot, owners: list[Constraint], rows: list[_Row]) -> Rows:
         limit=np.array([row.limit for row in rows]),
         inner=np.array([INNER * row.limit for row in rows]),
         room=np.array([row.room for row in rows]),
-        reach=np.stack([_reach(robot, *chain) for chain in zip(last, tools, strict=True)]),
+        reach=np.stack([_reach(robot, frame) for frame in frames]),
     )
 
 
-def _reach(robot: Robot, last: int, tool: Float[ndarray, "4 4"]) -> Float[ndarray, "dof"]:
-    """Bounds of the distance from each joint's axis to a frame's origin [m]; 1 for prismatic joints, 0 for
-    joints behind the frame."""
-    out, length = np.zeros(robot.dof), float(np.linalg.norm(tool[:3, 3]))
-    for k in reversed(range(last)):
+def _reach(robot: Robot, frame: str) -> Float[ndarray, "dof"]:
+    """Bounds of the distance from the axis of each joint that moves a frame to its origin [m], in order; 1
+    for prismatic joints, 0 after the last one."""
+    out, length = np.zeros(robot.dof), float(np.linalg.norm(robot.T_frame_link(frame)[:3, 3]))
+    for i, k in reversed([*enumerate(robot.chain(frame))]):
         joint = robot.planned_joints[k]
         if robot.prismatic[k]:
-            out[k] = 1.0
+            out[i] = 1.0
             length += max(abs(joint.lower), abs(joint.upper)) + 1e-3
         else:
-            out[k] = length
+            out[i] = length
         length += float(np.linalg.norm(robot.frame_offsets[k, :3, 3]))
     return out

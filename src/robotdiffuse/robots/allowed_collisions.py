@@ -153,7 +153,7 @@ def _own_between(robot: Robot, a: str, b: str) -> list[Joint] | None:
     def own(link: str) -> bool:
         """What its links carry is the arm's own too, as the bellows of a lift; but for the last one's."""
         moving = [joint for joint in above[link] if joint.kind in MOVING_KINDS][:1]
-        tool = robot.link_frame(link) == robot.dof and above[link][:1] != moving
+        tool = robot.at_end(link) and above[link][:1] != moving
         return not tool and all(joint in robot.planned_joints for joint in moving)
 
     above = {link: joints_above(link) for link in (a, b)}

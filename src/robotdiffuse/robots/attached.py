@@ -125,7 +125,8 @@ def _attached(robot: Robot, key: _Key) -> Robot:
     )
     has = {body.name: geometry} if body.shapes else {}
     # the tip is what goals and pictures are about; a tool on another branch than the tip's is not it
-    at_end = body.tool and robot.link_frame(body.link) == robot.link_frame(robot.tip) == robot.dof
+    frame = robot.link_frame(body.link) if body.tool and robot.at_end(body.link) else -1
+    tip, *others = [body.name if robot.link_frame(tip) == frame else tip for tip in robot.tips]
     return replace(
         robot,
         joints=(*robot.joints, joint),
@@ -133,7 +134,8 @@ def _attached(robot: Robot, key: _Key) -> Robot:
         meshes=robot.meshes | {name: of.meshes for name, of in has.items()},
         allowed_collisions=robot.allowed_collisions
         | {frozenset((body.name, link)) for link in body.touch_links},
-        tip=body.name if at_end else robot.tip,
+        tip=tip,
+        other_tips=tuple(others),
         attached=(*robot.attached, body),
         bare=robot.arm,
     )

@@ -88,7 +88,7 @@ def _check_tree(robot: Robot) -> None:
                 raise ValueError(f"joint {name} mimics itself")
             seen.add(name)
             name = leaders[name]
-    if robot.tip not in links or not {*robot.meshes} <= links:
+    if not {*robot.tips, *robot.meshes} <= links:
         raise ValueError("the tip or meshes of an unknown link")
     if any((rows[:, 3] <= 0).any() for rows in robot.spheres.values() if len(rows)):
         raise ValueError("spheres without a size")
@@ -109,6 +109,7 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
         "link's frame; inertias mass x y z of its centre xx xy xz yy yz zz about it, along the link's axes",
         "base": robot.base,
         "tip": robot.tip,
+        **({"other_tips": list(robot.other_tips)} if robot.other_tips else {}),
         "root": robot.root or robot.base,
         "above": {link: _pose_to_json(T_base_link) for link, T_base_link in robot.above.items()},
         "locked": robot.locked,
@@ -181,6 +182,7 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
         name=str(data["name"]),
         base=str(data["base"]),
         tip=str(data["tip"]),
+        other_tips=tuple(map(str, data.get("other_tips", ()))),
         joints=tuple(_joint_from_json(joint) for joint in data["joints"]),
         spheres={str(link): _array(rows, 4, f"spheres of {link}") for link, rows in data["spheres"].items()},
         meshes=meshes,

@@ -23,7 +23,7 @@ def robot_fingerprint(robot: Robot) -> str:
             rounded = np.round(np.asarray(values, np.float64), DIGITS) + 0.0  # no negative zeros
             digest.update(str(rounded.shape).encode() + rounded.tobytes())
 
-    add([robot.base, robot.tip])
+    add([robot.base, *robot.tips])
     for joint in robot.joints:
         limits = [getattr(joint, name) for name in LIMITS]
         add([joint.name, joint.kind, joint.parent, joint.child], joint.T_parent_joint, joint.axis, limits)

@@ -17,8 +17,8 @@ class ForwardKinematics:
     dtype and device given here, and so are the results. Every call raises InputError if the last axis of q
     is not as long as the robot has planned joints, or if the robot does not have the link.
 
-    Each step is T[j + 1] = T[j] @ (C + cos(q) A + sin(q) B) with constant A, B and C, so it takes one small
-    matrix product and two multiply-adds over the batch.
+    Each step is T[j + 1] = T[parents[j]] @ (C + cos(q) A + sin(q) B) with constant A, B and C, so it takes
+    one small matrix product and two multiply-adds over the batch.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class ForwardKinematics:
         p_base_link = T[..., frame, :3, :] @ self._T_frame_link[self.robot.link_names.index(link), :, 3]
         columns = []
         for j in range(self.robot.dof):
-            if j >= frame:
+            if not self.robot.moved_by[frame, j]:
                 columns.append(torch.zeros((*T.shape[:-3], 6), dtype=self.dtype, device=self.device))
                 continue
             axis = T[..., j + 1, :3, 2]
@@ -88,6 +88,7 @@ class ForwardKinematics:
         T = torch.eye(4, dtype=self.dtype, device=self.device)[:3, :, None].expand(3, 4, q.shape[1])
         frames = [T]
         for j in range(last):
+            T = frames[self.robot.parents[j]]
             parts = self._steps[j] @ T
             if self.robot.prismatic[j]:
                 T = torch.addcmul(parts[:, :4], q[j], parts[:, 4:])

@@ -1,4 +1,4 @@
-"""Which joints of a URDF's tree are an arm: chains that end where a gripper or a hand begins."""
+"""Which joints of a URDF's tree are an arm: chains that end where a gripper or a hand begins; or several."""
 
 import re
 from dataclasses import dataclass
@@ -11,6 +11,8 @@ from robotdiffuse.robots.srdf import Srdf
 
 GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
 """In the name of a joint: it is a gripper's, if few joints follow it."""
+BOTH, ALL = "both", "all"
+"""Groups of all arms of a robot: of two, and of any number."""
 ENDINGS = "_-/0123456789 "
 """Of what the names of an arm's joints have in common."""
 PINCH, GRASP = 2, 3
@@ -106,11 +108,12 @@ class JointTree:
 
 def planned_joints(
     file: Path, base: str, joints: list[Joint], tip: str | None, group: str | None, srdf: Srdf | None
-) -> tuple[set[str], str]:
-    """Names of the joints that are planned if they are not locked, and the tip.
+) -> tuple[set[str], list[str]]:
+    """Names of the joints that are planned if they are not locked, and the tips: several of a group that is a
+    tree, as two arms are.
 
     `joints` are all below the base, parents before children. Raises InputError for an unknown tip or group, a
-    group that is no chain, and several arms of which none is chosen.
+    group of joints that do not all lead to the tip that is named, and several arms of which none is chosen.
     """
     above = {joint.child: joint for joint in joints}
     if tip is not None and tip not in (base, *above):
@@ -120,23 +123,37 @@ def planned_joints(
         chosen = [joint.name for joint in srdf.joints(group, tuple(joints))]
         if not chosen:
             raise InputError(f"{srdf.path}: group {group} has no movable joint below {base}")
-        last = next(joint for joint in joints if joint.name == chosen[-1])
-        tip = tip or srdf.tip(group, tuple(joints)) or last.child
+        tips = _ends(chosen, above, srdf.tips(group)) if tip is None else [tip]
     elif group is not None or tip is None:
         arms = JointTree(base, joints).arms()
         groups = [] if srdf is None else list(srdf.groups)
-        arm = _one_arm(file, arms, groups) if group is None else _named_arm(file, arms, group, groups)
-        tip = tip or (base if arm is None else arm.tip)
-    leading = [joint for joint in chain(above, tip) if joint.kind in MOVING_KINDS]
+        found = _one_arm(file, arms, groups) if group is None else _named_arms(file, arms, group, groups)
+        tips = [tip] if tip else [arm.tip for arm in found] or [base]
+    else:
+        tips = [tip]
+    leading = [joint for end in tips for joint in chain(above, end) if joint.kind in MOVING_KINDS]
     off = [name for name in chosen or () if name not in {joint.name for joint in leading}]
     if off:
         raise InputError(
-            f"{file}: group {group} is no single chain: {', '.join(off)} do not lead to {tip}; choose a "
+            f"{file}: {', '.join(off)} of group {group} do not lead to {tip}; leave out --tip, or choose a "
             f"group of one arm"
         )
     passive = frozenset() if srdf is None else srdf.passive
     names = {joint.name for joint in leading if joint.mimic is None and joint.name not in passive}
-    return names if chosen is None else names & {*chosen}, tip
+    return names if chosen is None else names & {*chosen}, tips
+
+
+def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> list[str]:
+    """Where a group's joints end: at the tips of the chains that it is written as, else at last links."""
+    last = {joint.child: joint.child for joint in above.values() if joint.name in chosen}
+    for link in [*last]:
+        for joint in chain(above, link)[:-1]:
+            last.pop(joint.child, None)
+    for tip in written:
+        on_way = [joint.child for joint in chain(above, tip) if joint.child in last]
+        if on_way:
+            last[on_way[-1]] = tip
+    return list(last.values())
 
 
 def passive_notes(srdf: Srdf | None, joints: list[Joint]) -> list[str]:
@@ -164,33 +181,42 @@ def refuse_linkages(file: Path, robot: Robot) -> None:
             leader = by_name[leader.mimic.joint]
         if joint.mimic is None or leader.name in robot.locked:
             continue
-        if any(joint in chain(above, link) for link in (*robot.meshes, robot.tip)):
+        if any(joint in chain(above, link) for link in (*robot.meshes, *robot.tips)):
             raise InputError(
                 f"{file}: joint {joint.name} follows {leader.name}, which is planned; linkages are not "
                 f"supported: hold it with --lock {leader.name}=VALUE, or end the arm above it with --tip"
             )
 
 
-def _one_arm(file: Path, arms: list[Arm], groups: list[str]) -> Arm | None:
-    """The only arm of a robot, None if it has none; InputError, which lists them, if there are several.
+def _one_arm(file: Path, arms: list[Arm], groups: list[str]) -> list[Arm]:
+    """The only arm of a robot, if it has any; InputError, which lists them, if there are several.
 
     `groups` are names that may be chosen besides, those of its SRDF.
     """
     if len(arms) < 2:
-        return arms[0] if arms else None
+        return arms
     raise InputError(
-        f"{file} has {len(arms)} arms: {_listed(arms)}; choose one: robotdiffuse robot add {file.name} "
-        f"--group {_names_of(arms)[0]}" + (f" (groups of its SRDF: {', '.join(groups)})" if groups else "")
+        f"{file} has {len(arms)} arms: {_listed(arms)}; choose one, or {_together(arms)} as one robot: "
+        f"robotdiffuse robot add {file.name} --group {_names_of(arms)[0]}"
+        + (f" (groups of its SRDF: {', '.join(groups)})" if groups else "")
     )
 
 
-def _named_arm(file: Path, arms: list[Arm], name: str, groups: list[str]) -> Arm:
-    """The arm that a name of `_names_of` or a tip stands for; InputError, which lists them, for others."""
+def _named_arms(file: Path, arms: list[Arm], name: str, groups: list[str]) -> list[Arm]:
+    """The arm that a name of `_names_of` or a tip stands for, or all; InputError, which lists them, for
+    others."""
     names = _names_of(arms)
     chosen = [arm for arm, its in zip(arms, names, strict=True) if name in (its, arm.tip)]
-    if not chosen:
-        raise unknown_name(f"group of {file}", name, [*names, *groups])
-    return chosen[0]
+    if chosen:
+        return chosen[:1]
+    together = {ALL, _together(arms)} if len(arms) > 1 else set[str]()
+    if name in together:
+        return arms
+    raise unknown_name(f"group of {file}", name, [*names, *sorted(together), *groups])
+
+
+def _together(arms: list[Arm]) -> str:
+    return BOTH if len(arms) == 2 else ALL
 
 
 def _names_of(arms: list[Arm]) -> list[str]:

@@ -63,6 +63,7 @@ def inverse_kinematics(
     accept: Callable[[Float[ndarray, "n dof"]], Bool[ndarray, "n"]] | None = None,
     settings: InverseKinematicsSettings | None = None,
     near: Float[ndarray, "dof"] | None = None,
+    rest: Float[ndarray, "dof"] | None = None,
 ) -> Float[ndarray, "k dof"]:
     """Up to `count` distinct configurations that bring link `frame` to the pose, inside the joint limits.
 
@@ -71,7 +72,8 @@ def inverse_kinematics(
     values. The result is empty if the pose was not reached, and depends on nothing but the arguments and the
     state of `rng`. `accept` is called with batches of solutions, e.g. to keep those free of collision; what
     it refuses does not stop a solution nearby from being tried. `near` is the seed that is tried first: for a
-    pose that moves by little, the first solution does too.
+    pose that moves by little, the first solution does too. `rest` says what joints that are neither before
+    nor behind the link keep, those of another arm; without it they have random values as well.
 
     Raises InputError for an unknown link, one that no planned joint moves, a count below 1, or a matrix that
     is no finite rigid transform.
@@ -86,28 +88,32 @@ def inverse_kinematics(
     lower, upper = robot.lower + settings.limit_margin, robot.upper - settings.limit_margin
     tool = np.ascontiguousarray(robot.T_frame_link(frame))
     accepted = np.zeros((0, robot.dof))
-    distance = np.linalg.norm(T_base_frame[:3, 3] - robot.frame_offsets[0, :3, 3])
-    if distance > _longest_reach(robot, last, tool):
+    chain = list(robot.chain(frame))
+    distance = np.linalg.norm(T_base_frame[:3, 3] - robot.frame_offsets[chain[0], :3, 3])
+    if distance > _longest_reach(robot, chain, tool):
         return accepted
     target = np.array(T_base_frame, dtype=np.float64)
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
+    arm = np.flatnonzero(~beside(robot, frame))
+    chain_offsets = robot.frame_offsets[arm]
     idle = 0
     for i in range(settings.max_rounds):
         seeds = rng.uniform(lower, upper, (settings.seeds_per_round, robot.dof))
         if i == 0 and near is not None:
             seeds[0] = np.clip(near, lower, upper)
-        before = len(accepted)
+        others = seeds[0] if rest is None else rest
+        seeds, before = np.ascontiguousarray(seeds[:, arm]), len(accepted)
         while len(seeds) and len(accepted) < count:
             new, used = solve_seeds(
                 seeds,
-                accepted,
+                np.ascontiguousarray(accepted[:, arm]),
                 count - len(accepted),
-                robot.frame_offsets,
+                chain_offsets,
                 tool,
-                kinds,
-                last,
-                lower,
-                upper,
+                kinds[arm],
+                len(chain),
+                lower[arm],
+                upper[arm],
                 target,
                 settings.position_only,
                 settings.rotation_weight,
@@ -117,6 +123,9 @@ def inverse_kinematics(
                 settings.min_distance,
             )
             seeds = seeds[used:]
+            if len(arm) < robot.dof:
+                found, new = new, np.tile(others, (len(new), 1))
+                new[:, arm] = found
             if len(new):
                 accepted = np.concatenate([accepted, new if accept is None else new[accept(new)]])
         idle = 0 if len(accepted) > before else idle + 1
@@ -125,10 +134,20 @@ def inverse_kinematics(
     return accepted
 
 
-def _longest_reach(robot: Robot, last: int, tool: Float[ndarray, "4 4"]) -> float:
+def beside(robot: Robot, link: str) -> Bool[ndarray, "dof"]:
+    """The planned joints that are neither before nor behind a link: those of another arm."""
+    frame = robot.link_frame(link)
+    before = robot.moved_by[frame]
+    behind = robot.moved_by[1:, frame - 1] if frame else np.ones(robot.dof, bool)
+    return ~(before | behind)
+
+
+def _longest_reach(robot: Robot, chain: list[int], tool: Float[ndarray, "4 4"]) -> float:
     """Bound on the tool's distance from the first joint's origin [m], over all configurations."""
-    lengths = np.linalg.norm(robot.frame_offsets[1:last, :3, 3], axis=1).sum() + np.linalg.norm(tool[:3, 3])
-    travel = np.maximum(abs(robot.lower), abs(robot.upper))[:last] @ np.array(robot.prismatic[:last], float)
+    lengths = np.linalg.norm(robot.frame_offsets[chain[1:], :3, 3], axis=1).sum()
+    lengths += np.linalg.norm(tool[:3, 3])
+    slides = np.array(robot.prismatic, float)[chain]
+    travel = np.maximum(abs(robot.lower), abs(robot.upper))[chain] @ slides
     return float(lengths + travel) + 1e-6
 
 

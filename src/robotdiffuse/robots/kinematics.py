@@ -13,7 +13,7 @@ Z = np.array([0.0, 0.0, 1.0])
 def link_pose(robot: Robot, q: Float[ndarray, "dof"], link: str) -> Float[ndarray, "4 4"]:
     """T_base_link at one configuration, in NumPy; InputError for an unknown link."""
     T = np.eye(4)
-    for j in range(robot.link_frame(link)):
+    for j in robot.chain(link):
         T = T @ robot.frame_offsets[j] @ _motion(robot, j, q[j])
     return T @ robot.T_frame_link(link)
 
@@ -25,7 +25,7 @@ def _motion(robot: Robot, j: int, q: float) -> Float[ndarray, "4 4"]:
 def link_origins(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 3"]:
     """Where a link's origin is at many configurations [m]; InputError for an unknown link."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    for j in range(robot.link_frame(link)):
+    for j in robot.chain(link):
         motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
         if robot.prismatic[j]:
             motion[:, 2, 3] = q[:, j]
@@ -50,9 +50,9 @@ def _spheres_by_frame(robot: Robot) -> list[Float[ndarray, "n 4"]]:
 
 def placed_spheres(robot: Robot, q: Float[ndarray, "dof"]) -> Float[ndarray, "n 4"]:
     """The collision spheres at one configuration, x y z radius in the base frame [m]."""
-    parts, T = [], np.eye(4)
-    for j, spheres in enumerate(_spheres_by_frame(robot)):
-        if j:
-            T = T @ robot.frame_offsets[j - 1] @ _motion(robot, j - 1, q[j - 1])
+    parts, frames = [], [np.eye(4)]
+    for j, parent in enumerate(robot.parents):
+        frames.append(frames[parent] @ robot.frame_offsets[j] @ _motion(robot, j, q[j]))
+    for T, spheres in zip(frames, _spheres_by_frame(robot), strict=True):
         parts.append(np.column_stack([spheres[:, :3] @ T[:3, :3].T + T[:3, 3], spheres[:, 3]]))
     return np.concatenate(parts)

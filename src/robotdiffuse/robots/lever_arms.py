@@ -49,7 +49,7 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
             centers = spheres[:, :3] @ T[:3, :3].T + T[:3, 3]
             support[i] = (directions @ centers.T + spheres[:, 3]).max(-1)
             farthest[i] = (np.linalg.norm(centers, axis=1) + spheres[:, 3]).max()
-        moved = np.flatnonzero(frames > j)
+        moved = np.flatnonzero(robot.moved_by[frames, j])
         if not len(moved):
             continue
         joint = robot.planned_joints[j]

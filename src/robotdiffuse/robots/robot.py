@@ -1,4 +1,5 @@
-"""Robot: a serial arm as plain data, in the form that kinematics and collision checking share."""
+"""Robot: an arm, or several on one body, as plain data, in the form that kinematics and collision checking
+share."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -6,7 +7,7 @@ from functools import cached_property, lru_cache, wraps
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.checks import LARGEST
@@ -71,16 +72,19 @@ class Joint:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Robot:
-    """A serial arm: the joints between base and tip that are not locked are planned.
+    """A serial arm: the joints between base and tip that are not locked are planned. Or a tree of them: those
+    between the base and any of several tips, as of two arms on one torso.
 
     Frames: frame 0 is the base link; frame j + 1 moves with planned joint j, and
-    T_base_frame[j + 1] = T_base_frame[j] @ frame_offsets[j] @ M(q_j), where M turns about z, or slides
-    along z for a prismatic joint. Every link is rigidly fixed to one frame.
+    T_base_frame[j + 1] = T_base_frame[parents[j]] @ frame_offsets[j] @ M(q_j), where M turns about z, or
+    slides along z for a prismatic joint. Of a chain, parents[j] is j. Every link is rigidly fixed to one
+    frame.
     """
 
     name: str
     base: str
     tip: str
+    """What goals and pictures are about where they name no link; the first of `tips`."""
     joints: tuple[Joint, ...]
     """All joints of the tree below the base, parents before children."""
     spheres: dict[str, Float[ndarray, "n 4"]] = field(default_factory=dict)
@@ -108,6 +112,8 @@ class Robot:
     """The robot without these; None if there are none. See `arm`."""
     inertias: dict[str, Inertia] = field(default_factory=dict)
     """Of the links whose URDF gives them."""
+    other_tips: tuple[str, ...] = ()
+    """Where further arms end whose joints are planned too."""
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:
@@ -127,16 +133,28 @@ class Robot:
                 found[joint.child] = found[joint.parent] @ joint.T_parent_joint
         return found
 
+    @property
+    def tips(self) -> tuple[str, ...]:
+        return (self.tip, *self.other_tips)
+
     @cached_property
     def planned_joints(self) -> tuple[Joint, ...]:
-        """Movable, unlocked joints on the chain from base to tip, in order."""
+        """Movable, unlocked joints between the base and the tips: depth first, parents before children."""
         by_child = {joint.child: joint for joint in self.joints}
-        chain: list[Joint] = []
-        link = self.tip
-        while link != self.base:
-            chain.append(by_child[link])
-            link = by_child[link].parent
-        return tuple(j for j in reversed(chain) if j.kind in MOVING_KINDS and j.name not in self.locked)
+        chains: list[list[Joint]] = []
+        for link in self.tips:
+            chain: list[Joint] = []
+            while link != self.base:
+                chain.append(by_child[link])
+                link = by_child[link].parent
+            chains.append(chain[::-1])
+        first: dict[str, int] = {}
+        for i, chain in enumerate(chains):
+            for joint in chain:
+                first.setdefault(joint.name, i)
+        chains.sort(key=lambda chain: [first[joint.name] for joint in chain])
+        ordered = {joint.name: joint for chain in chains for joint in chain}.values()
+        return tuple(j for j in ordered if j.kind in MOVING_KINDS and j.name not in self.locked)
 
     @cached_property
     def joint_names(self) -> tuple[str, ...]:
@@ -215,24 +233,54 @@ class Robot:
         return (self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool)
 
     @cached_property
-    def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], list[ndarray]]:
+    def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], ndarray, ndarray]:
         links: dict[str, tuple[int, ndarray]] = {self.base: (0, np.eye(4))}
-        offsets: list[ndarray] = []
-        planned = {joint.name for joint in self.planned_joints}
+        offsets, parents = np.zeros((self.dof, 4, 4)), np.zeros(self.dof, np.int64)
+        planned = {joint.name: j for j, joint in enumerate(self.planned_joints)}
         for joint in self.joints:
             frame, T_frame_parent = links[joint.parent]
             if joint.name in planned:
+                j = planned[joint.name]
                 T_joint_frame = transform(np.zeros(3), rotation_z_to(joint.axis))
-                offsets.append(T_frame_parent @ joint.T_parent_joint @ T_joint_frame)
-                links[joint.child] = (len(offsets), inverse(T_joint_frame))
+                offsets[j] = T_frame_parent @ joint.T_parent_joint @ T_joint_frame
+                parents[j] = frame
+                links[joint.child] = (j + 1, inverse(T_joint_frame))
             else:
                 T_joint_child = joint.motion(self.locked.get(joint.name, 0.0))
                 links[joint.child] = (frame, T_frame_parent @ joint.T_parent_joint @ T_joint_child)
-        return links, offsets
+        return links, offsets, parents
 
     @cached_property
     def frame_offsets(self) -> Float[ndarray, "dof 4 4"]:
-        return np.stack(self._frames[1]) if self._frames[1] else np.zeros((0, 4, 4))
+        return self._frames[1]
+
+    @cached_property
+    def parents(self) -> Int[ndarray, "dof"]:
+        """The frame that each planned joint hangs from: that of the joint before it, in a chain."""
+        return self._frames[2]
+
+    @cached_property
+    def branching(self) -> Int[ndarray, "dof"] | None:
+        """The same for compiled code: None of a chain, where each planned joint moves all that come after."""
+        return None if (self.parents == np.arange(self.dof)).all() else self.parents
+
+    @cached_property
+    def moved_by(self) -> Bool[ndarray, "frames dof"]:
+        """Which planned joints move each frame."""
+        rows = np.zeros((self.dof + 1, self.dof), dtype=bool)
+        for j, parent in enumerate(self.parents):
+            rows[j + 1] = rows[parent]
+            rows[j + 1, j] = True
+        return rows
+
+    def at_end(self, link: str) -> bool:
+        """Whether planned joints move a link and none comes behind it."""
+        frame = self.link_frame(link)
+        return frame > 0 and not self.moved_by[frame + 1 :, frame - 1].any()
+
+    def chain(self, link: str) -> tuple[int, ...]:
+        """The planned joints that move a link, from the base on."""
+        return tuple(np.flatnonzero(self.moved_by[self.link_frame(link)]).tolist())
 
     def link_frame(self, link: str) -> int:
         """Index of the frame that the link is fixed to: 0 for the base, j + 1 behind planned joint j."""
@@ -348,7 +396,7 @@ class Robot:
         held = ", ".join(f"{name} = {value:g}" for name, value in list(self.locked.items())[:6])
         more = f" and {len(self.locked) - 6} more" if len(self.locked) > 6 else ""
         lines = [
-            f"Robot {self.name!r}: {self.dof} planned joints from {self.base} to {self.tip}",
+            f"Robot {self.name!r}: {self.dof} planned joints from {self.base} to {' and '.join(self.tips)}",
             f"  joints  {joints}",
             f"  lower   {row(self.lower)}",
             f"  upper   {row(self.upper)}",

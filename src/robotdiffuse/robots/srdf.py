@@ -40,11 +40,10 @@ class Srdf:
         named = self._named(group, {joint.child: joint for joint in joints}, ())
         return [joint for joint in joints if joint.name in named and joint.kind in MOVING_KINDS]
 
-    def tip(self, group: str, joints: tuple[Joint, ...]) -> str | None:
-        """The tip of the only chain that the group is written as; None if it is written otherwise."""
-        chains = self.groups[group].chains
-        links = {joint.child for joint in joints}
-        return chains[0][1] if len(chains) == 1 and chains[0][1] in links else None
+    def tips(self, group: str) -> list[str]:
+        """The tips of the chains that a known group and its subgroups are written as."""
+        content = self.groups[group]
+        return [tip for _, tip in content.chains] + [tip for sub in content.groups for tip in self.tips(sub)]
 
     def _named(self, group: str, above: dict[str, Joint], within: tuple[str, ...]) -> set[str]:
         if group not in self.groups or group in within:

@@ -106,7 +106,8 @@ class UrdfTree:
 
         `base` is the root of the tree by default; where it stands in the root's frame is kept, for scenes
         that are given there, while links above it are left out. `group` names a group of the SRDF, or an arm
-        by what the names of its joints begin with; `tip` a link. Without both, the robot must have one arm:
+        by what the names of its joints begin with, or is "both" or "all"; `tip` a link. A group of several
+        chains, as of two arms, is one robot with several tips. Without both, the robot must have one arm:
         from the base as far as the link where a gripper or a hand begins (`robots.groups` tells how these are
         known), else to the deepest link. So it is panda_hand for a Panda with fingers.
 
@@ -126,12 +127,13 @@ class UrdfTree:
             raise unknown_name(f"base link in {self.path.name}", base, self.links)
         joints = self.below(base)
         names = [base, *(joint.child for joint in joints)]
-        planned, end = planned_joints(self.path, base, joints, tip, group, srdf)
+        planned, ends = planned_joints(self.path, base, joints, tip, group, srdf)
         meshes, inertias = self.geometry(names), self.inertias(names)
         robot = Robot(
             name=self.name,
             base=base,
-            tip=end,
+            tip=ends[0],
+            other_tips=tuple(ends[1:]),
             joints=tuple(joints),
             meshes={link: parts for link, parts in meshes.items() if parts},
             notes=(*self.notes, *passive_notes(srdf, joints)),
@@ -149,7 +151,7 @@ class UrdfTree:
         robot = replace(robot, locked=following(robot.joints, rest)).with_locked(locked or {})
         if robot.dof == 0:
             raise InputError(
-                f"{self.path}: no movable joint between {base} and {end}; choose another --base or --tip"
+                f"{self.path}: no movable joint between {base} and {ends[0]}; choose another --base or --tip"
             )
         refuse_linkages(self.path, robot)
         return robot

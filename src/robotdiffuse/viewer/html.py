@@ -81,6 +81,7 @@ def _page_data(
             "name": robot.name,
             "joints": list(robot.joint_names),
             "offsets": [_rounded(offset[:3].reshape(-1), 9) for offset in robot.frame_offsets],
+            "parents": robot.parents.tolist(),
             "prismatic": list(robot.prismatic),
             "frames": [_packed(surface) if len(surface.faces) else None for surface in surfaces],
             "spheres": _spheres(robot),

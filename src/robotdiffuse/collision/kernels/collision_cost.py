@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.distance import frames_of, placed, solid_distance
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
 from robotdiffuse.collision.kernels.simd import W, first_lane, greatest, lane, least, load, magnitude, root
@@ -51,8 +51,9 @@ def _push(wrench, x, y, z, fx, fy, fz):
 @allocation_free(forceinline=True)
 def _pull(robot, frames, frame, wrench, grad):
     """Takes what a wrench on a frame does to the joints before it from grad."""
-    for j in range(frame):
-        axis = frames[j + 1]
+    while frame > 0:
+        j = frame - 1
+        axis, frame = frames[j + 1], parent_of(robot.parents, j)
         ax, ay, az = axis[2], axis[5], axis[8]
         fx, fy, fz = wrench[0], wrench[1], wrench[2]
         if robot.offsets[j, 12] > _ZERO:

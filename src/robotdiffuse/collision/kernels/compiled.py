@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numba.core import event
+from numba.core import event, types
+from numba.extending import overload
 from numpy import ndarray
 
 
@@ -48,6 +49,17 @@ def allocation_free(
     options: dict[str, Any] = {"fastmath": fastmath, "inline": inline, "forceinline": forceinline}
     options |= {"cache": True, "_nrt": False}
     return njit(**options)
+
+
+def parent_of(parents, j):
+    """The frame that joint j hangs from. Code for chains, which have None, is compiled apart, so that they
+    lose nothing to trees."""
+    return j if parents is None else parents[j]
+
+
+@overload(parent_of, inline="always")
+def _parent_of(parents, j):
+    return (lambda parents, j: j) if parents is types.none else (lambda parents, j: parents[j])
 
 
 def random_state(seed: int, attempt: int = 0) -> ndarray:

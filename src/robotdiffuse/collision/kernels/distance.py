@@ -6,7 +6,7 @@ refinement, and the clearances that the denoiser sees.
 
 import numpy as np
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.point_grid import near_point
 
 CAP = np.float32(1.0)
@@ -22,7 +22,7 @@ def frames_of(robot, q, frames):
     frames[0, :] = _ZERO
     frames[0, 0] = frames[0, 4] = frames[0, 8] = _ONE
     for j in range(len(q)):
-        parent, child, offset = frames[j], frames[j + 1], robot.offsets[j]
+        parent, child, offset = frames[parent_of(robot.parents, j)], frames[j + 1], robot.offsets[j]
         c, s, slide = np.cos(q[j]), np.sin(q[j]), _ZERO
         if robot.offsets[j, 12] > _ZERO:
             c, s, slide = _ONE, _ZERO, q[j]

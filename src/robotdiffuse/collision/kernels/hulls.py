@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
 
 MOST_STEPS = 32
@@ -84,11 +85,13 @@ def make_posture(hulls, solids, dof):
 
 
 @njit(cache=True)
-def pose(offsets, slides, q, dq, posture):
-    """The frames at q and their twists along dq; offsets[dof, 4, 4] as in `Robot.frame_offsets`."""
+def pose(offsets, parents, slides, q, dq, posture):
+    """The frames at q and their twists along dq; offsets[dof, 4, 4] and parents[dof] as of `Robot`, the
+    latter None of a chain."""
     for j in range(len(q)):
-        child, before, twist = posture.frames[j + 1], posture.twists[j], posture.twists[j + 1]
-        step(posture.frames[j], offsets[j], slides[j], q[j], child)
+        parent = parent_of(parents, j)
+        child, before, twist = posture.frames[j + 1], posture.twists[parent], posture.twists[j + 1]
+        step(posture.frames[parent], offsets[j], slides[j], q[j], child)
         for r in range(3):
             a, b = (r + 1) % 3, (r + 2) % 3
             axis = child[r, 2] * dq[j]
@@ -186,9 +189,33 @@ def _support_of_solid(solids, o, posture, row):
 
 
 @njit(cache=True)
+def _least_along(hulls, p, base, sign, posture):
+    """Least height of a part along sign * points[0], at the two ends of the motion but for the remainder,
+    with velocities seen from frame `base`."""
+    n, T = posture.points[0], posture.frames[hulls.frame[p]]
+    twist, seen = posture.twists[hulls.frame[p]], posture.twists[base]
+    at_start, at_stop = np.inf, np.inf
+    for i in range(hulls.first[p], hulls.first[p + 1]):
+        x, y, z = (
+            placed(T, hulls.vertices[:, i], 0),
+            placed(T, hulls.vertices[:, i], 1),
+            placed(T, hulls.vertices[:, i], 2),
+        )
+        a, b, c = twist[0] - seen[0], twist[1] - seen[1], twist[2] - seen[2]
+        u = b * z - c * y + twist[3] - seen[3]
+        v = c * x - a * z + twist[4] - seen[4]
+        w = a * y - b * x + twist[5] - seen[5]
+        height = sign * (n[0] * x + n[1] * y + n[2] * z)
+        speed = sign * (n[0] * u + n[1] * v + n[2] * w)
+        at_start, at_stop = min(at_start, height - speed), min(at_stop, height + speed)
+    return at_start - hulls.rounding[p], at_stop - hulls.rounding[p]
+
+
+@njit(cache=True)
 def separation(hulls, p, solids, other, base, posture):
     """By how much the plane with the unit normal points[0] parts two bodies: in the middle, and along the
-    motion but for the remainder, seen from frame `base`. `other` below 0 stands for part -1 - other."""
+    motion but for the remainder, seen from frame `base`. `other` below 0 stands for part -1 - other, which
+    moves too if its frame is not `base`."""
     x, y, z = posture.points[0, 0], posture.points[0, 1], posture.points[0, 2]
     frame = hulls.frame[p]
     T, twist, seen = posture.frames[frame], posture.twists[frame], posture.twists[base]
@@ -220,6 +247,10 @@ def separation(hulls, p, solids, other, base, posture):
         reach = hulls.rounding[-1 - other]
     at = posture.points[2]
     reach += x * at[0] + y * at[1] + z * at[2]
+    if other < 0 and hulls.frame[-1 - other] != base:
+        start, stop = _least_along(hulls, p, base, 1.0, posture)
+        other_start, other_stop = _least_along(hulls, -1 - other, base, -1.0, posture)
+        return middle - reach - 1e-9, min(start + other_start, stop + other_stop) - 1e-9
     # a normal of length 1 + e errs by e times the extent; that is what float64 leaves
     return middle - reach - 1e-9, along - reach - 1e-9
 

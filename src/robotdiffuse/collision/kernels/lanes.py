@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.point_grid import far_from_points, near_points, touch_points
 from robotdiffuse.collision.kernels.simd import (
     W,
@@ -55,15 +55,16 @@ def _sine_of_turn(u):
 
 
 @allocation_free(forceinline=True)
-def _turn(frames, j, offset, q):
-    """Frame behind a revolute joint, in 16 lanes: frames[j + 1] = frames[j] @ offset @ Rz(q)."""
+def _turn(frames, parent, j, offset, q):
+    """Frame behind a revolute joint, in 16 lanes: frames[j + 1] = frames[parent] @ offset @ Rz(q)."""
     turns = load(q, j, 0) * _INV_TAU
     turns = turns - whole(turns + _HALF)
     far = magnitude(turns)
     c = _sine_of_turn(_QUARTER - far)
     s = with_sign(_sine_of_turn(_QUARTER - magnitude(far - _QUARTER)), turns)
     for k in range(3):
-        r0, r1, r2 = load(frames, j, 3 * k), load(frames, j, 3 * k + 1), load(frames, j, 3 * k + 2)
+        r0, r1 = load(frames, parent, 3 * k), load(frames, parent, 3 * k + 1)
+        r2 = load(frames, parent, 3 * k + 2)
         x = r0 * offset[0] + r1 * offset[3] + r2 * offset[6]
         y = r0 * offset[1] + r1 * offset[4] + r2 * offset[7]
         z = r0 * offset[2] + r1 * offset[5] + r2 * offset[8]
@@ -71,20 +72,21 @@ def _turn(frames, j, offset, q):
         store(frames, j + 1, 3 * k + 1, y * c - x * s)
         store(frames, j + 1, 3 * k + 2, z)
         p = r0 * offset[9] + r1 * offset[10] + r2 * offset[11]
-        store(frames, j + 1, 9 + k, p + load(frames, j, 9 + k))
+        store(frames, j + 1, 9 + k, p + load(frames, parent, 9 + k))
 
 
 @allocation_free(forceinline=True)
-def _slide(frames, j, offset, q):
-    """Frame behind a prismatic joint, in 16 lanes: frames[j + 1] = frames[j] @ offset @ Tz(q)."""
+def _slide(frames, parent, j, offset, q):
+    """Frame behind a prismatic joint, in 16 lanes: frames[j + 1] = frames[parent] @ offset @ Tz(q)."""
     for k in range(3):
-        r0, r1, r2 = load(frames, j, 3 * k), load(frames, j, 3 * k + 1), load(frames, j, 3 * k + 2)
+        r0, r1 = load(frames, parent, 3 * k), load(frames, parent, 3 * k + 1)
+        r2 = load(frames, parent, 3 * k + 2)
         z = r0 * offset[2] + r1 * offset[5] + r2 * offset[8]
         store(frames, j + 1, 3 * k, r0 * offset[0] + r1 * offset[3] + r2 * offset[6])
         store(frames, j + 1, 3 * k + 1, r0 * offset[1] + r1 * offset[4] + r2 * offset[7])
         store(frames, j + 1, 3 * k + 2, z)
         p = r0 * offset[9] + r1 * offset[10] + r2 * offset[11]
-        store(frames, j + 1, 9 + k, p + load(frames, j, 9 + k) + z * load(q, j, 0))
+        store(frames, j + 1, 9 + k, p + load(frames, parent, 9 + k) + z * load(q, j, 0))
 
 
 @allocation_free(forceinline=True)
@@ -112,9 +114,9 @@ def place_frames(robot, q, frames, centres):
     """Frames of 16 configurations, and the centres of the bounding spheres of all groups."""
     for j in range(len(robot.offsets)):
         if robot.offsets[j, 12] > _ZERO:
-            _slide(frames, j, robot.offsets[j], q)
+            _slide(frames, parent_of(robot.parents, j), j, robot.offsets[j], q)
         else:
-            _turn(frames, j, robot.offsets[j], q)
+            _turn(frames, parent_of(robot.parents, j), j, robot.offsets[j], q)
     for g in range(len(robot.frame)):
         place(frames, robot.frame[g], robot.bounds, g, centres, g)
 

@@ -4,12 +4,14 @@ obstacles."""
 import numpy as np
 from numba import njit
 
+from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
 
 
 @njit(cache=True)
-def forward(offsets, slides, q):
-    """T_base_frame [n, dof + 1, 4, 4] of q[n, dof], in float64; offsets[dof, 4, 4], slides[dof]."""
+def forward(offsets, parents, slides, q):
+    """T_base_frame [n, dof + 1, 4, 4] of q[n, dof], in float64; offsets[dof, 4, 4], parents[dof] or None of a
+    chain, slides[dof]."""
     n, dof = q.shape
     frames = np.zeros((n, dof + 1, 4, 4))
     for i in range(n):
@@ -17,7 +19,7 @@ def forward(offsets, slides, q):
             frames[i, 0, k, k] = 1.0
         for j in range(dof):
             frames[i, j + 1, 3, 3] = 1.0
-            step(frames[i, j], offsets[j], slides[j], q[i, j], frames[i, j + 1])
+            step(frames[i, parent_of(parents, j)], offsets[j], slides[j], q[i, j], frames[i, j + 1])
     return frames
 
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, step
 
 CAP = 1.0
@@ -24,6 +25,8 @@ class Links(NamedTuple):
 
     offsets: np.ndarray
     """[dof, 4, 4] `Robot.frame_offsets`"""
+    parents: np.ndarray | None
+    """[dof] `Robot.parents`; None of a chain."""
     slides: np.ndarray
     """[dof] whether the joint is prismatic."""
     frame: np.ndarray
@@ -162,7 +165,7 @@ def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
 @njit(cache=True)
 def _pose_arm(links, q, frames):
     for j in range(len(q)):
-        step(frames[j], links.offsets[j], links.slides[j], q[j], frames[j + 1])
+        step(frames[parent_of(links.parents, j)], links.offsets[j], links.slides[j], q[j], frames[j + 1])
 
 
 @njit(cache=True)

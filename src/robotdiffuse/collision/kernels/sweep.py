@@ -9,6 +9,9 @@ some t in [-1, 1] |d_j - t dq_j| <= e_j; on a straight line e is zero. Twice dif
 p by joints j <= k gives at most the distance L_k of the point from the axis of joint k, so
 
     p(q + d) = p(q) + t v + r,   v = J(q) dq,   |r| <= sum_k L_k (e_k + D_k (D_k / 2 + sum_{j<k} D_j)).
+
+Of two links on one chain, the further is seen from the nearer, so only the joints between them count. Of two
+on different arms, both are seen from where the arms part: the remainders of both add up.
 """
 
 from typing import NamedTuple
@@ -49,6 +52,8 @@ class Arm(NamedTuple):
     hulls: tuple
     offsets: np.ndarray
     """[dof, 4, 4] `Robot.frame_offsets`"""
+    parents: np.ndarray | None
+    """[dof] `Robot.parents`; None of a chain."""
     slides: np.ndarray
     """[dof] whether the joint is prismatic."""
 
@@ -64,9 +69,14 @@ class Checks(NamedTuple):
     """[checks, 4] from which part of the hulls on, up to which; and of the link that is further from the base
     in a pair: those of the nearer one."""
     base: np.ndarray
-    """[checks] the frame that the link's motion is seen from: the base, or that of the nearer link."""
+    """[checks] the frame of what the link is checked against: the base, or that of the nearer link."""
+    common: np.ndarray
+    """[checks] the frame that motion is seen from: `base`, or where the arms of two links part."""
+    second: np.ndarray
+    """[checks] of links on two arms, the first joint of the second arm; else 0."""
     levers: np.ndarray
-    """[checks, dof] motion bound of the link, seen from there, per unit of joint motion."""
+    """[checks, dof] motion bound of the link, or of either of two, seen from there, per unit of joint
+    motion."""
 
 
 class Motion(NamedTuple):
@@ -202,9 +212,11 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
 
 
 @njit(cache=True)
-def _remainder(lever, e, most):
+def _remainder(lever, second, e, most):
     total, before = 0.0, 0.0
     for k in range(len(lever)):
+        if k == second:
+            before = 0.0
         if lever[k] > 0:
             total += lever[k] * (e[k] + most[k] * (0.5 * most[k] + before))
             before += most[k]
@@ -228,7 +240,7 @@ def by_spheres(arm, scene, motion, checks, pieces, best, work):
                 _spread(motion, pieces.start[row], pieces.stop[row], q, dq, e, most, scratch)
                 for c in range(count):
                     if pieces.undecided[row, c]:
-                        rest[row, c] = _remainder(checks.levers[c], e, most)
+                        rest[row, c] = _remainder(checks.levers[c], checks.second[c], e, most)
             for j in range(dof):
                 block[j, i], moves[j, i] = q[j], dq[j]
         place_motions(arm.spheres, block, moves, work)
@@ -281,7 +293,7 @@ def by_hulls(arm, solids, motion, checks, found, best, tightness, contact, postu
                 continue
             if not posed:
                 _spread(motion, found.pieces.start[row], found.pieces.stop[row], q, dq, e, most, scratch)
-                meshes.pose(arm.offsets, arm.slides, q, dq, posture)
+                meshes.pose(arm.offsets, arm.parents, arm.slides, q, dq, posture)
                 posed = True
             rest, kind, coarser = found.rest[row, c], checks.kind[c], found.clearance[row, c]
             clearance, lower, best[kind], coarse, touching = _parted(
@@ -307,7 +319,7 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     if less was measured, whether something is known by its bounds alone that are too near, and whether bodies
     touch or nearly."""
     against_scene = checks.kind[c] == SCENE
-    base, parts = checks.base[c], len(hulls.frame)
+    base, common, parts = checks.base[c], checks.common[c], len(hulls.frame)
     clearance, lower, coarse, touching = CAP, CAP, False, False
     others = range(len(solids.disc)) if against_scene else range(checks.parts[c, 2], checks.parts[c, 3])
     for p in range(checks.parts[c, 0], checks.parts[c, 1]):
@@ -325,7 +337,7 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
             elif along - rest < best:
                 other, slot = (o, parts + o) if against_scene else (-1 - o, o)
                 middle, along, measured = meshes.best_plane(
-                    hulls, p, solids, other, base, tightness * best + rest, posture.planes[p, slot], posture
+                    hulls, p, solids, other, common, tightness * best + rest, posture.planes[p, slot], posture
                 )
                 if measured and middle <= contact:
                     touching = True

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from robotdiffuse.collision.kernels.compiled import allocation_free
+from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.lane_clearance import (
     ClearanceWorkspace,
     count_obstacles,
@@ -108,7 +108,8 @@ def place_motions(robot, q, dq, work):
     work.at.placed[:] = False
     for j in range(len(robot.offsets)):
         slides = robot.offsets[j, 12] > _ZERO
-        _twist(work.twists[j], work.at.frames[j + 1], slides, dq[j], work.twists[j + 1])
+        parent = parent_of(robot.parents, j)
+        _twist(work.twists[parent], work.at.frames[j + 1], slides, dq[j], work.twists[j + 1])
 
 
 @allocation_free(inline="always")

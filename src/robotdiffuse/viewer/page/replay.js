@@ -16,7 +16,7 @@ function frames(q) {
   for (let j = 0; j < dof; j++) {
     const M = new THREE.Matrix4();
     if (data.robot.prismatic[j]) M.makeTranslation(0, 0, q[j]); else M.makeRotationZ(q[j]);
-    T.push(T[j].clone().multiply(offsets[j]).multiply(M));
+    T.push(T[data.robot.parents[j]].clone().multiply(offsets[j]).multiply(M));
   }
   return T;
 }
