@@ -1,0 +1,187 @@
+"""Two arms as one robot: which joints are planned, what a goal of one hand means, plans, proofs, tools."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from helpers.example_robots import example_robot
+from helpers.made_arms import chain, row, written
+from robotdiffuse.certificates.checker import check
+from robotdiffuse.cli import main
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.errors import InputError
+from robotdiffuse.robots.bundle import read_bundle, write_bundle
+from robotdiffuse.robots.covering import cover
+from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.srdf import read_srdf
+from robotdiffuse.robots.urdf import read_urdf
+
+PARTS = chain("base", ["waist"]), chain("waist_link", row("left_", 4)), chain("waist_link", row("right_", 4))
+
+
+@cache
+def two_arms() -> Robot:
+    """Boxes covered by spheres, on a torso that a planned joint turns."""
+    robot = example_robot("two_arms")
+    spheres = {link: np.concatenate([cover(part) for part in parts]) for link, parts in robot.meshes.items()}
+    beside = [("pedestal", "torso")]
+    for side in ("left", "right"):
+        limb = ("torso", *(f"{side}_{part}" for part in ("upper", "lower", "hand")))
+        beside += pairwise(limb)
+    return replace(robot, spheres=spheres, allowed_collisions=frozenset(map(frozenset, beside)))
+
+
+def test_both_arms_and_the_joint_that_they_share_are_planned(tmp_path: Path) -> None:
+    for group in ("both", "all"):
+        robot = read_urdf(written(tmp_path, *PARTS), group=group)
+        assert robot.joint_names == ("waist", *row("left_", 4), *row("right_", 4))
+        assert robot.tips == ("left_4_link", "right_4_link") and not robot.locked
+        assert robot.parents.tolist() == [0, 1, 2, 3, 4, 1, 6, 7, 8] and robot.branching is not None
+        assert robot.chain("right_2_link") == (0, 5, 6) and robot.at_end("left_4_link")
+    with pytest.raises(InputError, match="choose one, or both as one robot"):
+        read_urdf(written(tmp_path, *PARTS))
+    left = read_urdf(written(tmp_path, *PARTS), group="left")
+    assert left.branching is None and left.tips == ("left_4_link",)
+    held = robot.with_locked({name: 0.1 for name in row("right_", 4)})
+    assert held.joint_names == left.joint_names and held.branching is None
+
+
+def test_groups_of_an_srdf_may_have_several_chains(tmp_path: Path) -> None:
+    (tmp_path / "made.srdf").write_text(
+        """<robot name="made">
+          <group name="left"><chain base_link="base" tip_link="left_4_link"/></group>
+          <group name="right"><chain base_link="waist_link" tip_link="right_3_link"/></group>
+          <group name="both_arms"><group name="left"/><group name="right"/></group>
+          <group name="some"><joint name="right_2"/><joint name="left_1"/><joint name="left_3"/></group>
+        </robot>"""
+    )
+    srdf = read_srdf(tmp_path / "made.srdf")
+    robot = read_urdf(written(tmp_path, *PARTS), group="both_arms", srdf=srdf)
+    assert robot.joint_names == ("waist", *row("left_", 4), *row("right_", 3))
+    assert robot.tips == ("left_4_link", "right_3_link") and robot.locked == {"right_4": 0.0}
+    robot = read_urdf(written(tmp_path, *PARTS), group="some", srdf=srdf)
+    assert robot.joint_names == ("left_1", "left_3", "right_2") and robot.parents.tolist() == [0, 1, 0]
+    with pytest.raises(
+        InputError, match=r"right_1, right_2, right_3 of group both_arms do not lead to left_4_link"
+    ):
+        read_urdf(written(tmp_path, *PARTS), group="both_arms", srdf=srdf, tip="left_4_link")
+
+
+def test_files_keep_all_tips(tmp_path: Path) -> None:
+    robot = two_arms()
+    write_bundle(robot, tmp_path / "kept", {})
+    again = read_bundle(tmp_path / "kept")
+    assert again.tips == robot.tips and again.joint_names == robot.joint_names
+    assert robot_fingerprint(robot) != robot_fingerprint(replace(robot, other_tips=()))
+
+
+def test_spheres_parts_and_the_arms_of_one_robot_agree() -> None:
+    """What covering spheres call free is free by the parts; and Baxter's left arm is where it is alone."""
+    robot, rng = two_arms(), np.random.default_rng(0)
+    q = rng.uniform(robot.lower, robot.upper, (2000, robot.dof))
+    free, hits = CollisionChecker(robot, rd.Scene()).free(q), ExactCollision(robot, rd.Scene()).collides(q)
+    assert not (free & hits).any() and 0.2 < free.mean() < (~hits).mean()
+    both, left = rd.load_robot("baxter"), rd.load_robot("baxter_left")
+    assert both.dof == 14 and both.with_locked({n: 0.0 for n in both.joint_names if n[0] == "r"}).dof == 7
+    q = rng.uniform(both.lower, both.upper)
+    own = [both.joint_names.index(name) for name in left.joint_names]
+    np.testing.assert_allclose(link_pose(both, q, left.tip), link_pose(left, q[own], left.tip), atol=1e-12)
+
+
+def test_the_other_arm_keeps_its_values_in_inverse_kinematics() -> None:
+    robot, rng = two_arms(), np.random.default_rng(1)
+    q = rng.uniform(robot.lower, robot.upper)
+    T, rest = link_pose(robot, q, "right_lower"), rng.uniform(robot.lower, robot.upper)
+    found = inverse_kinematics(robot, "right_lower", T, 3, rng=rng, rest=rest)
+    assert len(found) and len(robot.chain("right_lower")) == 3
+    for one in found:
+        np.testing.assert_allclose(link_pose(robot, one, "right_lower"), T, atol=1e-5)
+        assert (one[1:4] == rest[1:4]).all()
+    assert len({*found[:, 6]}) == len(found)  # the joint behind the link is anywhere
+
+
+@pytest.mark.parametrize("planner", ["rrt_connect", "aorrtc", "robotdiffuse"])
+def test_planners_move_both_arms_past_each_other(planner: str) -> None:
+    robot = two_arms()
+    start, goal = _crossing(robot)
+    problem = rd.Problem(
+        robot=robot, scene=rd.Scene([rd.Sphere([0.45, 0.0, 0.75], 0.05)]), start=start, goal=goal
+    )
+    result = rd.load_planner(planner).plan(problem, time_limit=20.0, seed=0, until="first")
+    assert result.solved, result.reason
+    assert result.path is not None and rd.verify(problem, result.path).valid
+    steps = np.concatenate([np.linspace(a, b, 50) for a, b in pairwise(result.path.positions)])
+    assert not ExactCollision(robot, problem.scene).collides(steps).any()
+
+
+def _crossing(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
+    """Two free configurations between which the straight way is not."""
+    checker, rng = (
+        CollisionChecker(robot, rd.Scene([rd.Sphere([0.45, 0.0, 0.75], 0.05)])),
+        np.random.default_rng(3),
+    )
+    while True:
+        ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
+        way = np.linspace(*ends, 100)
+        if checker.free(ends).all() and not checker.free(way).all():
+            return ends[0], ends[1]
+
+
+def test_a_pose_of_one_hand_leaves_the_other_arm_where_it_starts() -> None:
+    robot, rng = two_arms(), np.random.default_rng(5)
+    checker = CollisionChecker(robot, rd.Scene())
+    free = [q for q in rng.uniform(robot.lower, robot.upper, (200, robot.dof)) if checker.free(q[None])[0]]
+    start, there = free[0], free[1].copy()
+    there[4:] = start[4:]  # left arm and waist elsewhere
+    goal = rd.PoseGoal("left_hand", link_pose(robot, there, "left_hand"))
+    problem = rd.Problem(robot=robot, scene=rd.Scene(), start=start, goal=goal)
+    result = rd.plan(problem, time_limit=20.0)
+    assert result.solved and result.path is not None
+    np.testing.assert_array_equal(result.path.positions[-1][4:], start[4:])
+
+
+def test_certificates_prove_motions_of_both_arms() -> None:
+    robot = two_arms()
+    start, goal = _crossing(robot)
+    problem = rd.Problem(
+        robot=robot, scene=rd.Scene([rd.Box([0.6, 0, -0.2], [0.2, 0.2, 0.1])]), start=start, goal=goal
+    )
+    result = rd.plan(problem, time_limit=20.0)
+    assert result.solved and result.path is not None
+    certificate = rd.certify(problem, result.path)
+    assert check(certificate, problem, result.path).valid
+
+
+def test_a_tool_on_the_second_hand_is_its_tip_and_is_checked() -> None:
+    robot = two_arms()
+    armed = robot.with_tool("right_hand", np.eye(4), [rd.Box([0.15, 0, 0], [0.2, 0.02, 0.02], name="blade")])
+    assert armed.tips == ("left_hand", "tool") and ("left_lower", "tool") in armed.checked_pairs()
+    assert robot.with_tool("left_hand", np.eye(4)).tips == ("tool", "right_hand")
+    assert robot.with_tool("torso", np.eye(4)).tips == robot.tips
+
+
+def test_added_planned_and_verified_from_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    wide = {"xyz": "0.12 0 0.12"}
+    parts = chain("base", row("left_", 4), **wide), chain("base", row("right_", 4), xyz="-0.12 0 0.12")
+    assert main(["robot", "add", str(written(tmp_path, *parts)), "--group", "both"]) == 0
+    assert "right_4_link" in capsys.readouterr().out
+    problem = tmp_path / "problem.yaml"
+    problem.write_text(
+        "robot: made\nscene: [{sphere: {center: [0, 0.4, 0.3], radius: 0.05}}]\n"
+        "start: [0, 0, 0, 0, 0, 0, 0, 0]\ngoal: {joints: [0.8, 0.4, 0.2, 0.1, -0.6, 0.5, 0.2, -0.3]}\n"
+    )
+    out = tmp_path / "result.json"
+    assert main(["plan", str(problem), "--planner", "rrt_connect", "--out", str(out)]) == 0
+    assert main(["verify", str(problem), str(out)]) == 0
