@@ -158,7 +158,7 @@ def test_certificates_prove_motions_of_both_arms() -> None:
     result = rd.plan(problem, time_limit=20.0)
     assert result.solved and result.path is not None
     certificate = rd.certify(problem, result.path)
-    assert check(certificate, problem, result.path).valid
+    assert check(certificate, problem).valid
 
 
 def test_a_tool_on_the_second_hand_is_its_tip_and_is_checked() -> None:
@@ -184,4 +184,4 @@ def test_added_planned_and_verified_from_the_command_line(
     )
     out = tmp_path / "result.json"
     assert main(["plan", str(problem), "--planner", "rrt_connect", "--out", str(out)]) == 0
-    assert main(["verify", str(problem), str(out)]) == 0
+    assert main(["verify", str(out)]) == 0

@@ -7,7 +7,7 @@ const duration = data.times[data.times.length - 1];
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
 const color = (rgb) => new THREE.Color().setRGB(rgb[0] / 255, rgb[1] / 255, rgb[2] / 255, THREE.SRGBColorSpace);
 
-// --- Kinematics: T[j + 1] = T[j] · offset[j] · (turn about, or slide along, z)
+// --- Kinematics: T[j + 1] = T[parents[j]] · offset[j] · (turn about, or slide along, z)
 
 const offsets = data.robot.offsets.map((m) => new THREE.Matrix4().set(...m, 0, 0, 0, 1));
 
