@@ -16,9 +16,9 @@ from robotdiffuse.scenes.scene import Scene
 
 
 def turns_about_vertical(robot: Robot) -> bool:
-    """Whether the first joint turns about the z axis of the base."""
+    """Whether the first joint turns about the z axis of the base, and all of the robot with it."""
     T_base_joint = robot.frame_offsets[0]
-    on_axis = np.allclose(T_base_joint[:2, 3], 0.0, atol=1e-6)
+    on_axis = np.allclose(T_base_joint[:2, 3], 0.0, atol=1e-6) and bool(robot.moved_by[1:, 0].all())
     return not robot.prismatic[0] and on_axis and bool(np.isclose(T_base_joint[2, 2], 1.0, atol=1e-9))
 
 

@@ -101,7 +101,6 @@ def inverse_kinematics(
         seeds = rng.uniform(lower, upper, (settings.seeds_per_round, robot.dof))
         if i == 0 and near is not None:
             seeds[0] = np.clip(near, lower, upper)
-        others = seeds[0] if rest is None else rest
         seeds, before = np.ascontiguousarray(seeds[:, arm]), len(accepted)
         while len(seeds) and len(accepted) < count:
             new, used = solve_seeds(
@@ -124,7 +123,8 @@ def inverse_kinematics(
             )
             seeds = seeds[used:]
             if len(arm) < robot.dof:
-                found, new = new, np.tile(others, (len(new), 1))
+                found, shape = new, (len(new), robot.dof)
+                new = rng.uniform(lower, upper, shape) if rest is None else np.tile(rest, (len(new), 1))
                 new[:, arm] = found
             if len(new):
                 accepted = np.concatenate([accepted, new if accept is None else new[accept(new)]])
