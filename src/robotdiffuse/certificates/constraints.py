@@ -98,11 +98,11 @@ def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
         if not isinstance(one, CartesianLine) or one.speed is None:
             continue
         postures = linkage.place(motion.positions)
-        level = int(linkage.levels[linkage.links.index(one.frame)])
+        joints = np.flatnonzero(linkage.moved[linkage.links.index(one.frame)])
         p = postures.T[:, linkage.links.index(one.frame), :3, 3]
-        rates = np.cross(postures.axes[:, :level], p[:, None] - postures.origins[:, :level])
-        rates[:, linkage.slides[:level]] = postures.axes[:, :level][:, linkage.slides[:level]]
-        speeds = np.linalg.norm((rates * motion.velocities[:, :level, None]).sum(axis=1), axis=1)
+        rates = np.cross(postures.axes[:, joints], p[:, None] - postures.origins[:, joints])
+        rates[:, linkage.slides[joints]] = postures.axes[:, joints][:, linkage.slides[joints]]
+        speeds = np.linalg.norm((rates * motion.velocities[:, joints, None]).sum(axis=1), axis=1)
         if speeds.max() > one.speed * (1 + slack):
             lines.append(f"motion: {one.frame} moves at {speeds.max():.4g} m/s, of {one.speed:g} allowed")
     return lines
@@ -110,20 +110,20 @@ def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
 
 def _along(linkage: Linkage, postures: Postures, q: ndarray, frame: str) -> _Along:
     k = linkage.links.index(frame)
-    level, T = int(linkage.levels[k]), postures.T[:, k]
-    step = np.abs(np.diff(q, axis=0))[:, :level]
-    across = np.cross(T[:-1, None, :3, 3] - postures.origins[:-1, :level], postures.axes[:-1, :level])
+    joints, T = np.flatnonzero(linkage.moved[k]), postures.T[:, k]
+    step = np.abs(np.diff(q, axis=0))[:, joints]
+    across = np.cross(T[:-1, None, :3, 3] - postures.origins[:-1, joints], postures.axes[:-1, joints])
     lengths = np.linalg.norm(across, axis=2)
-    lengths[:, linkage.slides[:level]] = 1.0
+    lengths[:, linkage.slides[joints]] = 1.0
     went, sag = np.zeros(len(step)), np.zeros(len(step))
-    for j in reversed(range(level)):
-        if not linkage.slides[j]:
+    for j in reversed(range(len(joints))):
+        if not linkage.slides[joints[j]]:
             lengths[:, j] += went  # what later joints have moved it
         went = went + step[:, j] * lengths[:, j]
         before = step[:, :j].sum(axis=1)
         sag += lengths[:, j] * step[:, j] * (step[:, j] + 2 * before) / 8
-    turn = step[:, ~linkage.slides[:level]].sum(axis=1)
-    return _Along(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), level)
+    turn = step[:, ~linkage.slides[joints]].sum(axis=1)
+    return _Along(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), len(joints))
 
 
 def _body(constraint: Constraint) -> _Body:
@@ -159,7 +159,7 @@ def _ends(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndar
         return start[k], linkage.place(goal.positions[:1]).T[0, k]
     if isinstance(goal, PoseGoal):
         other = linkage.links.index(goal.frame)
-        if linkage.levels[k] == linkage.levels[other]:
+        if (linkage.moved[k] == linkage.moved[other]).all():
             return start[k], goal.T_base_frame @ np.linalg.inv(start[other]) @ start[k]
     raise InputError(f"cartesian_line of {line.frame}: the goal does not say one pose of it")
 

@@ -35,7 +35,7 @@ class MovingProver(Prover):
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
         """Moving links against each obstacle."""
-        links = [link for link in self.links if self._levels[self._of[link]] > 0]
+        links = [link for link in self.links if self._moved[self._of[link]].any()]
         return tuple(Claim(link, one.name) for link in links for one in self.moving)
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
@@ -48,8 +48,8 @@ class MovingProver(Prover):
         further = np.array([self._of[claim.link] for claim in self.claims])[stretches.claim]
         row, ball, first = self._expand(further)
         centers = self._placed(postures, row, further[row], self._balls[ball, :3])
-        radii, level = self._balls[ball, 3], self._levels[further][row]
-        went = self.linkage.displacement(postures, row, centers, radii, level, 0 * level, spans)
+        radii, moved = self._balls[ball, 3], self._moved[further][row]
+        went = self.linkage.displacement(postures, row, centers, radii, moved, spans)
         number = {one.name: i for i, one in enumerate(self.moving)}
         which = np.array([number[claim.against] for claim in self.claims])[stretches.claim]
         distances, obstacle = np.empty(len(row)), np.empty(len(which))

@@ -33,10 +33,10 @@ class Dynamics:
         link = payload.link or robot.tip
         self.robot, self.limits = robot, robot.effort
         self._rnea, model = pinocchio.rnea, pinocchio.Model()
-        joint = 0
         for j, T in enumerate(robot.frame_offsets):
             kind = pinocchio.JointModelPZ() if robot.prismatic[j] else pinocchio.JointModelRZ()
-            joint = model.addJoint(joint, kind, pinocchio.SE3(T[:3, :3], T[:3, 3]), robot.joint_names[j])
+            parent = int(robot.parents[j])
+            model.addJoint(parent, kind, pinocchio.SE3(T[:3, :3], T[:3, 3]), robot.joint_names[j])
         moments = np.diag(payload.moments)
         carried = [(link, Inertia(payload.mass, payload.com, moments))] if payload.mass > MASSLESS else []
         for name, inertia in (*robot.inertias.items(), *carried):
