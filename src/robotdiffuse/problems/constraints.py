@@ -6,7 +6,7 @@ Places and directions are in the frame of the base.
 
 from dataclasses import dataclass, fields, replace
 from types import NoneType
-from typing import TYPE_CHECKING, ClassVar, get_args, no_type_check
+from typing import TYPE_CHECKING, Any, ClassVar, get_args, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -194,17 +194,17 @@ CONSTRAINTS: dict[str, type[Constraint]] = {
 def _check(constraint: Constraint) -> None:
     """Each field by its name: the frame, vectors, directions of any length, and sizes within bounds."""
     for field in fields(constraint):
-        name, given = field.name, getattr(constraint, field.name)
+        name = field.name
+        given: Any = getattr(constraint, name)
         where = f"{constraint.kind}.{name}"
         if name == "frame" and not isinstance(given, str):
             raise InputError(f"{where} is {shown(given)}; it must be the name of a link")
         if name in ("point", "low", "high", *DIRECTIONS):
-            given = vector(constraint.kind, name, given, 3)
-        if name in DIRECTIONS:
-            length = float(np.linalg.norm(given))
-            if length < 1e-6:
-                raise InputError(f"{where} is {shown(given)}; it must not be zero")
-            given = given if abs(length - 1) < 1e-15 else given / length
+            row = vector(constraint.kind, name, given, 3)
+            length = float(np.linalg.norm(row))
+            if name in DIRECTIONS and length < 1e-6:
+                raise InputError(f"{where} is {shown(row)}; it must not be zero")
+            given = row if name not in DIRECTIONS or abs(length - 1) < 1e-15 else row / length
         if name in SIZES and not (given is None and NoneType in get_args(field.type)):
             least, most, unit = SIZES[name]
             value = numbers(given)
