@@ -12,6 +12,7 @@ import robotdiffuse as rd
 from helpers.example_robots import example_robot
 from helpers.made_arms import chain, row, written
 from robotdiffuse.certificates.checker import check
+from robotdiffuse.certificates.constraints import kept
 from robotdiffuse.cli import main
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
@@ -19,6 +20,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
 from robotdiffuse.robots.covering import cover
 from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.inertias import Payload, inertia_of
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -159,6 +161,42 @@ def test_certificates_prove_motions_of_both_arms() -> None:
     assert result.solved and result.path is not None
     certificate = rd.certify(problem, result.path)
     assert check(certificate, problem).valid
+
+
+def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:
+    robot, rng = two_arms(), np.random.default_rng(7)
+    plane = rd.OnPlane("right_hand", point=[0.0, 0.0, 0.5], normal=[0.0, 0.6, 0.8], tolerance=5.0)
+    q = np.linspace(*rng.uniform(robot.lower, robot.upper, (2, robot.dof)), 12)
+    problem = rd.Problem(
+        robot=robot, scene=rd.Scene(), start=q[0], goal=rd.JointGoal(q[-1:]), constraints=[plane]
+    )
+    (bounds,) = (found.bounds for found in kept(problem, q, 0.0))
+    heights = [
+        abs((link_pose(robot, a + share * (b - a), "right_hand")[:3, 3] - plane.point) @ plane.normal)
+        for a, b in pairwise(q)
+        for share in np.linspace(0, 1, 9)
+    ]
+    assert (bounds >= np.reshape(heights, (-1, 9)).max(axis=1) - 1e-9).all()
+    still = q.copy()
+    still[:, 1:4] = q[0, 1:4]  # the left arm, which only the moved one's bounds may depend on
+    assert robot.joint_names[1:4] == ("left_shoulder", "left_elbow", "left_wrist")
+    np.testing.assert_array_equal(kept(problem, still, 0.0)[0].bounds, bounds)
+
+
+def test_a_locked_arm_weighs_as_much_as_one_that_stands_still() -> None:
+    pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
+    from robotdiffuse.robots.dynamics import Dynamics
+
+    body = inertia_of([1.5, 0.05, 0.02, -0.01, 0.02, 0, 0, 0.03, 0, 0.01])
+    both = replace(two_arms(), inertias={link: body for link in two_arms().link_names})
+    rng, rows = np.random.default_rng(8), np.arange(4)
+    q, v, a = (np.zeros((1, both.dof)) for _ in range(3))
+    q[0] = rng.uniform(both.lower, both.upper)
+    v[0, rows], a[0, rows] = rng.normal(size=(2, len(rows)))
+    left = both.with_locked(dict(zip(both.joint_names[4:], q[0, 4:], strict=True)))
+    whole, part = Dynamics(both, Payload(0.0)), Dynamics(left, Payload(0.0))
+    expected = part.torques(q[:, rows], v[:, rows], a[:, rows])
+    np.testing.assert_allclose(whole.torques(q, v, a)[:, rows], expected, atol=1e-9)
 
 
 def test_a_tool_on_the_second_hand_is_its_tip_and_is_checked() -> None:
