@@ -95,7 +95,7 @@ def test_what_is_made_of_the_arm_is_what_is_made_anew() -> None:
     anew = replace(robot, attached=(), bare=None)
     assert np.allclose(motion_radii(robot), motion_radii(anew), atol=1e-12)
     for a, b in zip(compile_robot(robot), compile_robot(anew), strict=True):
-        assert np.array_equal(a, b)
+        assert np.array_equal(np.asarray(a), np.asarray(b))
     assert robot.joint_names == box_arm().joint_names and robot.dof == 3
 
 

@@ -127,15 +127,13 @@ def test_planners_move_both_arms_past_each_other(planner: str) -> None:
 
 def _crossing(robot: Robot) -> tuple[np.ndarray, np.ndarray]:
     """Two free configurations between which the straight way is not."""
-    checker, rng = (
-        CollisionChecker(robot, rd.Scene([rd.Sphere([0.45, 0.0, 0.75], 0.05)])),
-        np.random.default_rng(3),
-    )
+    checker = CollisionChecker(robot, rd.Scene([rd.Sphere([0.45, 0.0, 0.75], 0.05)]))
+    rng = np.random.default_rng(3)
     while True:
-        ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
-        way = np.linspace(*ends, 100)
-        if checker.free(ends).all() and not checker.free(way).all():
-            return ends[0], ends[1]
+        start, goal = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
+        free = checker.free(np.linspace(start, goal, 100))
+        if free[0] and free[-1] and not free.all():
+            return start, goal
 
 
 def test_a_pose_of_one_hand_leaves_the_other_arm_where_it_starts() -> None:
@@ -166,7 +164,8 @@ def test_certificates_prove_motions_of_both_arms() -> None:
 def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:
     robot, rng = two_arms(), np.random.default_rng(7)
     plane = rd.OnPlane("right_hand", point=[0.0, 0.0, 0.5], normal=[0.0, 0.6, 0.8], tolerance=5.0)
-    q = np.linspace(*rng.uniform(robot.lower, robot.upper, (2, robot.dof)), 12)
+    ends = rng.uniform(robot.lower, robot.upper, (2, robot.dof))
+    q = np.linspace(ends[0], ends[1], 12)
     problem = rd.Problem(
         robot=robot, scene=rd.Scene(), start=q[0], goal=rd.JointGoal(q[-1:]), constraints=[plane]
     )
