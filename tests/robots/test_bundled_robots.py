@@ -40,7 +40,7 @@ def test_what_spheres_call_free_is_free_and_little_else_is(name: str) -> None:
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (400, robot.dof))
     by_spheres, by_meshes = CollisionChecker(robot, scene).free(q), ~ExactCollision(robot, scene).collides(q)
     assert not (by_spheres & ~by_meshes).any()
-    assert by_meshes.mean() > 0.5 and (by_meshes & ~by_spheres).sum() < 0.12 * by_meshes.sum()
+    assert by_meshes.mean() > 0.4 and (by_meshes & ~by_spheres).sum() < 0.12 * by_meshes.sum()
 
 
 @pytest.mark.parametrize("name", ROBOTS)
