@@ -131,7 +131,7 @@ class Verifier:
         times, positions = rows if found else between_rows(trajectory, self.settings.chord)
         still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
         along = None
-        if not found:
+        if not found and self.dynamics is not None:
             found += self._torques(*states_between(trajectory, self.settings.torque_step))
         if self.constraints is not None:
             found += self._too_fast(trajectory)
@@ -252,8 +252,7 @@ class Verifier:
 
     def _torques(self, clock: ndarray, q: ndarray, v: ndarray, a: ndarray) -> list[Violation]:
         """Where a joint's torque is first beyond its effort limit, with the problem's payload."""
-        if self.dynamics is None:
-            return []
+        assert self.dynamics is not None
         torques = np.abs(self.dynamics.torques(q, v, a))
         excess = torques - self.dynamics.limits * (1 + self.settings.rate_slack)
         bad = np.flatnonzero((excess > 0).any(axis=1))

@@ -41,6 +41,8 @@ WAYPOINTS = 48
 """Of smooth noise: as many as the networks have."""
 BATCH_SECONDS = 0.1
 """What a batch or its refinement takes, until it is known [s]: the first of a process is slow."""
+LONGER = 2.0
+"""A batch may take so many times what those before it took: scenes differ."""
 LOAD_SECONDS = 3.0
 """A call that has so much time left may load PyTorch and the network [s]."""
 
@@ -136,7 +138,10 @@ class _Batches:
 
     def _can(self) -> bool:
         """Whether there is time for a batch."""
-        return self.call.remaining > self.planner.seconds["batch"]
+        return self._time_for("batch")
+
+    def _time_for(self, part: str) -> bool:
+        return self.call.remaining > LONGER * self.planner.seconds[part]
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:
@@ -190,7 +195,7 @@ class _NetworkBatches(_Batches):
             if self._code is None:
                 self._code = encode(model, checker, planner.settings.points, call.rng)
             sampled = planner.draw(model, checker, self._code, start, goals, call.rng)
-        if not self._take(sampled, "network") and call.remaining > planner.seconds["refinement"]:
+        if not self._take(sampled, "network") and self._time_for("refinement"):
             with self._timed("refinement"):
                 refined = planner.refine(checker, sampled)
             self._take(refined, "refinement")
