@@ -2,6 +2,7 @@
 
 import ast
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -39,6 +40,14 @@ install_import_hook(checked_modules(), "beartype.beartype")
 # the same examples at every run: a suite that fails by chance guards nothing
 settings.register_profile("suite", deadline=None, max_examples=40, derandomize=True)
 settings.load_profile("suite")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def apart_from_the_users_robots(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What tests prepare is not found by those after them, nor left to whoever runs them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path_factory.mktemp("robots")))
+        yield
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
