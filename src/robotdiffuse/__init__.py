@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from robotdiffuse.planners import load_planner as load_planner
     from robotdiffuse.planners import plan as plan
     from robotdiffuse.planners.many import plan_many as plan_many
+    from robotdiffuse.planners.next_view import NextView as NextView
+    from robotdiffuse.planners.next_view import next_view as next_view
     from robotdiffuse.planners.replanner import Replanner as Replanner
     from robotdiffuse.planners.replanner import ReplannerSettings as ReplannerSettings
     from robotdiffuse.problems.constraints import AxisCone as AxisCone
@@ -58,6 +60,8 @@ _HOME = {
     "RopDataset": "robotdiffuse.data.dataset",
     "load_result": "robotdiffuse.results",
     "load_planner": "robotdiffuse.planners",
+    "NextView": "robotdiffuse.planners.next_view",
+    "next_view": "robotdiffuse.planners.next_view",
     "plan": "robotdiffuse.planners",
     "plan_many": "robotdiffuse.planners.many",
     "Replanner": "robotdiffuse.planners.replanner",

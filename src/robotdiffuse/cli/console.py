@@ -3,6 +3,7 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.results import PlanResult
     from robotdiffuse.verify import Report
 
@@ -46,3 +47,20 @@ def print_result(result: "PlanResult") -> None:
     rows += [("note", note) for note in result.notes]
     rows.append(("seed", str(result.seed)))
     show(Table.pairs(f"{result.robot}: {result.status.value}", rows))
+
+
+def print_next_view(problem: "Problem", result: "PlanResult") -> None:
+    """Where a camera is to look next, as problem files say it."""
+    from robotdiffuse.planners.next_view import next_view
+    from robotdiffuse.transforms import quaternion_from_rotation
+
+    proposed = next_view(problem, result)
+    xyz, wxyz = (
+        ", ".join(f"{number:.4g}" for number in numbers)
+        for numbers in (
+            proposed.T_base_camera[:3, 3],
+            quaternion_from_rotation(proposed.T_base_camera[:3, :3]),
+        )
+    )
+    print(f"next view, which sees {100 * proposed.seen:.0f} % of what the motion may run into:")
+    print(f"  camera: {{xyz: [{xyz}], wxyz: [{wxyz}]}}")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotdiffuse.cli.arguments import natural, not_negative, positive, share
-from robotdiffuse.cli.console import print_result
+from robotdiffuse.cli.console import print_next_view, print_result
 from robotdiffuse.cli.draw import ENDINGS, draw, show
 from robotdiffuse.handover import WRITERS
 from robotdiffuse.types import SHORT, UNTIL
@@ -71,6 +71,11 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         metavar="POLICY",
         help="what space that the problem's views do not show is taken for: optimistic (free), padded, "
         "imagined or occupied (default: what the problem says, or optimistic)",
+    )
+    parser.add_argument(
+        "--next-view",
+        action="store_true",
+        help="say where a camera sees most of the unseen space that the motion crosses",
     )
     for what in ("velocity", "acceleration"):
         parser.add_argument(
@@ -142,6 +147,8 @@ def run_plan(arguments: argparse.Namespace) -> int:
         problem = with_policy(problem, arguments.unseen)
     if arguments.blend is not None:
         problem = replace(problem, blend=arguments.blend)
+    if arguments.next_view:
+        check_seen("--next-view", problem)
     result = solve(
         problem,
         name,
@@ -156,6 +163,8 @@ def run_plan(arguments: argparse.Namespace) -> int:
         jerk=arguments.jerk,
     )
     print_result(result)
+    if arguments.next_view and result.path is not None:
+        print_next_view(problem, result)
     for file in outputs:
         if file.suffix.lower() == ".json":
             result.save(file, problem_record(problem))
@@ -175,13 +184,19 @@ def run_plan(arguments: argparse.Namespace) -> int:
 
 def with_policy(problem: "Problem", unseen: str) -> "Problem":
     """The problem with this policy for unseen space; InputError for an unknown one, and without views."""
-    from robotdiffuse.errors import InputError
     from robotdiffuse.problems.problem import check_unseen
 
     check_unseen("--unseen", unseen)
-    if not problem.views:
-        raise InputError(f"--unseen {unseen} is for problems that cameras saw; this one has no views")
+    check_seen(f"--unseen {unseen}", problem)
     return replace(problem, unseen=unseen)
+
+
+def check_seen(option: str, problem: "Problem") -> None:
+    """InputError for a problem without views."""
+    from robotdiffuse.errors import InputError
+
+    if not problem.views:
+        raise InputError(f"{option} is for problems that cameras saw; this one has no views")
 
 
 def run_demo(arguments: argparse.Namespace) -> int:
