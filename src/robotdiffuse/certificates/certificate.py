@@ -148,15 +148,15 @@ def _record(certificate: Certificate) -> dict[str, Any]:
             **({name: getattr(motion, name).tolist() for name in ROWS} if timed else {}),
         },
         "between": certificate.between.tolist(),
-        "proof": [_claim_record(proof, k, claim) for k, claim in enumerate(proof.claims)],
+        "proof": _proof_record(proof),
         "request_parts": certificate.request_parts,
-        "moving": None
-        if certificate.moving is None
-        else [
-            _claim_record(certificate.moving, k, claim) for k, claim in enumerate(certificate.moving.claims)
-        ],
+        "moving": None if certificate.moving is None else _proof_record(certificate.moving),
         "constraints": [list(one) for one in certificate.constraints],
     }
+
+
+def _proof_record(proof: Proof) -> list[dict[str, Any]]:
+    return [_claim_record(proof, k, claim) for k, claim in enumerate(proof.claims)]
 
 
 def _claim_record(proof: Proof, k: int, claim: Claim) -> dict[str, Any]:

@@ -82,10 +82,8 @@ def hash_of(motion: Path | Trajectory) -> str:
 
 def _unproved(problem: Problem, certificate: Certificate) -> Iterator[str]:
     prover = Prover(problem.robot, problem.scene, configurations(certificate.motion, certificate.between))
-    proof, said = (
-        certificate.proof,
-        {"scene": certificate.scene_clearance, "self": certificate.self_clearance},
-    )
+    proof = certificate.proof
+    said = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
     of_pairs = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
     yield from _of_proof(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, said)
 

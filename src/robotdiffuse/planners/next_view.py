@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.errors import InputError
-from robotdiffuse.planners.rungs import FINE, voxels_in
+from robotdiffuse.planners.rungs import FINE, fine, voxels_in
 from robotdiffuse.planners.sight_kernel import seen_weights
 from robotdiffuse.planners.unseen_space import UnseenSpace
 from robotdiffuse.problems.problem import IMAGINED, Problem
@@ -79,7 +79,7 @@ def next_view(
     weights = likely[tuple(at.T)]
     if not len(at):
         return NextView(views[0].T_base_camera, 1.0)
-    filled = volume.occupied.repeat(2, 0).repeat(2, 1).repeat(2, 2).astype(np.float32)
+    filled = fine(volume.occupied).astype(np.float32)
     if imagined is not None:
         np.maximum(filled, imagined, out=filled)
     filled[voxels_in(placed_spheres(problem.robot, problem.start).astype(np.float32))] = 1.0

@@ -38,8 +38,12 @@ class Rung(ABC):
     name: str
 
     @abstractmethod
+    def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "..."]:
+        """Those that have to be carved out for the arm's covering spheres, x y z radius [m]."""
+
     def touched(self, spheres: Float32[ndarray, "n 4"]) -> int:
-        """How many of them have to be carved out for the arm's covering spheres, x y z radius [m]."""
+        """How many have to be carved out for these spheres."""
+        return int(self._touched(spheres).sum())
 
     @abstractmethod
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
@@ -61,9 +65,6 @@ class Padded(Rung):
     def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "points"]:
         return sphere_distances(self.points, spheres) < PADDED_SHARE * self.padding + PADDED_MORE
 
-    def touched(self, spheres: Float32[ndarray, "n 4"]) -> int:
-        return int(self._touched(spheres).sum())
-
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
         return UnseenPoints(self.points[~self._touched(spheres)], self.padding, name="padded")
 
@@ -83,9 +84,6 @@ class Voxels(Rung):
     def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "nx ny nz"]:
         return self.occupied & voxels_in(spheres, CARVED + self.edge / 2, self.edge)
 
-    def touched(self, spheres: Float32[ndarray, "n 4"]) -> int:
-        return int(self._touched(spheres).sum())
-
     def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
         """Those at the surface, for the arm, which starts outside, cannot get within; without those that it
         cannot reach and those in shapes that are known."""
@@ -96,6 +94,11 @@ class Voxels(Rung):
             inside = np.float32(self.edge / 2 - 1e-3)
             points = points[~near_scene(compile_scene_for(robot, known), points.astype(np.float32), inside)]
         return UnseenPoints(points, self.edge / 2, name="unseen")
+
+
+def fine(voxels: Bool[ndarray, "mx my mz"]) -> Bool[ndarray, "nx ny nz"]:
+    """Voxels of the observed volume as their eighths."""
+    return voxels.repeat(2, 0).repeat(2, 1).repeat(2, 2)
 
 
 def voxels_in(

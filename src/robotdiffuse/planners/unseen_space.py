@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.arrays import compile_robot
-from robotdiffuse.planners.rungs import CARVED, FINE, FINE_SHAPE, voxels_in
+from robotdiffuse.planners.rungs import CARVED, FINE, FINE_SHAPE, fine, voxels_in
 from robotdiffuse.planners.swept_kernel import heaviest_part, summed, sweep
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
@@ -29,7 +29,7 @@ class UnseenSpace:
         self._robot = compile_robot(problem.robot)
         goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
         ends = [placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals)]
-        self.unknown = volume.unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+        self.unknown = fine(volume.unknown)
         self.unknown &= ~voxels_in(np.concatenate(ends), CARVED)
         self.probability = None if imagined is None else np.where(self.unknown, imagined, np.float32(0))
 
