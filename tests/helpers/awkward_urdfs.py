@@ -1,0 +1,180 @@
+"""Awkward URDFs, made: what works, and what is refused by one line that says what to do."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from helpers.made_arms import BALL, chain, joint, link, robot, row, written
+
+ARM = chain("base", row("j", 6))
+
+
+def solid(mesh: trimesh.Trimesh | bytes, file: str = "part.stl", more: str = "") -> Callable[[Path], Path]:
+    """An arm whose last link is a mesh."""
+
+    def make(folder: Path) -> Path:
+        if isinstance(mesh, bytes):
+            (folder / file).write_bytes(mesh)
+        else:
+            mesh.export(folder / file)
+        shape = f'<collision><geometry><mesh filename="{file}" {more}/></geometry></collision>'
+        return written(folder, ARM, link("end", shape), joint("last", "j6_link", "end"))
+
+    return make
+
+
+def arm(*parts: str, **how: str) -> Callable[[Path], Path]:
+    return lambda folder: written(folder, *parts, **how)
+
+
+def text(content: str | bytes, file: str = "made.urdf") -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        data = content if isinstance(content, bytes) else content.encode()
+        (folder / file).write_bytes(data)
+        return folder / file
+
+    return make
+
+
+def box() -> trimesh.Trimesh:
+    return trimesh.creation.box([0.06, 0.06, 0.06])
+
+
+def degenerate() -> trimesh.Trimesh:
+    """With triangles of no area, repeated corners, and points of no triangle."""
+    mesh = box()
+    faces = np.concatenate([mesh.faces, [[0, 0, 1], [2, 2, 2], [0, 1, 0]]])
+    vertices = np.concatenate([mesh.vertices, mesh.vertices[:2], [[0.0, 0.0, 0.0]]])
+    return trimesh.Trimesh(vertices, faces, process=False)
+
+
+def fine() -> trimesh.Trimesh:
+    """A cube of 200,000 triangles."""
+    mesh = box()
+    while len(mesh.faces) < 190_000:
+        mesh = mesh.subdivide()
+    return mesh
+
+
+VISUAL = '<visual><geometry><box size="0.05 0.05 0.05"/></geometry></visual>'
+CAPSULE = '<collision><geometry><capsule radius="0.03" length="0.05"/></geometry></collision>'
+XACRO = '<robot name="made" xmlns:xacro="http://www.ros.org/wiki/xacro">{}</robot>'
+FINGERS = "".join(chain("j6_link", row(f"f{i}_", 3), limits='lower="0" upper="1"') for i in range(5))
+LINKAGE = chain("j6_link", ["knuckle"]) + "".join(
+    link(f"bar{i}") + joint(f"rod{i}", "j6_link", f"bar{i}", more='<mimic joint="knuckle" multiplier="-1"/>')
+    for i in range(3)
+)
+
+WORKS: dict[str, tuple[Callable[[Path], Path], int]] = {
+    "three joints": (arm(chain("base", row("j", 3))), 3),
+    "fourteen joints": (arm(chain("base", row("j", 14))), 14),
+    "a gantry": (
+        arm(
+            chain("base", ["x"], kind="prismatic", axis="1 0 0", limits='lower="-0.5" upper="0.5"'),
+            chain("x_link", ["y"], kind="prismatic", axis="0 1 0", limits='lower="-0.5" upper="0.5"'),
+            chain("y_link", ["z"], kind="prismatic", axis="0 0 1", limits='lower="0" upper="0.5"'),
+        ),
+        3,
+    ),
+    "continuous joints alone": (arm(chain("base", row("j", 5), kind="continuous", limits="")), 5),
+    "a rail and continuous joints": (
+        arm(chain("base", ["rail"], kind="prismatic"), chain("rail_link", row("j", 4), kind="continuous")),
+        5,
+    ),
+    "a branch along the arm": (arm(ARM, chain("j2_link", ["lid"])), 6),
+    "names in other scripts": (
+        arm(chain("base", ["Gelenk_ß", "关节二", "сустав", "مفصل"]), name="机器人 Ä"),
+        4,
+    ),
+    "names with slashes and spaces": (arm(chain("base", ["arm/joint 1", "arm/joint 2", "arm/joint 3"])), 3),
+    "a hand of five fingers": (arm(ARM, FINGERS), 6),
+    "a jaw": (arm(ARM, chain("j6_link", ["gripper"])), 6),
+    "a closed chain as mimic in the gripper": (arm(ARM, LINKAGE), 6),
+    "a fixed wrist": (arm(ARM, link("plate"), joint("bolt", "j6_link", "plate", "fixed")), 6),
+    "a joint that cannot move": (arm(chain("base", row("j", 4)).replace('upper="2"', 'upper="-2"', 1)), 3),
+    "no upper limits": (arm(chain("base", row("j", 3), limits='lower="-2"')), 3),
+    "no velocity limits": (text(robot(ARM).replace('velocity="2"', "")), 6),
+    "axes that meet": (arm(ARM, chain("j6_link", row("w", 3), xyz="0 0 0")), 9),
+    "capsules": (arm(ARM, link("end", CAPSULE), joint("last", "j6_link", "end")), 7),
+    "several shapes on a link": (arm(ARM, link("end", BALL + CAPSULE), joint("last", "j6_link", "end")), 7),
+    "tiny links": (text(robot(ARM).replace('radius="0.04"', 'radius="0.001"')), 6),
+    "visual geometry alone": (text(robot(ARM).replace(BALL, VISUAL)), 6),
+    "links without geometry": (text(robot(ARM).replace(link("j3_link"), link("j3_link", ""))), 6),
+    "a mesh of 200,000 triangles": (solid(fine()), 7),
+    "a mesh with degenerate triangles": (solid(degenerate(), "part.obj"), 7),
+    "a mesh in millimetres": (solid(trimesh.creation.box([60, 60, 60]), more='scale="0.001 0.001 0.001"'), 7),
+    "a mirrored mesh": (solid(box(), more='scale="1 -1 1"'), 7),
+    "a mesh with an ending in capitals": (solid(box(), "PART.STL"), 7),
+    "another encoding": (
+        text(b'<?xml version="1.0" encoding="latin-1"?>' + robot(ARM, name="Ärmchen").encode("latin-1")),
+        6,
+    ),
+    "a byte order mark and comments": (text(b"\xef\xbb\xbf" + f"<!-- made -->{robot(ARM)}".encode()), 6),
+    "an old base frame above": (
+        text(robot(ARM, link("world", ""), joint("stand", "world", "base", "fixed", xyz="1 2 3"))),
+        6,
+    ),
+    "xacro": (text(XACRO.format(robot(ARM).split(">", 1)[1][: -len("</robot>")]), "made.urdf.xacro"), 6),
+}
+"""What is made, and how many joints are planned."""
+
+NOTHING = "<robot name='bare'><link name='base'/></robot>"
+REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "a missing mesh": (
+        arm(
+            ARM,
+            link("end", '<collision><geometry><mesh filename="a.stl"/></geometry></collision>')
+            + joint("last", "j6_link", "end"),
+        ),
+        "mesh file 'a.stl' is not there; put it there",
+    ),
+    "a mesh in a package that is not there": (
+        arm(
+            ARM,
+            link("end", '<collision><geometry><mesh filename="package://p/a.stl"/></geometry></collision>')
+            + joint("last", "j6_link", "end"),
+        ),
+        "--package p=FOLDER",
+    ),
+    "no geometry": (text(robot(ARM).replace(BALL, "")), "give its links <collision> elements"),
+    "a floating base": (
+        arm(link("body"), joint("free", "base", "body", "floating"), chain("body", row("j", 6))),
+        "has type 'floating'; .*--base body plans",
+    ),
+    "a planar base": (
+        arm(link("body"), joint("drive", "base", "body", "planar"), chain("body", row("j", 6))),
+        "--base body plans",
+    ),
+    "a closed chain": (arm(ARM, joint("close", "base", "j6_link")), "two parent joints .*leave one out"),
+    "a linkage of planned joints": (
+        arm(ARM, link("bar"), joint("rod", "j1_link", "bar", more='<mimic joint="j2"/>')),
+        "hold it with --lock j2=VALUE",
+    ),
+    "two arms": (arm(chain("base", row("l", 6)), chain("base", row("r", 6))), "--group l"),
+    "four legs": (arm(*(chain("base", row(f"leg{i}_", 3)) for i in "abcd")), "has 4 arms"),
+    "no joint": (text(NOTHING), "no movable joint .*choose another --base or --tip"),
+    "loose links": (arm(ARM, link("loose")), r"2 \(base, loose\); connect them with fixed joints"),
+    "an empty file": (text(""), "not well-formed XML"),
+    "an MJCF file": (text("<mujoco/>"), "root element is <mujoco>.*convert"),
+    "a folder": (lambda folder: folder, "cannot be read: it is a folder"),
+    "an axis of zero length": (arm(chain("base", row("j", 3), axis="0 0 0")), "its axis is zero"),
+    "limits that are no numbers": (arm(chain("base", ["j"], limits='lower="nan" upper="1"')), "is 'nan'"),
+    "a triangle": (
+        solid(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])),
+        "holds no triangle mesh",
+    ),
+    "a point": (solid(b"v 0 0 0\nv 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\nf 2 3 4\n", "part.obj"), "holds no"),
+    "a mesh with corners that are no numbers": (
+        solid(b"v nan 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 2 3 4\n", "part.obj"),
+        "holds no triangle mesh",
+    ),
+    "a damaged mesh": (solid(b"this is no mesh", "part.dae"), "cannot be read"),
+    "a name that is a path": (arm(ARM, name="../made"), "give --name NAME"),
+    "a shape nobody knows": (
+        text(robot(ARM).replace("<sphere radius", "<torus radius")),
+        "known: box, capsule",
+    ),
+}
+"""What is made, and what the line says."""
