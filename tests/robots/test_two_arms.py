@@ -15,6 +15,7 @@ from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.constraints import kept
 from robotdiffuse.cli import main
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.arrays import reach_bound
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
@@ -22,8 +23,9 @@ from robotdiffuse.robots.covering import cover
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.inertias import Payload, inertia_of
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
-from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.scaled import reach
 from robotdiffuse.robots.srdf import read_srdf
 from robotdiffuse.robots.urdf import read_urdf
 
@@ -222,3 +224,17 @@ def test_added_planned_and_verified_from_the_command_line(
     out = tmp_path / "result.json"
     assert main(["plan", str(problem), "--planner", "rrt_connect", "--out", str(out)]) == 0
     assert main(["verify", str(out)]) == 0
+
+
+def test_both_arms_reach_as_far_as_one() -> None:
+    """Lines on the page were twice as wide once: the reach was of the offsets of all joints of both arms."""
+    both, left, right = (rd.load_robot(f"baxter{arm}") for arm in ("", "_left", "_right"))
+    assert reach(both) == pytest.approx(max(reach(left), reach(right)), rel=0.01)  # of random configurations
+    assert reach_bound(both) <= max(reach_bound(left), reach_bound(right)) + 1e-9
+    held = both.with_locked({n: 0.0 for n in both.joint_names if n[0] == "r"})
+    assert reach(held) == pytest.approx(reach(left), rel=0.01)
+    for robot in (both, left):
+        q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (50, robot.dof))
+        spheres = np.concatenate([placed_spheres(robot, one) for one in q])
+        far = (np.linalg.norm(spheres[:, :3], axis=1) + spheres[:, 3]).max()
+        assert reach(robot) < far < reach_bound(robot)

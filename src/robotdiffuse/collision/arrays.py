@@ -155,13 +155,14 @@ def _placed_groups(robot: Robot) -> dict[str, _Group]:
 
 
 @once_per_robot
-def reach(robot: Robot) -> float:
-    """An upper bound of the distance of any sphere's surface from the base's origin [m]."""
+def reach_bound(robot: Robot) -> float:
+    """What the distance of any sphere's surface from the base's origin never exceeds [m]."""
     lengths = np.linalg.norm(robot.frame_offsets[:, :3, 3], axis=1)
     slides = np.where(robot.prismatic, np.maximum(np.abs(robot.lower), np.abs(robot.upper)), 0.0)
     arrays = compile_robot(robot)
     extent = np.linalg.norm(arrays.bounds[:, :3], axis=1) + arrays.bounds[:, 3]
-    return float(lengths.sum() + slides.sum() + extent.max(initial=0.0))
+    farthest = (robot.moved_by @ (lengths + slides)).max()
+    return float(farthest + extent.max(initial=0.0))
 
 
 def _clusters(spheres: ndarray) -> list[ndarray]:
@@ -194,7 +195,7 @@ def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
     """The arrays of a scene as far as the robot can get near it; those of the last few scenes are kept, since
     a search and the judge ask for the same."""
     largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
-    return compile_scene(scene, reach(robot), largest)
+    return compile_scene(scene, reach_bound(robot), largest)
 
 
 def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> SceneArrays:

@@ -10,9 +10,9 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from robotdiffuse.live.obstacles import dimensions, handle_pose, held_at
-from robotdiffuse.live.session import reach
 from robotdiffuse.planners.candidates import Candidates
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.scaled import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
 from robotdiffuse.transforms import quaternion_from_rotation
@@ -33,7 +33,7 @@ TREES = ("/trees/start", "/trees/goal")
 COAT = 0.002
 """How far what is seen through stands out, so that it lies over the arm where both are in one place [m]; the
 less that is seen through it, the further."""
-TRACE_WIDTH, FAN_WIDTH, TREE_WIDTH = 0.0066, 0.0025, 0.002
+TRACE_WIDTH, FAN_WIDTH, TREE_WIDTH = 0.0094, 0.0035, 0.0028
 """Of lines, as shares of the arm's reach."""
 GHOST = 0.3
 """Opacity of start and goal."""

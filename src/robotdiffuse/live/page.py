@@ -31,18 +31,19 @@ from robotdiffuse.live.drawing import RATE as FILM_RATE
 from robotdiffuse.live.latest import Latest
 from robotdiffuse.live.panel import Deeds, Panel
 from robotdiffuse.live.player import Player
-from robotdiffuse.live.session import Session, State, reach
+from robotdiffuse.live.session import Session, State
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.scaled import reach
 from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.verify import Violation
 from robotdiffuse.viewer import look
 from robotdiffuse.viewer.camera import VERTICAL_FIELD, view_of_motion
 from robotdiffuse.viewer.look import GOAL, START, Surface
 
-GIZMO, SMALL_GIZMO = 0.16, 0.11
+GIZMO, SMALL_GIZMO = 0.23, 0.16
 """Sizes, as shares of the arm's reach."""
-FLOOR = 3.3
+FLOOR = 4.7
 """Side, in the same."""
 FRAME, FREE = (900, 800), (0.06, 0.06)
 """What the first view is made for [pixels], and the shares of its height that stay free."""

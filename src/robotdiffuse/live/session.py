@@ -27,12 +27,13 @@ from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.scaled import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.settings import Bound, OneOf, Settings
 from robotdiffuse.verify import Report, verify_trajectory
 
-AHEAD, SIZE = np.array([0.35, 0.0, 0.35]), 0.066
+AHEAD, SIZE = np.array([0.5, 0.0, 0.5]), 0.094
 """Where new obstacles stand, and the radius of a ball, as shares of the arm's reach."""
 KEEP_TREES = {
     "robotdiffuse": "search.keep_trees=true",
@@ -328,11 +329,6 @@ class Session:
                 return
             self._state = replace(self._state, candidates=candidates)
         self.tell()
-
-
-def reach(robot: Robot) -> float:
-    """About how far the arm reaches [m]."""
-    return float(np.linalg.norm(robot.frame_offsets[:, :3, 3], axis=1).sum())
 
 
 def _reached(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
-from robotdiffuse.collision.arrays import compile_scene_for, reach
+from robotdiffuse.collision.arrays import compile_scene_for, reach_bound
 from robotdiffuse.planners.swept_kernel import mark, surface
 from robotdiffuse.problems.problem import IMAGINED, OCCUPIED, PADDED, Problem
 from robotdiffuse.problems.seen_kernel import near_scene, sphere_distances
@@ -89,7 +89,7 @@ class Voxels(Rung):
         cannot reach and those in shapes that are known."""
         points = (surface(self.occupied & ~self._touched(spheres)) + 0.5) * self.edge + LOW
         robot, known = self.problem.robot, self.problem.known_scene
-        points = points[np.linalg.norm(points, axis=1) < reach(robot) + self.edge]
+        points = points[np.linalg.norm(points, axis=1) < reach_bound(robot) + self.edge]
         if known.shapes:
             inside = np.float32(self.edge / 2 - 1e-3)
             points = points[~near_scene(compile_scene_for(robot, known), points.astype(np.float32), inside)]

@@ -17,12 +17,18 @@ FAR = 0.99
 
 @once_per_robot
 def reach(robot: Robot) -> float:
-    """How far the tip gets from the first joint's axis at the height of the second joint, about an arm's
-    shoulder, but for 1 % of its configurations [m]."""
+    """How far an arm's tip gets from its first joint's axis at the height of its second joint, about its
+    shoulder, but for 1 % of the configurations [m]; of several arms, the longest one's."""
     q = np.random.default_rng(0).uniform(robot.lower, robot.upper, (SAMPLES, robot.dof))
-    height = (robot.frame_offsets[0] @ robot.frame_offsets[min(1, robot.dof - 1)])[2, 3]
-    shoulder = np.array([*robot.frame_offsets[0, :2, 3], height])
-    return float(np.quantile(np.linalg.norm(link_origins(robot, q, robot.tip) - shoulder, axis=1), FAR))
+    reached = []
+    for tip in robot.tips:
+        first = list(robot.chain(tip)[:2])
+        if not first:  # an arm that is held
+            continue
+        offsets = robot.frame_offsets[first]
+        shoulder = np.array([*offsets[0, :2, 3], (offsets[0] @ offsets[-1])[2, 3]])
+        reached.append(np.linalg.norm(link_origins(robot, q, tip) - shoulder, axis=1))
+    return float(np.quantile(reached, FAR, axis=1).max())
 
 
 def scaled(robot: Robot, scale: float) -> Robot:
