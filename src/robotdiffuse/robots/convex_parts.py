@@ -64,6 +64,11 @@ class PartSettings:
                 "all must be positive"
             )
 
+    def scaled(self, size: float) -> "PartSettings":
+        """For meshes that are so many times as large."""
+        lengths = ("concavity", "finest", "rounding")
+        return replace(self, **{name: size * getattr(self, name) for name in lengths})
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:

@@ -25,9 +25,13 @@ from robotdiffuse.robots.convex_parts import PartSettings, Surface, convex_parts
 from robotdiffuse.robots.interfaces import hidden_by_neighbours
 from robotdiffuse.robots.refusals import PairRefusals, Refusals, measure_refusals
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.scaled import reach
 from robotdiffuse.robots.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
 from robotdiffuse.robots.sphere_room import FLOOR, Bounds, Solid
 
+LARGE = 1.4
+"""Reach [m] from which on lengths of the settings are meant for such an arm, and grow with the reach: a larger
+arm works in more room, and needs as many parts and spheres."""
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, the number of the step and the number of steps."""
 FINER = 0.5
@@ -63,6 +67,14 @@ class PreparationSettings:
                 f"preparation: refused is {self.refused} (must be between 0 and 1), samples {self.samples} "
                 f"(at least 100), rounds {self.rounds} (at least 0)"
             )
+
+
+    def for_reach(self, reach: float) -> "PreparationSettings":
+        """The settings with their lengths in the size of an arm that reaches so far [m]."""
+        size = max(reach / LARGE, 1.0)
+        return replace(
+            self, parts=self.parts.scaled(size), spheres=self.spheres.scaled(size), finest=size * self.finest
+        )
 
 
 @dataclass(frozen=True)
@@ -132,6 +144,7 @@ def prepare(
     `surfaces` are the meshes by link, in the links' frames; `allowed` pairs, with reasons, that need no check
     whatever sampling says. The same input and seed give the same robot.
     """
+    settings = settings.for_reach(reach(robot))
     links = {name: _Link(name, meshes, settings.parts) for name, meshes in surfaces.items()}
     steps = 2 * len(links) + 1 + settings.rounds
     for step, link in enumerate(links.values()):

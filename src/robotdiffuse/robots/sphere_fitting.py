@@ -10,7 +10,7 @@ alternates between giving each cell to the sphere that holds it with most room t
 to its best centre. It starts from a greedy set cover and drops spheres as long as all have room.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,6 +72,11 @@ class SphereSettings:
                 f"sphere tolerances: finest is {self.finest}; it must be positive and at most first_half "
                 f"({self.first_half}) and second_half ({self.second_half})"
             )
+
+    def scaled(self, size: float) -> "SphereSettings":
+        """For links that are so many times as large."""
+        lengths = ("first_half", "second_half", "fixed", "finest")
+        return replace(self, **{name: size * getattr(self, name) for name in lengths})
 
     def tolerance(self, robot: Robot, link: str, inradius: float) -> float:
         """How far the spheres of a link may stick out [m] whose largest inner sphere has this radius [m]."""

@@ -21,8 +21,8 @@ sqrt(dof) times as long as the straight line that it stands for.
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
-from itertools import product
-from math import ceil, sqrt
+from itertools import combinations, product
+from math import ceil, comb, sqrt
 from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
@@ -45,8 +45,10 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.types import Status
 
-SLICE = 200
-"""Expansions between two looks at the clock."""
+SLICE = 4000
+"""Edges that are met between two looks at the clock, about: some take 10 microseconds."""
+MOST_MOVES = 100_000
+"""Edges that a node may have."""
 MOST_KEYS = 2**62
 """Nodes that can be told apart."""
 ROUNDING = 1e-4
@@ -127,6 +129,13 @@ def _make_graph(
             f"which must be below {MOST_KEYS:.0e}: a spacing of "
             f"{spacing * (total / MOST_KEYS) ** (1 / robot.dof) * 1.1:.2g} does it"
         )
+    edges = [comb(robot.dof, k) * 2**k for k in range(1, robot.dof + 1)]
+    if sum(edges[: settings.joints_per_move]) > MOST_MOVES:
+        most = int(np.searchsorted(np.cumsum(edges), MOST_MOVES, side="right"))
+        raise InputError(
+            f"{settings.settings_name}.joints_per_move is {settings.joints_per_move}; on {robot.name} that "
+            f"makes {sum(edges[: settings.joints_per_move])} edges of a node; it must be at most {most}"
+        )
     strides = np.concatenate([[1], np.cumprod(counts[:-1])]).astype(np.int64)
     origin = start - spacing * below
     half = _moves(robot.dof, settings.joints_per_move)
@@ -151,9 +160,14 @@ def _moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
     """One of each pair of opposite moves: the first joint that moves, moves up. Few joints first."""
     if joints == 1:
         return np.eye(dof, dtype=np.int64)
-    every = (m for m in product((0, 1, -1), repeat=dof) if 0 < sum(map(abs, m)) <= joints)
-    kept = [m for m in every if next(step for step in m if step) > 0]
-    return np.array(sorted(kept, key=lambda m: sum(map(abs, m))), np.int64)
+    moves = []
+    for count in range(1, min(joints, dof) + 1):
+        signs = [(1, *others) for others in product((1, -1), repeat=count - 1)]
+        rows = np.zeros((comb(dof, count), len(signs), dof), np.int64)
+        for row, moving in zip(rows, combinations(range(dof), count), strict=True):
+            row[:, moving] = signs
+        moves += sorted(rows.reshape(-1, dof).tolist(), key=lambda move: [step % 3 for step in move])
+    return np.array(moves, np.int64)
 
 
 class _Search:
@@ -171,6 +185,7 @@ class _Search:
         self.checker, self.settings, self.padding = checker, settings, padding
         self.goals = goals
         self._graph = _make_graph(checker.robot, start, goals, settings)
+        self._expansions = max(SLICE // len(self._graph.lattice.moves), 1)
         self._table = table.make_table(self._graph.lattice, settings.max_nodes, incremental)
         self._space = search_space(checker, settings.resolution, padding)
 
@@ -216,7 +231,9 @@ class AStarSearch(_Search):
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
         """Search on until there is a path, none, no more room, or `stop` says so."""
         while True:
-            code = kernel.a_star(self._space, self._graph.lattice, self._table, self._inflation, SLICE)
+            code = kernel.a_star(
+                self._space, self._graph.lattice, self._table, self._inflation, self._expansions
+            )
             if code != kernel.GOING or stop():
                 return Outcome(code)
 
@@ -266,7 +283,13 @@ class DStarLiteSearch(_Search):
             return Outcome.FULL
         while True:
             code = kernel.d_star_lite(
-                self._space, self._graph.lattice, self._table, self._last, self._start, self._offset, SLICE
+                self._space,
+                self._graph.lattice,
+                self._table,
+                self._last,
+                self._start,
+                self._offset,
+                self._expansions,
             )
             if code != kernel.GOING or stop():
                 return Outcome(code)
