@@ -19,6 +19,7 @@ import subprocess
 import sys
 import time
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -36,7 +37,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from helpers.awkward_urdfs import REFUSED, WORKS  # noqa: E402
+from helpers.awkward_urdfs import REFUSED, WORKS
 
 MADE = {name: make for name, (make, _) in (WORKS | REFUSED).items()}
 
@@ -164,7 +165,7 @@ def planned(robot: Robot) -> tuple[str, str]:
 
 def past_a_box(robot: Robot, q: np.ndarray) -> Problem | None:
     """A problem between free configurations with a box where the tip is halfway, if there is one."""
-    for start, goal in zip(q[:-1], q[1:], strict=True):
+    for start, goal in pairwise(q):
         way = np.linspace(start, goal, 33)
         tips = link_origins(robot, way, robot.tip)
         size = 0.15 * np.linalg.norm(np.ptp(tips, axis=0))

@@ -307,7 +307,7 @@ def test_updates_refuse_another_robot_and_places_off_the_lattice():
 @pytest.mark.parametrize("settings", [AStarSettings(), DStarLiteSettings()])
 def test_two_arms_do_not_outrun_the_time_limit(settings: AStarSettings | DStarLiteSettings) -> None:
     """With 14 joints a slice of 200 expansions met 78,400 edges, and the clock was looked at a second late;
-    before that, the moves of two joints at once were picked from all 3^14, for half a minute of busy cores."""
+    before that, the moves of two joints at once were picked from all 3^14, for half a minute."""
     baxter = load_robot("baxter")
     rng, checker = np.random.default_rng(0), CollisionChecker(baxter, Scene())
     q = rng.uniform(baxter.lower, baxter.upper, (2000, 14)).astype(np.float32)
@@ -322,7 +322,7 @@ def test_two_arms_do_not_outrun_the_time_limit(settings: AStarSettings | DStarLi
 
     assert running.run(stop) is Outcome.GOING
     edges = {1: 28, 2: 392}[settings.joints_per_move]
-    assert 0 < np.diff(looks).min() and edges * np.diff(looks).max() <= 4000
+    assert np.diff(looks).min() > 0 and edges * np.diff(looks).max() <= 4000
 
 
 def test_moves_of_several_joints_are_all_once_few_joints_first() -> None:

@@ -1,5 +1,6 @@
 """Two arms as one robot: which joints are planned, what a goal of one hand means, plans, proofs, tools."""
 
+import time
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -7,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numba import njit
+from rich.console import Console
 
 import robotdiffuse as rd
 from helpers.example_robots import example_robot
@@ -14,10 +17,13 @@ from helpers.made_arms import chain, row, written
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.constraints import kept
 from robotdiffuse.cli import main
+from robotdiffuse.cli.plan import solve
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.arrays import reach_bound
 from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.errors import InputError
+from robotdiffuse.planners.call import Call
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
 from robotdiffuse.robots.covering import cover
 from robotdiffuse.robots.fingerprint import robot_fingerprint
@@ -224,6 +230,24 @@ def test_added_planned_and_verified_from_the_command_line(
     out = tmp_path / "result.json"
     assert main(["plan", str(problem), "--planner", "rrt_connect", "--out", str(out)]) == 0
     assert main(["verify", str(out)]) == 0
+
+
+def test_the_first_robot_of_several_arms_compiles_which_is_said_and_takes_no_time_of_the_call(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Code for trees of joints is compiled at their first plan: who waits need not have a new machine."""
+    robot, shown, status = two_arms(), [], Console.status
+    monkeypatch.setattr(Console, "status", lambda on, text: (shown.append(text), status(on, text))[1])
+    q = np.zeros(robot.dof)
+    problem = rd.Problem(robot=robot, scene=rd.Scene(), start=q, goal=q)
+    solve(problem, "rrt_connect", time_limit=20.0)
+    assert "the first robot of several arms compiles first" in shown[0]
+    began, call = time.perf_counter(), Call("test", problem, time_limit=20.0, seed=0)
+    before = call.elapsed
+    njit(lambda parents: parent_of(parents, 3))(robot.branching)
+    waited = time.perf_counter() - began
+    assert call.elapsed - before < 0.5 * waited
+    assert any("compiled for" in note for note in call.unsolved().notes)
 
 
 def test_both_arms_reach_as_far_as_one() -> None:

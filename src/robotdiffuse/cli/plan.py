@@ -273,10 +273,11 @@ def solve(
     from rich.console import Console
 
     from robotdiffuse.planners import load_planner
+    from robotdiffuse.planners.base import compiles_first
     from robotdiffuse.processes import interrupts_at_once
 
     console = Console(stderr=True)
-    loading = console.status("loading compiled code (a new machine compiles it first, for about a minute)")
+    loading = console.status(f"loading compiled code ({compiles_first(problem.robot)})")
     with interrupts_at_once(loading.stop), loading:
         loaded = load_planner(planner, settings, weights)
         loaded.warm_up(problem)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 from robotdiffuse.live.session import State
+from robotdiffuse.planners.base import compiles_first
 from robotdiffuse.verify import Report
 
 FREE, WRONG, NONE, WAITING = "free", "wrong", "none", "waiting"
@@ -26,7 +27,7 @@ def certificate(state: State) -> Certificate:
         if why_not:
             return Certificate(NONE, "no plan", (why_not,))
         if state.planning:
-            return Certificate(WAITING, "planning", ("a new machine compiles first, for about a minute",))
+            return Certificate(WAITING, "planning", (compiles_first(state.problem.robot),))
         return Certificate(WAITING, "nothing planned yet")
     if verdict is None:
         return Certificate(WAITING, "judging")

@@ -156,6 +156,12 @@ def ever_finer(call: Call, settings: Own) -> Iterator[tuple[Own, int]]:
         attempt += 1
 
 
+def compiles_first(robot: Robot) -> str:
+    """What to say while a first call keeps people waiting: code for trees of joints is compiled apart."""
+    who = "a new machine" if robot.branching is None else "the first robot of several arms"
+    return f"{who} compiles first, for about a minute"
+
+
 def one_of_each(scene: Scene) -> Scene:
     """The first shape of each kind; of meshes and clouds a single triangle or point."""
     shapes: dict[str, Shape] = {}

@@ -54,7 +54,15 @@ def seen_points(
         for view in views:
             spheres = placed_spheres(robot, start if view.configuration is None else view.configuration)
             spheres = (spheres + np.array([0, 0, 0, ARM])).astype(np.float32)
-            rest = np.float32(reach_bound(robot) + AROUND), spheres, np.float32(voxel), keys, cells, sums, count
+            rest = (
+                np.float32(reach_bound(robot) + AROUND),
+                spheres,
+                np.float32(voxel),
+                keys,
+                cells,
+                sums,
+                count,
+            )
             if view.cloud is not None:
                 count = gather_cloud(view.cloud, *rest)
             else:

@@ -30,8 +30,8 @@ from robotdiffuse.robots.sphere_fitting import SphereSettings, covered, fit_sphe
 from robotdiffuse.robots.sphere_room import FLOOR, Bounds, Solid
 
 LARGE = 1.4
-"""Reach [m] from which on lengths of the settings are meant for such an arm, and grow with the reach: a larger
-arm works in more room, and needs as many parts and spheres."""
+"""Reach [m] from which on the lengths of settings grow with the reach: a larger arm works in more room, and
+needs no more parts and spheres."""
 Progress = Callable[[str, int, int], None]
 """Called with what is being done, the number of the step and the number of steps."""
 FINER = 0.5
@@ -67,7 +67,6 @@ class PreparationSettings:
                 f"preparation: refused is {self.refused} (must be between 0 and 1), samples {self.samples} "
                 f"(at least 100), rounds {self.rounds} (at least 0)"
             )
-
 
     def for_reach(self, reach: float) -> "PreparationSettings":
         """The settings with their lengths in the size of an arm that reaches so far [m]."""
