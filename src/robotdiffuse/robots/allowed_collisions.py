@@ -3,7 +3,9 @@
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import coal
 import numpy as np
@@ -12,7 +14,7 @@ from numpy import ndarray
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
-from robotdiffuse.robots.sphere_kernels import deepest_touches
+from robotdiffuse.robots.sphere_kernels import ball_distances, deepest_touches
 from robotdiffuse.transforms import rotation_about
 
 ADJACENT, ALWAYS, NEVER, CHECKED = "adjacent", "always", "never", "checked"
@@ -28,6 +30,8 @@ OFTEN, UNCERTAIN = 0.2, 0.25
 variance of colliding that the other joints may explain, at most."""
 COARSE = 0.03
 """Meshes of links that overlap in a named pose by no more are taken for coarse there [m]."""
+ROUNDING = 1e-9
+"""What balls are larger by [m]: more than rounding takes away."""
 NEAR = 0.1
 """Links whose balls never come so near [m] are driven towards each other from few samples."""
 
@@ -193,6 +197,7 @@ class Links:
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
         self.hulls = {link: [_coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
+        self.balls = {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in robot.meshes.items()}
         self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
         self._leading: dict[frozenset[str], list[Joint]] = {}
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
@@ -251,28 +256,40 @@ class Links:
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
         """Signed distance between the covering spheres of two links [m]: at most that of their meshes."""
-        return -deepest_touches(poses[a], poses[b], self.robot.spheres[a], self.robot.spheres[b], NEAR)[0]
+        spheres = self.robot.spheres
+        return -deepest_touches(poses[a], poses[b], spheres[a], spheres[b], NEAR, -np.inf)[0]
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""
         T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
-        for first in self.hulls[a]:
-            for second in self.hulls[b]:
-                self.result.clear()
-                if coal.collide(first, T_a, second, T_b, self.request, self.result):
-                    return True
+        for _, first, second in self._near(poses, a, b, i, 0.0):
+            self.result.clear()
+            if coal.collide(first, T_a, second, T_b, self.request, self.result):
+                return True
         return False
 
     def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
         """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
         T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
         least = np.inf
-        for first in self.hulls[a]:
-            for second in self.hulls[b]:
-                self.distance_result.clear()
-                distance = coal.distance(first, T_a, second, T_b, self.distance_request, self.distance_result)
-                least = min(least, distance)
+        for at_least, first, second in self._near(poses, a, b, i, np.inf):
+            if at_least >= least:
+                break
+            self.distance_result.clear()
+            distance = coal.distance(first, T_a, second, T_b, self.distance_request, self.distance_result)
+            least = min(least, distance)
         return float(least)
+
+    def _near(
+        self, poses: dict[str, ndarray], a: str, b: str, i: int, limit: float
+    ) -> Iterator[tuple[float, Any, Any]]:
+        """Hulls of two links whose balls are within a limit [m] of each other in configuration i, the nearest
+        first, with that distance: theirs is at least that."""
+        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
+        count = apart.shape[1]
+        near = np.flatnonzero(apart.ravel() <= limit)
+        for k in near[np.argsort(apart.ravel()[near])]:
+            yield apart.ravel()[k], self.hulls[a][k // count], self.hulls[b][k % count]
 
 
 def _motions(axis: Float[ndarray, "3"], prismatic: bool, q: Float[ndarray, "n"]) -> Float[ndarray, "n 4 4"]:
@@ -288,6 +305,12 @@ def _motions(axis: Float[ndarray, "3"], prismatic: bool, q: Float[ndarray, "n"])
 
 def coal_pose(T: Float[ndarray, "4 4"]) -> "coal.Transform3s":
     return coal.Transform3s(np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]))
+
+
+def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
+    """Centre and radius of a ball that holds a mesh."""
+    center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
+    return np.append(center, np.linalg.norm(mesh.vertices - center, axis=1).max() + ROUNDING)
 
 
 def _coal_hull(mesh: ConvexMesh) -> "coal.Convex":

@@ -17,6 +17,9 @@ ANGLES = 9
 NEARLY = 0.004
 """Points so near to a neighbour count as inside [m]: a gap between two links is as thin as that."""
 
+BESIDE = 10 * NEARLY
+"""What is further from a neighbour's box is not nearly inside, sharp as its edges may be [m]."""
+
 
 @dataclass(frozen=True, eq=False)
 class Neighbour:
@@ -50,14 +53,20 @@ def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
 
 def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Float[ndarray, "n 3"]], Bool[ndarray, "n"]]:
     """Which points, in the link's frame, are inside one neighbour at all values of the joint between them."""
-    beside = [(other, stacked_planes(robot.meshes[other.link])) for other in neighbours(robot, link)]
+    beside = []
+    for other in neighbours(robot, link):
+        corners = np.concatenate([mesh.vertices for mesh in robot.meshes[other.link]])
+        box = corners.min(0) - BESIDE, corners.max(0) + BESIDE
+        beside.append((other, box, stacked_planes(robot.meshes[other.link])))
 
     def hidden(points: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
         found = np.zeros(len(points), dtype=bool)
-        for other, planes in beside:
+        for other, (low, high), planes in beside:
             left = np.flatnonzero(~found)
             for T in other.T_link_neighbour:
                 local = (points[left] - T[:3, 3]) @ T[:3, :3]
+                near = ((local >= low) & (local <= high)).all(axis=1)
+                left, local = left[near], local[near]
                 left = left[within(local, *planes, -NEARLY)]
             found[left] = True
         return found

@@ -72,7 +72,7 @@ def measure_refusals(
     trees = {link: tuple(map(_tree, parts)) for link, parts in surfaces.items()}
     found = []
     for a, b in robot.checked_pairs():
-        depth, middle = deepest_touches(poses[a], poses[b], robot.spheres[a], robot.spheres[b], 0.0)
+        depth, middle = deepest_touches(poses[a], poses[b], robot.spheres[a], robot.spheres[b], 0.0, 0.0)
         spheres = depth > 0
         parts, meshes = np.zeros(samples, dtype=bool), np.zeros(samples, dtype=bool)
         for i in np.flatnonzero(spheres):

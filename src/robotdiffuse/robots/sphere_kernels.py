@@ -154,24 +154,46 @@ def enclosing(spheres):
 
 
 @njit(cache=True)
-def deepest_touches(T_base_a, T_base_b, first, second, apart):
+def relative(A, B, T):
+    """Writes the pose [3, 4] of the second of two frames in the first, of poses [4, 4]."""
+    for i in range(3):
+        for j in range(3):
+            T[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
+        T[i, 3] = 0.0
+        for k in range(3):
+            T[i, 3] += A[k, i] * (B[k, 3] - A[k, 3])
+
+
+@njit(cache=True)
+def ball_distances(T_base_a, T_base_b, first, second):
+    """Signed distances [a, b] between the balls of two sets at two poses [4, 4] [m]."""
+    T, found = np.empty((3, 4)), np.empty((len(first), len(second)))
+    relative(T_base_a, T_base_b, T)
+    for j in range(len(second)):
+        x = T[0, 0] * second[j, 0] + T[0, 1] * second[j, 1] + T[0, 2] * second[j, 2] + T[0, 3]
+        y = T[1, 0] * second[j, 0] + T[1, 1] * second[j, 1] + T[1, 2] * second[j, 2] + T[1, 3]
+        z = T[2, 0] * second[j, 0] + T[2, 1] * second[j, 1] + T[2, 2] * second[j, 2] + T[2, 3]
+        for i in range(len(first)):
+            dx, dy, dz = first[i, 0] - x, first[i, 1] - y, first[i, 2] - z
+            far = math.sqrt(dx * dx + dy * dy + dz * dz)
+            found[i, j] = far - first[i, 3] - second[j, 3]
+    return found
+
+
+@njit(cache=True)
+def deepest_touches(T_base_a, T_base_b, first, second, apart, least):
     """For poses [n, 4, 4] of two sets of spheres how deep any two of them overlap [m] (negative if none do),
     and the middle of where they do, in the frame of the first set.
 
-    Where balls around the two sets are further from each other than `apart`, only that is told.
+    Where balls around the two sets are further from each other than `apart`, only that is told; nothing is
+    looked for that overlaps by no more than `least`.
     """
-    depth, middle = np.full(len(T_base_a), -np.inf), np.zeros((len(T_base_a), 3))
+    depth, middle = np.full(len(T_base_a), least), np.zeros((len(T_base_a), 3))
     a_center, a_radius = enclosing(first)
     b_center, b_radius = enclosing(second)
     T = np.empty((3, 4))
     for n in range(len(T_base_a)):
-        A, B = T_base_a[n], T_base_b[n]
-        for i in range(3):
-            for j in range(3):
-                T[i, j] = A[0, i] * B[0, j] + A[1, i] * B[1, j] + A[2, i] * B[2, j]
-            T[i, 3] = 0.0
-            for k in range(3):
-                T[i, 3] += A[k, i] * (B[k, 3] - A[k, 3])
+        relative(T_base_a[n], T_base_b[n], T)
         square = 0.0
         for i in range(3):
             at = T[i, 0] * b_center[0] + T[i, 1] * b_center[1] + T[i, 2] * b_center[2] + T[i, 3]
@@ -184,6 +206,11 @@ def deepest_touches(T_base_a, T_base_b, first, second, apart):
             x = T[0, 0] * second[j, 0] + T[0, 1] * second[j, 1] + T[0, 2] * second[j, 2] + T[0, 3]
             y = T[1, 0] * second[j, 0] + T[1, 1] * second[j, 1] + T[1, 2] * second[j, 2] + T[1, 3]
             z = T[2, 0] * second[j, 0] + T[2, 1] * second[j, 1] + T[2, 2] * second[j, 2] + T[2, 3]
+            # most spheres are further from all of the first set than those that were found
+            reach = a_radius + second[j, 3] - depth[n]
+            dx, dy, dz = a_center[0] - x, a_center[1] - y, a_center[2] - z
+            if reach <= 0.0 or dx * dx + dy * dy + dz * dz >= reach * reach:
+                continue
             for i in range(len(first)):
                 dx, dy, dz = first[i, 0] - x, first[i, 1] - y, first[i, 2] - z
                 reach = first[i, 3] + second[j, 3] - depth[n]
