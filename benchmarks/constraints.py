@@ -6,7 +6,10 @@ Problems are drawn in the scenes of the held-out families shelf and table, with 
 down, at random places above the ground. Upright: from one place to another, the cup's axis within 10 degrees
 of the vertical. Line: to a place 15 to 40 cm away in the same orientation, the hand's origin within 2 mm of
 the segment and its orientation within 0.05 rad; drawn again until at nine places of the segment some
-configuration is free. Goals are up to ten configurations, the same ones for both planners.
+configuration is free. Goals are up to ten configurations, the same ones for all planners.
+
+aorrtc searches on what the constraints leave; diffusion draws from the network, which knows of no
+constraints, under guidance by their cost, and projects every waypoint.
 
 sscbirrt (PyPI) plans with this project's compiled projection and collision check as its callbacks, in its
 Python core: its native one takes MuJoCo's scenes, analytical inverse kinematics and its own sets. It returns
@@ -33,6 +36,7 @@ import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.planners import call
+from robotdiffuse.planners.base import Planner
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.path_constraints import PathConstraints
@@ -142,9 +146,9 @@ def _reached(
     return found if len(found) else None
 
 
-def ours(problem: Problem, seed: int) -> Answer:
-    """By aorrtc, which plans under constraints by `planners/constrained`."""
-    result = rd.load_planner("aorrtc").plan(problem, time_limit=LONG, seed=seed)
+def ours(planner: Planner, problem: Problem, seed: int) -> Answer:
+    """By a planner of this project."""
+    result = planner.plan(problem, time_limit=LONG, seed=seed)
     if result.path is None or result.trajectory is None:
         return Answer(result.planning_time, np.inf, None, np.inf, False)
     first = result.progress[0][0]
@@ -249,9 +253,11 @@ def _excess(problem: Problem, frames: ndarray) -> float:
 
 def compared(kind: str, number: int, with_peer: bool) -> None:
     """Plan, show to the oracles, and print."""
-    problems = list(drawn(kind, number))
-    rd.load_planner("aorrtc").warm_up(problems[0])
-    answers = {"ours": [ours(p, i) for i, p in enumerate(progress(problems, f"{kind}, ours"))]}
+    problems, answers = list(drawn(kind, number)), dict[str, list[Answer]]()
+    for name in ("aorrtc", "diffusion"):
+        planner = rd.load_planner(name)
+        planner.warm_up(problems[0])
+        answers[name] = [ours(planner, p, i) for i, p in enumerate(progress(problems, f"{kind}, {name}"))]
     if with_peer:
         peer(problems[0], 0)
         answers["sscbirrt"] = [peer(p, i) for i, p in enumerate(progress(problems, f"{kind}, sscbirrt"))]

@@ -64,12 +64,17 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
     return max(off, rotation_angle(up.T @ T[:3, :3]) - constraint.angle)
 
 
+@pytest.mark.parametrize(
+    ("name", "stage"), [("rrt_connect", "constrained_rrt_connect"), ("diffusion", "network")]
+)
 @pytest.mark.parametrize(("constraints", "scene"), CASES, ids=[case[0][0].kind for case in CASES])
-def test_motions_keep_constraints_at_every_millimetre(constraints: list[Constraint], scene: rd.Scene) -> None:
+def test_motions_keep_constraints_at_every_millimetre(
+    constraints: list[Constraint], scene: rd.Scene, name: str, stage: str
+) -> None:
     made = problem(constraints, scene)
-    result = load_planner("rrt_connect").plan(made, time_limit=20.0)
+    result = load_planner(name).plan(made, time_limit=20.0)
     assert result.path is not None and result.trajectory is not None, result.reason
-    assert result.stage == "constrained_rrt_connect"
+    assert result.stage == stage
     assert verify(made, result.path).valid and verify_trajectory(made, result.trajectory).valid
     for rows in (result.path.positions, result.trajectory.positions):
         for a, b in pairwise(rows):

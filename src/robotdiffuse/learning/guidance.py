@@ -18,10 +18,13 @@ Gauss-Newton step); a kernel spreads the pushes over the neighbouring waypoints,
 al., ICRA 2011). These two move one waypoint after the other towards its optimum between its neighbours.
 
 Each is a file in `learning.costs` and a line in its table. A new one says its step down itself, and acts
-where `further` gives it a strength; the steps of these five are compiled, in `guidance_kernel.descend`.
+where `further` gives it a strength; the steps of these five are compiled, in `guidance_kernel.descend`. The
+cost of a problem's path constraints, `learning.costs.path_constraints`, comes with the problem.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 from jaxtyping import Float
@@ -67,8 +70,19 @@ class GuidanceSettings(Settings, name="guidance"):
 class CollisionGuidance:
     """Moves trajectories of one problem out of collision, and down the other costs of its settings."""
 
-    def __init__(self, checker: CollisionChecker, settings: GuidanceSettings | None = None) -> None:
+    def __init__(
+        self,
+        checker: CollisionChecker,
+        settings: GuidanceSettings | None = None,
+        of_problem: Mapping[str, Cost] = MappingProxyType({}),
+    ) -> None:
+        """`of_problem`: costs that the problem brings along, by name; their strength is the longest push."""
         self.checker, self.settings = checker, settings or GuidanceSettings()
+        each = {name: (COSTS.load(name), strength) for name, strength in self.settings.further.items()}
+        self._further: dict[str, tuple[Cost, float]] = {
+            **each,
+            **{name: (cost, self.settings.push) for name, cost in of_problem.items()},
+        }
 
     def __call__(
         self, q: Float[ndarray, "count waypoints dof"], steps: int, prefix: int = 1, suffix: int = 1
@@ -97,9 +111,7 @@ class CollisionGuidance:
             smoothness=np.float32(settings.smoothness),
             length=np.float32(settings.length),
         )
-        further: list[tuple[Cost, float]] = [
-            (COSTS.load(n), strength) for n, strength in settings.further.items()
-        ]
+        further = self._further.values()
         costs, free = np.zeros(len(q), np.float32), slice(prefix, q.shape[1] - suffix)
         # one round at a time only where not all of it is compiled
         for count in [1] * steps if further else [steps]:
@@ -116,12 +128,11 @@ class CollisionGuidance:
         In rad² but for the collision costs, in m². Not what the steps compute with: the formulas as they
         are, to look at and to test against.
         """
-        found: dict[str, Float[ndarray, "count"]] = {}
-        for name in COSTS:
-            cost: Cost = COSTS.load(name)
-            strength = (
-                getattr(self.settings, cost.setting) if cost.setting else self.settings.further.get(name)
-            )
-            if strength is not None:
-                found[name] = cost.value(self.checker, q, strength)
-        return found
+        compiled = {name: cost for name in COSTS if (cost := COSTS.load(name)).setting}
+        every = {name: (cost, getattr(self.settings, cost.setting)) for name, cost in compiled.items()}
+        every.update(self._further)
+        return {
+            name: cost.value(self.checker, q, strength)
+            for name, (cost, strength) in every.items()
+            if strength is not None
+        }

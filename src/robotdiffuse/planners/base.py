@@ -24,7 +24,10 @@ WARM_UP, SLIGHT = 1.0, 0.02
 """Limits of the calls of `warm_up`: easy ones, and the beginning of a search [s]."""
 CONSTRAINTS, CLEARANCE = "path constraints", "a clearance that is asked for"
 """What not every planner can keep."""
-ABLE = {CONSTRAINTS: "robotdiffuse, aorrtc, rrt_connect", CLEARANCE: "robotdiffuse, aorrtc, rrt_connect"}
+ABLE = {
+    CONSTRAINTS: "robotdiffuse, aorrtc, rrt_connect, diffusion",
+    CLEARANCE: "robotdiffuse, aorrtc, rrt_connect",
+}
 """The planners that can, for messages."""
 RADIUS = 0.08
 """Of the balls of `warm_up` [m]."""
@@ -72,7 +75,7 @@ class Planner(ABC, Generic[Own]):
         `planners/moving.py`. Where the problem has a start velocity, it begins moving:
         `planners/in_motion.py`. Where cameras saw the scene, `problem.unseen` says what the rest is taken
         for: `planners/unseen.py`. Path constraints are for aorrtc, rrt_connect
-        and robotdiffuse: `planners/constrained`.
+        and robotdiffuse, `planners/constrained`, and for diffusion.
 
         Raises InputError for arguments that are none of these, for what the planner cannot keep, and where
         `prepare` does.

@@ -6,11 +6,17 @@ none is valid, the next batch is drawn from new noise, until time runs out. Ther
 search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance solve.
 Around it, `planners.robotdiffuse` puts what makes a motion dependable.
 
+Path constraints are a further cost of guidance, and each waypoint of a sample is projected onto them before
+the judge, who proves them between the waypoints too, is asked. The network has never seen any.
+
 Unless the settings say otherwise, the weights are used with the sampler and the steps that they name, and
 without guidance this is the network alone: `guidance_steps` 0.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import numpy as np
@@ -18,12 +24,17 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.learning.costs.cost import Cost
+from robotdiffuse.learning.costs.path_constraints import path_constraints
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.weights_at_hand import weights_for
+from robotdiffuse.planners.base import CONSTRAINTS
 from robotdiffuse.planners.call import Call
+from robotdiffuse.planners.constrained.search import SHARE
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings, nearest_goals
+from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.sampling import sample_surface
@@ -91,15 +102,17 @@ class ModelSampler(LearnedPlanner[Own]):
         goals: Float[ndarray, "k dof"],
         rng: np.random.Generator,
         clearances: "ClearanceFn | None" = None,
+        of_problem: Mapping[str, Cost] = MappingProxyType({}),
     ) -> Float[ndarray, "count waypoints dof"]:
         """A batch of samples under guidance, shared out among the nearest goals; `code` as by `encode`.
 
         clearances: what the model is told of the obstacles; None: what is true.
+        of_problem: as for `CollisionGuidance`.
         """
         from robotdiffuse.learning.clearances import link_clearances
 
         settings = self.settings
-        guidance = CollisionGuidance(checker, settings.guidance)
+        guidance = CollisionGuidance(checker, settings.guidance, of_problem)
         goals = nearest_goals(start, goals, settings.samples)
         counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(goals))]
         clearances = clearances or link_clearances(checker, model.settings)
@@ -135,21 +148,39 @@ def encode(
     return model.encode(sample_surface(checker.scene, points, rng, model.encoder.settings.region), rng)
 
 
+def _projected(
+    constraints: PathConstraints, path: Float[ndarray, "waypoints dof"]
+) -> Float[ndarray, "waypoints dof"]:
+    """The path with all waypoints between its ends on what the constraints leave; as it is, for the judge to
+    refuse, where one of them leads nowhere."""
+    between = constraints.projected(path[1:-1], SHARE)
+    return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
+
+
+def _kept(constraints: PathConstraints | None, corner: Float[ndarray, "n dof"]) -> bool:
+    """Whether the way through configurations keeps a share of the tolerances."""
+    return constraints is None or constraints.first(corner, share=SHARE) is None
+
+
 class Diffusion(ModelSampler[DiffusionSettings]):
     """The paper's method as a planner; see the head of this file."""
 
     name = "diffusion"
     settings_class = DiffusionSettings
+    keeps = frozenset({CONSTRAINTS})
 
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
         model, rng = self.network(call.problem.robot), call.rng
         start, goals = ends.rows()
         code = encode(model, ends.checker, self.settings.points, rng)
-        names = call.problem.robot.joint_names
+        names, constraints = call.problem.robot.joint_names, call.judge.constraints
+        costs = {} if constraints is None else {"path_constraints": path_constraints(constraints, SHARE)}
         every, valid, until = list[Path](), list[Path](), call.time_limit
         while not every or call.elapsed < until:
-            batch = self.draw(model, ends.checker, code, start, goals, rng)
+            batch = self.draw(model, ends.checker, code, start, goals, rng, of_problem=costs)
+            if constraints is not None:
+                batch = [_projected(constraints, q) for q in batch]
             paths = [Path(names, ends.complete(q)) for q in batch]
             passed = [path for path in paths if call.judge.path(path).valid]
             for path in passed:
@@ -160,7 +191,8 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         reason = f"{len(valid)} of {len(every)} samples of the network are valid"
         # where none is, the judge is asked about one once more, so that the result says what is wrong with it
         for path in sorted(valid or every[-1:], key=lambda path: path.length):
-            result = call.finish(path.positions, "network", f"solved by network: {reason}")
+            how = f"solved by network: {reason}"
+            result = call.finish(path.positions, "network", how, keeps=partial(_kept, constraints))
             if result is not None:
                 return result
         return call.unsolved(reason)

@@ -369,29 +369,39 @@ def _residuals(rows, limits, q, work):
 
 
 @njit(cache=True)
+def step(rows, limits, q, most, work):
+    """Moves q by a damped Newton step, at most so long [rad], towards where it keeps the limits, within the
+    joints' limits; how many residuals there were, 0 for none and so no step, -1 where no step helps."""
+    dof = len(q)
+    count = _residuals(rows, limits, q, work)
+    if count == 0:
+        return 0
+    work.held[:] = False
+    damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
+    again = False
+    for k in range(dof):
+        low, high = q[k] <= rows.lower[k], q[k] >= rows.upper[k]
+        if not rows.endless[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
+            work.held[k] = again = True
+    if again:
+        damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
+    length = np.sqrt((work.step * work.step).sum())
+    scale = min(1.0, most / max(length, 1e-12))
+    if length < 1e-9:
+        return -1
+    for k in range(dof):
+        q[k] += scale * work.step[k]
+        if not rows.endless[k]:
+            q[k] = min(max(q[k], rows.lower[k]), rows.upper[k])
+    return count
+
+
+@njit(cache=True)
 def project(rows, limits, q, work):
     """Moves q to a configuration near by that keeps the limits, by damped Newton steps within the joints'
     limits; whether it got there."""
-    dof = len(q)
     for _ in range(ITERATIONS):
-        count = _residuals(rows, limits, q, work)
-        if count == 0:
-            return True
-        work.held[:] = False
-        damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
-        again = False
-        for k in range(dof):
-            low, high = q[k] <= rows.lower[k], q[k] >= rows.upper[k]
-            if not rows.endless[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
-                work.held[k] = again = True
-        if again:
-            damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
-        length = np.sqrt((work.step * work.step).sum())
-        scale = min(1.0, MOST_STEP / max(length, 1e-12))
-        if length < 1e-9:
-            return False
-        for k in range(dof):
-            q[k] += scale * work.step[k]
-            if not rows.endless[k]:
-                q[k] = min(max(q[k], rows.lower[k]), rows.upper[k])
+        left = step(rows, limits, q, MOST_STEP, work)
+        if left <= 0:
+            return left == 0
     return _residuals(rows, limits, q, work) == 0

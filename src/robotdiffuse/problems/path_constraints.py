@@ -99,14 +99,17 @@ class PathConstraints:
         """Of each row [m] or [rad]."""
         return kernel.values(self.rows, np.ascontiguousarray(q, np.float64))
 
+    def limits(self, share: float) -> Float[ndarray, "rows"]:
+        """Of the values, with a share of the tolerances [m] or [rad]."""
+        return self.rows.limit - (1 - share) * self.rows.room
+
     def kept(self, q: Float[ndarray, "n dof"], share: float = 1.0) -> Bool[ndarray, "n"]:
         """Which configurations keep all constraints; with less than a share of 1, and room beside."""
-        limits = self.rows.limit - (1 - share) * self.rows.room
-        return np.all(self.values(q) <= limits, axis=1)
+        return np.all(self.values(q) <= self.limits(share), axis=1)
 
     def projected(self, q: Float[ndarray, "n dof"], share: float) -> Float[ndarray, "k dof"]:
         """Configurations near those given that keep a share of the tolerances, of each that leads to one."""
-        limits, work = self.rows.limit - (1 - share) * self.rows.room, kernel.make_work(self.rows)
+        limits, work = self.limits(share), kernel.make_work(self.rows)
         rows = [row for row in q.astype(np.float64) if kernel.project(self.rows, limits, row, work)]
         return np.stack(rows) if rows else np.zeros((0, self.robot.dof))
 
@@ -128,7 +131,7 @@ class PathConstraints:
         around = np.where(rows.what == DISTANCE, rows.reach.sum(axis=1), rows.last)
         turning = (rows.what == TURN) * np.linalg.norm(rows.a, axis=1) * np.linalg.norm(rows.b, axis=1)
         slack = chord * (around + turning * rows.reach.sum(axis=1))
-        limits = rows.limit - slack - (1 - share) * rows.room
+        limits = self.limits(share) - slack
         segment, part, row = kernel.first_unproved(rows, limits, q, FINEST)
         if row < 0:
             return None

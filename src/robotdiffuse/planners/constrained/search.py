@@ -45,7 +45,7 @@ class ConstrainedSearch(AnytimeSearch):
         self.constraints: PathConstraints = constraints
         rows, start = constraints.rows, ends.start_lead
         assert start is not None  # or there would be no ends
-        self.kept = rows.limit - (1 - SHARE) * rows.room
+        self.kept = constraints.limits(SHARE)
         at_ends = constraints.values(np.stack([start, *ends.goal_leads])).max(axis=0) + AT_ENDS
         self.kept = np.minimum(np.maximum(self.kept, at_ends), rows.limit)
         super().__init__(call, ends, settings, STAGE, bounded=False)
