@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.goals import AnyGoal as AnyGoal
     from robotdiffuse.problems.goals import JointGoal as JointGoal
     from robotdiffuse.problems.goals import PoseGoal as PoseGoal
+    from robotdiffuse.problems.goals import PosesGoal as PosesGoal
     from robotdiffuse.problems.problem import Problem as Problem
     from robotdiffuse.results import PlanResult as PlanResult
     from robotdiffuse.results import load_result as load_result
@@ -69,6 +70,7 @@ _HOME = {
     "AnyGoal": "robotdiffuse.problems.goals",
     "JointGoal": "robotdiffuse.problems.goals",
     "PoseGoal": "robotdiffuse.problems.goals",
+    "PosesGoal": "robotdiffuse.problems.goals",
     "AxisCone": "robotdiffuse.problems.constraints",
     "CartesianLine": "robotdiffuse.problems.constraints",
     "OnLine": "robotdiffuse.problems.constraints",

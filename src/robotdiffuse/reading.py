@@ -269,6 +269,8 @@ class _Composer:
                 key: Any = self.loader.get_event()
                 if not isinstance(key, yaml.ScalarEvent) or key.tag is not None:
                     self._refuse(key, "a key is no plain text")
+                if key.value in value:
+                    self._refuse(key, f"{key.value} stands twice")
                 value[key.value] = self._node(depth + 1)
             self.loader.get_event()
         if event.anchor is not None:

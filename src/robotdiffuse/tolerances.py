@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Bound, Natural, NotNegative, Positive, Settings
@@ -89,6 +89,9 @@ def goal_error(
         errors = [goal_error(robot, one, q, settings, blend) for one in goal.goals]
         off = [error for error in errors if error is not None]
         return min(off, key=lambda error: error.excess) if len(off) == len(errors) else None
+    if isinstance(goal, PosesGoal):
+        errors = [goal_error(robot, one, q, settings, blend) for one in goal.poses]
+        return max((error for error in errors if error), key=lambda error: error.excess, default=None)
     if isinstance(goal, JointGoal):
         differences = goal.positions - q
         differences -= robot.turns(differences)
@@ -152,6 +155,8 @@ def _near(
     """Which configurations may be within `blend` of a goal, by position alone."""
     if isinstance(goal, AnyGoal):
         return np.any([_near(robot, one, q, blend, settings) for one in goal.goals], axis=0)
+    if isinstance(goal, PosesGoal):
+        return np.all([_near(robot, one, q, blend, settings) for one in goal.poses], axis=0)
     if isinstance(goal, JointGoal):
         differences = goal.positions[:, None] - q
         differences -= robot.turns(differences)

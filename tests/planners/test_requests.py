@@ -23,7 +23,7 @@ from robotdiffuse.verify import verify, verify_trajectory
 PANDA = rd.load_robot("panda")
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 GOAL = START + np.array([0.4, 0.1, 0.0, 0.1, 0.0, 0.0, 0.1])
-HAND = "panda_hand"
+HAND, ELBOW = "panda_hand", "panda_link4"
 FAR = rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6], name="crate")
 SCENE = rd.Scene([FAR])
 T_GOAL = link_pose(PANDA, GOAL, HAND)
@@ -68,6 +68,9 @@ def _seen() -> Problem:
 ASKED: dict[str, Asked] = {
     "pose": Asked(_goal(rd.PoseGoal(HAND, T_GOAL))),
     "pose with room": Asked(_goal(rd.PoseGoal(HAND, T_GOAL, [0.02] * 3, [0.1, 0.1, np.pi]))),
+    "poses of two links": Asked(
+        _goal(rd.PosesGoal([rd.PoseGoal(ELBOW, link_pose(PANDA, GOAL, ELBOW)), rd.PoseGoal(HAND, T_GOAL)]))
+    ),
     "any goal": Asked(_goal([rd.PoseGoal(HAND, T_GOAL), rd.JointGoal(GOAL)])),
     "waypoints": Asked(lambda: replace(PLAIN, waypoints=(rd.JointGoal((START + GOAL) / 2),))),
     "blended": Asked(

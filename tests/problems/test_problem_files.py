@@ -239,14 +239,17 @@ WRONG: dict[str, tuple[object, str]] = {
         GOOD | {"goal": {"joints": [9, *READY[1:]]}},
         "goal: panda_joint1 is 9 rad; its limits are -2.8",
     ),
-    "goal a list": (GOOD | {"goal": READY}, "goal is .* it must be one of joints, joint_set, pose and any"),
+    "goal a list": (
+        GOOD | {"goal": READY},
+        "goal is .* one of joints, joint_set, pose, poses, any",
+    ),
     "unknown goal": (
         GOOD | {"goal": {"place": []}},
         "unknown field of goal: 'place'; known: any, joint_set, joints",
     ),
     "two goals": (
         GOOD | {"goal": {"joints": READY, "pose": {}}},
-        "it must be one of joints, joint_set, pose and any",
+        "it must be one of joints, joint_set, pose, poses, any",
     ),
     "set as joints": (GOOD | {"goal": {"joints": [READY]}}, "goal.joints is .* it must be a list of numbers"),
     "joints as set": (GOOD | {"goal": {"joint_set": READY}}, "goal.joint_set is .* a list of configurations"),

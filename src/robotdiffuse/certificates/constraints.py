@@ -16,7 +16,7 @@ from numpy import ndarray
 from robotdiffuse.certificates.kinematics import Linkage, Postures
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
-from robotdiffuse.problems.goals import JointGoal, PoseGoal
+from robotdiffuse.problems.goals import JointGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.types import Trajectory
 
@@ -157,10 +157,10 @@ def _ends(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndar
     start, goal = linkage.place(problem.start[None]).T[0], problem.goal
     if isinstance(goal, JointGoal):
         return start[k], linkage.place(goal.positions[:1]).T[0, k]
-    if isinstance(goal, PoseGoal):
-        other = linkage.links.index(goal.frame)
+    for pose in poses_of(goal):
+        other = linkage.links.index(pose.frame)
         if (linkage.moved[k] == linkage.moved[other]).all():
-            return start[k], goal.T_base_frame @ np.linalg.inv(start[other]) @ start[k]
+            return start[k], pose.T_base_frame @ np.linalg.inv(start[other]) @ start[k]
     raise InputError(f"cartesian_line of {line.frame}: the goal does not say one pose of it")
 
 

@@ -9,7 +9,7 @@ from numpy import ndarray
 from robotdiffuse.certificates.certificate import AGREEMENT, Certificate, Tolerances
 from robotdiffuse.certificates.constraints import kept, too_fast
 from robotdiffuse.certificates.kinematics import Linkage
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, Trajectory
@@ -148,6 +148,8 @@ def at_goal(robot: Robot, goal: Goal, q: Float[ndarray, "dof"], tolerances: Tole
     """Whether a configuration is at a goal."""
     if isinstance(goal, AnyGoal):
         return any(at_goal(robot, one, q, tolerances) for one in goal.goals)
+    if isinstance(goal, PosesGoal):
+        return all(at_goal(robot, one, q, tolerances) for one in goal.poses)
     if isinstance(goal, JointGoal):
         off = goal.positions - q
         off = np.where(robot.continuous, np.arctan2(np.sin(off), np.cos(off)), off)

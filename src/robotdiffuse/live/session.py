@@ -21,7 +21,7 @@ from robotdiffuse.live.obstacles import handle_pose, held_at, new_obstacle, resi
 from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, load_planner, planner_settings
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.candidates import Candidates, draw_candidates
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
@@ -349,17 +349,20 @@ def _target(problem: Problem) -> tuple[str, Float[ndarray, "4 4"], Float[ndarray
     goal, robot = problem.goal, problem.robot
     if isinstance(goal, AnyGoal):
         goal = goal.goals[0]
-    if isinstance(goal, PoseGoal):
-        return goal.frame, goal.T_base_frame, None
+    if poses := poses_of(goal):
+        return poses[0].frame, poses[0].T_base_frame, None
     assert isinstance(goal, JointGoal)
     q = goal.positions[0]
     return robot.tip, link_pose(robot, q, robot.tip), q
 
 
-def _posed(goal: Goal, frame: str, T_base_frame: Float[ndarray, "4 4"]) -> PoseGoal:
-    """The goal at another pose; a pose's tolerances stay."""
+def _posed(goal: Goal, frame: str, T_base_frame: Float[ndarray, "4 4"]) -> PoseGoal | PosesGoal:
+    """The goal at another pose of a link; tolerances stay, and the poses of other links."""
     if isinstance(goal, PoseGoal):
         return replace(goal, T_base_frame=T_base_frame)
+    if isinstance(goal, PosesGoal):
+        moved = replace(next(one for one in goal.poses if one.frame == frame), T_base_frame=T_base_frame)
+        return PosesGoal([moved if one.frame == frame else one for one in goal.poses])
     return PoseGoal(frame, T_base_frame)
 
 

@@ -1,6 +1,6 @@
 """Where a motion begins and may end: goals of a pose, ends that touch, and why there can be no plan."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -11,28 +11,16 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.planners.call import Call
-from robotdiffuse.problems.constraints import PositionBox
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
+from robotdiffuse.planners.poses import reaching
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.results import PlanResult
-from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.tolerances import DEFAULT, goal_error
 from robotdiffuse.types import Status
 
-GOAL_COUNT = 10
-"""Configurations that are looked for when the goal is a pose (the paper's k)."""
-POSES, OF_EACH = 20, 2
-"""Poses within the tolerances of a goal that are tried, and configurations that are looked for in each."""
 ROUNDS, LOOKING = 100, 0.5
 """How often others are tried, by the exact meshes, as long as none is free; the share of the time left."""
-SOME_ROUNDS = InverseKinematicsSettings(max_rounds=2, patience=1)
-"""Of these: many may be out of reach."""
-FEW_ROUNDS = InverseKinematicsSettings(max_rounds=8, patience=2)
-"""Of these under path constraints: none may keep them."""
-SHARE_AT_GOAL, LEAST_BOX = 0.9, 2e-4
-"""Share of the tolerances that projected goals keep; half edges of the box that they are kept in [m]."""
 END_MARGIN = 0.0005
 """What an end that is closer than the wanted clearance keeps less than it has [m]."""
 RETREAT_STEP = 0.01
@@ -133,7 +121,7 @@ def images(
 def usable_ends(call: Call) -> Ends | PlanResult:
     """The ends that a search of this call can begin and end at, or the result that says why it cannot.
 
-    For a pose, up to GOAL_COUNT configurations by inverse kinematics. Configurations that the covering
+    For poses, up to `poses.GOAL_COUNT` configurations by inverse kinematics. Configurations that the covering
     spheres call free come alone; where there are none, those that the exact meshes call free.
     """
     checker = CollisionChecker(call.problem.robot, call.problem.scene)
@@ -226,9 +214,9 @@ def _goals(call: Call, goal: Goal, checker: CollisionChecker) -> Float[ndarray, 
             return np.concatenate(found)
         none = next(result for result in each if isinstance(result, PlanResult))
         return replace(none, reason=f"none of {len(each)} goals can be reached, the first: {none.reason}")
-    if isinstance(goal, PoseGoal):
-        return _pose_goals(call, goal, checker)
-    return _free_goals(call, goal, checker)
+    if isinstance(goal, JointGoal):
+        return _free_goals(call, goal, checker)
+    return _pose_goals(call, goal, checker)
 
 
 def _free_goals(
@@ -256,15 +244,16 @@ def _free_goals(
 
 
 def _pose_goals(
-    call: Call, goal: PoseGoal, checker: CollisionChecker
+    call: Call, goal: PoseGoal | PosesGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    robot, scene = call.problem.robot, call.problem.scene
-    found = _reaching(call, goal, checker.free)
+    problem, robot, scene = call.problem, call.problem.robot, call.problem.scene
+    constraints, rng = call.judge.constraints, call.rng
+    found = reaching(problem, goal, constraints, rng, checker.free)
     if len(found):
         return _by_turns(call, found)
     until, collisions = call.elapsed + LOOKING * call.remaining, list[str | None]()
     for _ in range(ROUNDS):
-        reached = _reaching(call, goal, None)
+        reached = reaching(problem, goal, constraints, rng)
         found = [_explained(robot, scene, q) for q in reached]
         kept = [q for q, collision in zip(reached, found, strict=True) if collision is None]
         if kept:
@@ -272,24 +261,25 @@ def _pose_goals(
         collisions += found
         if not goal.tolerant or call.elapsed > until:
             break
-    xyz = ", ".join(f"{value:.3f}" for value in goal.T_base_frame[:3, 3])
-    if not collisions and call.judge.constraints is not None:
-        any_of_it = inverse_kinematics(
-            robot, goal.frame, goal.T_base_frame, 1, rng=call.rng, rest=call.problem.start
-        )
-        wrong = call.judge.constraints.worst(any_of_it[0]) if len(any_of_it) else None
+    places = [", ".join(f"{value:.3f}" for value in pose.T_base_frame[:3, 3]) for pose in poses_of(goal)]
+    named = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
+    of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in named.items())
+    if not collisions and constraints is not None:
+        any_of_it = reaching(replace(problem, constraints=()), goal, None, rng)
+        wrong = constraints.worst(any_of_it[0]) if len(any_of_it) else None
         if wrong is not None:
-            what = f"no configuration was found for the pose of {goal.frame} at ({xyz}) m that keeps the"
+            what = f"no configuration was found for {of_poses} that keeps the"
             return call.fail(Status.INVALID_GOAL, f"{what} constraints, e.g. {wrong.message}")
     if not collisions:
+        several = poses_of(goal) if len(named) > 1 else ()
+        alone = [pose.frame for pose in several if not len(reaching(problem, pose, None, rng))]
+        brought = " and ".join(f"{frame} to the pose at {named[frame]}" for frame in alone or named)
         return call.fail(
-            Status.UNREACHABLE_GOAL,
-            f"no configuration within the joint limits brings {goal.frame} to the pose at ({xyz}) m",
+            Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {brought}"
         )
     return call.fail(
         Status.INVALID_GOAL,
-        f"all {len(collisions)} configurations found for the pose of {goal.frame} at ({xyz}) m are in "
-        f"collision, e.g. {collisions[0]}",
+        f"all {len(collisions)} configurations found for {of_poses} are in collision, e.g. {collisions[0]}",
     )
 
 
@@ -297,75 +287,6 @@ def _by_turns(call: Call, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:
     """Goals of a pose, which does not say how often a joint turns."""
     robot, start = call.problem.robot, call.problem.start
     return np.concatenate([robot.same_stance(q, start) for q in goals])
-
-
-def _reaching(
-    call: Call, goal: PoseGoal, accept: Callable[[ndarray], ndarray] | None
-) -> Float[ndarray, "k dof"]:
-    """Configurations that bring the link to the pose; where it has tolerances, to some poses within them.
-    Another arm stays where it starts."""
-    robot, rng, constraints = call.problem.robot, call.rng, call.judge.constraints
-    if constraints is not None:
-        return _reaching_constrained(call, goal, constraints, accept)
-    rest = call.problem.start
-    if not goal.tolerant:
-        return inverse_kinematics(
-            robot, goal.frame, goal.T_base_frame, GOAL_COUNT, rng=rng, accept=accept, rest=rest
-        )
-    found = np.zeros((0, robot.dof))
-    for i in range(POSES):
-        T_base_frame = goal.draw(rng) if i else goal.T_base_frame
-        few = inverse_kinematics(
-            robot, goal.frame, T_base_frame, OF_EACH, rng=rng, accept=accept, settings=SOME_ROUNDS, rest=rest
-        )
-        found = np.concatenate([found, few])
-        if len(found) >= GOAL_COUNT:
-            break
-    return found[:GOAL_COUNT]
-
-
-def _reaching_constrained(
-    call: Call,
-    goal: PoseGoal,
-    constraints: PathConstraints,
-    accept: Callable[[ndarray], ndarray] | None,
-) -> Float[ndarray, "k dof"]:
-    """The same of configurations that keep the constraints: those of a pose with tolerances are projected
-    onto them, and kept where they are still within."""
-    problem, found = call.problem, np.zeros((0, call.problem.robot.dof))
-
-    def keeps(q: ndarray) -> ndarray:
-        kept = constraints.kept(q)
-        return kept if accept is None else kept & accept(q)
-
-    def reached(T_base_frame: ndarray, count: int, accept: Callable[[ndarray], ndarray] | None) -> ndarray:
-        robot, settings = problem.robot, FEW_ROUNDS
-        return inverse_kinematics(
-            robot,
-            goal.frame,
-            T_base_frame,
-            count,
-            rng=call.rng,
-            accept=accept,
-            settings=settings,
-            rest=problem.start,
-        )
-
-    if not goal.tolerant:
-        return reached(goal.T_base_frame, GOAL_COUNT, keeps)
-    xyz = np.full(3, 0.5 * DEFAULT.goal_distance) if goal.xyz_tolerance is None else goal.xyz_tolerance
-    half = np.maximum(xyz, LEAST_BOX)
-    box = PositionBox(goal.frame, -half, half, goal.T_base_frame)
-    within = PathConstraints(replace(problem, constraints=(*problem.constraints, box)))
-    for i in range(POSES):
-        few = reached(goal.draw(call.rng) if i else goal.T_base_frame, OF_EACH, None)
-        few = np.concatenate([few[constraints.kept(few)], within.projected(few, SHARE_AT_GOAL)])
-        at_goal = [goal_error(problem.robot, goal, q) is None for q in few]
-        few = few[np.array(at_goal, bool)]
-        found = np.concatenate([found, few if accept is None or not len(few) else few[accept(few)]])
-        if len(found) >= GOAL_COUNT:
-            break
-    return found[:GOAL_COUNT]
 
 
 def _explained(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:

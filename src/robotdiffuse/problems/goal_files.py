@@ -4,6 +4,7 @@
 {joint_set: [[...], [...]]}
 {pose: {frame: panda_hand, xyz: [...], wxyz: [...]}}
 {pose: {..., relative_to: shelf, xyz_tolerance: [0.1, 0.1, 0], rpy_tolerance: [0, 0, 3.1416]}}
+{poses: {left_gripper: {xyz: [...], wxyz: [...]}, right_gripper: {...}}}
 {any: [{pose: {...}}, {joints: [...]}]}
 """
 
@@ -15,12 +16,12 @@ from numpy import ndarray
 from robotdiffuse.checks import numbers
 from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.equipment import pose_entry, pose_of
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.placement import placed
 from robotdiffuse.scenes.scene import Scene
 
-GOALS = ("joints", "joint_set", "pose", "any")
+GOALS = ("joints", "joint_set", "pose", "poses", "any")
 TOLERANCES = ("xyz_tolerance", "rpy_tolerance")
 
 
@@ -28,7 +29,7 @@ def read_goal(field: str, data: object, scene: Scene) -> Goal:
     """A goal of a problem file; InputError that names its field. Poses are in the frame of the scene, or of
     one of its objects."""
     if not isinstance(data, dict) or len(data) != 1:
-        raise InputError(f"{field} is {shown(data)}; it must be one of joints, joint_set, pose and any")
+        raise InputError(f"{field} is {shown(data)}; it must be one of {', '.join(GOALS)}")
     [(kind, value)] = data.items()
     if kind not in GOALS:
         raise unknown_name(f"field of {field}:", kind, GOALS)
@@ -39,6 +40,11 @@ def read_goal(field: str, data: object, scene: Scene) -> Goal:
         return AnyGoal(tuple(goals))  # type: ignore[arg-type]
     if kind == "pose":
         return _pose_goal(f"{field}.pose", value, scene)
+    if kind == "poses":
+        if not isinstance(value, dict) or not value:
+            raise InputError(f"{field}.poses is {shown(value)}; it must have a pose for each of some links")
+        each = [_pose_goal(f"{field}.poses.{frame}", one, scene, frame) for frame, one in value.items()]
+        return PosesGoal(each)
     array = numbers(value)
     if array is None or array.ndim != (1 if kind == "joints" else 2):
         form = "a list of numbers" if kind == "joints" else "a list of configurations of one length"
@@ -60,13 +66,21 @@ def goal_entry(goal: Goal) -> dict[str, Any]:
     if isinstance(goal, JointGoal):
         rows = goal.positions.tolist()
         return {"joints": rows[0]} if len(rows) == 1 else {"joint_set": rows}
-    tolerances = {name: getattr(goal, name) for name in TOLERANCES}
+    if isinstance(goal, PosesGoal):
+        return {"poses": {pose.frame: _entry(pose) for pose in goal.poses}}
+    return {"pose": {"frame": goal.frame, **_entry(goal)}}
+
+
+def _entry(pose: PoseGoal) -> dict[str, Any]:
+    tolerances = {name: getattr(pose, name) for name in TOLERANCES}
     given = {name: value.tolist() for name, value in tolerances.items() if value is not None}
-    return {"pose": {"frame": goal.frame, **pose_entry(goal.T_base_frame), **given}}
+    return {**pose_entry(pose.T_base_frame), **given}
 
 
-def _pose_goal(field: str, value: object, scene: Scene) -> PoseGoal:
-    pose = check_fields(field, value, ("frame", "xyz", "wxyz"), ("relative_to", *TOLERANCES))
+def _pose_goal(field: str, value: object, scene: Scene, frame: object = None) -> PoseGoal:
+    """`frame`: of a pose that does not say it itself."""
+    own = () if frame is not None else ("frame",)
+    pose = {"frame": frame, **check_fields(field, value, (*own, "xyz", "wxyz"), ("relative_to", *TOLERANCES))}
     T = pose_of(field, pose)
     if "relative_to" in pose:
         T = _object_pose(field, pose["relative_to"], scene) @ T

@@ -1,8 +1,10 @@
-"""Where a motion is to end: configurations, poses of links with what they may be off, or any of several.
+"""Where a motion is to end: configurations, poses of links with what they may be off, poses of several
+links at once, or any of several.
 
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, no_type_check
 
@@ -100,27 +102,65 @@ class PoseGoal:
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
+class PosesGoal:
+    """A pose for each of several links at once, for each hand of two arms say, each with its tolerances."""
+
+    poses: tuple[PoseGoal, ...]
+
+    def __post_init__(self) -> None:
+        poses = self.poses if isinstance(self.poses, list | tuple) else ()
+        if not poses or not all(isinstance(pose, PoseGoal) for pose in poses):
+            raise InputError(f"goal.poses is {shown(self.poses)}; it must be a list of rd.PoseGoal")
+        frames = [pose.frame for pose in poses]
+        twice = next((frame for frame in frames if frames.count(frame) > 1), None)
+        if twice is not None:
+            raise InputError(f"goal.poses names {twice!r} twice; each link has one pose")
+        object.__setattr__(self, "poses", tuple(poses))
+
+    if TYPE_CHECKING:
+
+        def __init__(self, poses: Sequence[PoseGoal]) -> None: ...
+
+    @property
+    def tolerant(self) -> bool:
+        """Whether more than one pose of any link will do."""
+        return any(pose.tolerant for pose in self.poses)
+
+
+@no_type_check
+@dataclass(frozen=True, eq=False)
 class AnyGoal:
     """Any of several goals."""
 
-    goals: "tuple[JointGoal | PoseGoal, ...]"
+    goals: "tuple[OneGoal, ...]"
 
     def __post_init__(self) -> None:
         goals = self.goals if isinstance(self.goals, list | tuple) else ()
-        if not goals or not all(isinstance(goal, JointGoal | PoseGoal) for goal in goals):
+        if not goals or not all(isinstance(goal, OneGoal) for goal in goals):
             raise InputError(
-                f"goal.goals is {shown(self.goals)}; it must be a list of rd.JointGoal and rd.PoseGoal"
+                f"goal.goals is {shown(self.goals)}; it must be a list of rd.JointGoal, rd.PoseGoal and "
+                "rd.PosesGoal"
             )
         object.__setattr__(self, "goals", tuple(goals))
 
 
-Goal = JointGoal | PoseGoal | AnyGoal
+OneGoal = JointGoal | PoseGoal | PosesGoal
+Goal = OneGoal | AnyGoal
+
+
+def poses_of(goal: Goal) -> tuple[PoseGoal, ...]:
+    """The poses that a goal asks for together; none of configurations, or of any of several goals."""
+    if isinstance(goal, PosesGoal):
+        return goal.poses
+    return (goal,) if isinstance(goal, PoseGoal) else ()
 
 
 def moved_goal(goal: Any, T: Float[ndarray, "4 4"]) -> Any:
     """The goal after a rigid motion: poses move, configurations do not."""
     if isinstance(goal, AnyGoal):
         return AnyGoal(tuple(moved_goal(one, T) for one in goal.goals))
+    if isinstance(goal, PosesGoal):
+        return PosesGoal([moved_goal(pose, T) for pose in goal.poses])
     if isinstance(goal, list | tuple):
         return [moved_goal(one, T) for one in goal]
     return replace(goal, T_base_frame=T @ goal.T_base_frame) if isinstance(goal, PoseGoal) else goal

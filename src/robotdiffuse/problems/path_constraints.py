@@ -1,5 +1,6 @@
 """The path constraints of a problem, made ready: what they say of configurations, and proofs of motions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,7 +19,7 @@ from robotdiffuse.problems.constraints import (
     OnPlane,
     PositionBox,
 )
-from robotdiffuse.problems.goals import JointGoal, PoseGoal
+from robotdiffuse.problems.goals import JointGoal, PoseGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.inverse_kinematics import KINDS
 from robotdiffuse.robots.kinematics import link_pose
@@ -31,6 +32,8 @@ EPISODE_STEP, EPISODE_STEPS = 0.01, 1000
 """Step [rad] and number of the configurations at which the greatest excess is looked for."""
 INNER = 0.5
 """Share of a tolerance that projection goes to."""
+EXACT = 2e-6
+"""What a projected link may be off its pose [m], [rad]."""
 SHORTEST = 1e-3
 """A Cartesian line is at least so long [m]."""
 ONE_POSE = 1e-3
@@ -82,13 +85,18 @@ class _Row(NamedTuple):
 class PathConstraints:
     """Rows of all constraints of a problem."""
 
-    def __init__(self, problem: Problem) -> None:
-        """Raises InputError where a Cartesian line has no ends."""
+    def __init__(self, problem: Problem, poses: Sequence[PoseGoal] = ()) -> None:
+        """`poses`: beside them, links that are to be at these very poses, for projection.
+
+        Raises InputError where a Cartesian line has no ends.
+        """
         self.robot = problem.robot
         each = [(constraint, row) for constraint in problem.constraints for row in _rows(problem, constraint)]
         self.owners = [constraint for constraint, _ in each]
         """The constraint of each row."""
-        self.rows = _arrays(problem.robot, self.owners, [row for _, row in each])
+        at = [(pose.frame, row) for pose in poses for row in _pose_rows(pose)]
+        frames = [owner.frame for owner in self.owners] + [frame for frame, _ in at]
+        self.rows = _arrays(problem.robot, frames, [row for _, row in each + at])
         self._paced = [
             (m, owner.speed)
             for m, owner in enumerate(self.owners)
@@ -220,13 +228,17 @@ def line_end(problem: Problem, line: CartesianLine) -> Float[ndarray, "4 4"]:
         if all(np.linalg.norm(T[:3, 3]) < ONE_POSE and rotation_angle(T[:3, :3]) < ONE_POSE for T in off):
             return poses[0]
         why = f"its {len(poses)} configurations have {line.frame} at different poses"
-    elif isinstance(goal, PoseGoal) and not goal.tolerant:
-        if robot.link_frame(goal.frame) == robot.link_frame(line.frame):
-            between = inverse(robot.T_frame_link(goal.frame)) @ robot.T_frame_link(line.frame)
-            return goal.T_base_frame @ between
-        why = f"it is a pose of {goal.frame}, which does not move with {line.frame}"
+    elif poses := poses_of(goal):
+        for pose in poses:
+            if robot.link_frame(pose.frame) == robot.link_frame(line.frame) and not pose.tolerant:
+                between = inverse(robot.T_frame_link(pose.frame)) @ robot.T_frame_link(line.frame)
+                return pose.T_base_frame @ between
+        what = " and of ".join(pose.frame for pose in poses)
+        why = f"it is a pose of {what}, which does not move with {line.frame}"
+        if any(robot.link_frame(pose.frame) == robot.link_frame(line.frame) for pose in poses):
+            why = "it leaves room"
     else:
-        why = "it leaves room" if isinstance(goal, PoseGoal) else "it is any of several"
+        why = "it is any of several"
     raise InputError(f"cartesian_line of {line.frame}: the goal must say one pose of it, but {why}")
 
 
@@ -242,8 +254,13 @@ def _rotation_vector(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
     return angle * axis * (-1.0 if skew @ axis < 0 else 1.0)
 
 
-def _arrays(robot: Robot, owners: list[Constraint], rows: list[_Row]) -> Rows:
-    frames = [owner.frame for owner in owners]
+def _pose_rows(pose: PoseGoal) -> list[_Row]:
+    """Position and orientation, without their tolerances."""
+    T, nothing = pose.T_base_frame, np.zeros(3)
+    return [_Row(what, EXACT, EXACT, T, nothing, nothing) for what in (DISTANCE, TURN)]
+
+
+def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
     chains = [robot.chain(frame) for frame in frames]
     joints = np.zeros((len(chains), robot.dof), np.int64)
     for row, chain in zip(joints, chains, strict=True):

@@ -17,9 +17,10 @@ from robotdiffuse.checks import LARGEST, numbers
 from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
-from robotdiffuse.problems.goals import Goal, check_pose, moved_goal
+from robotdiffuse.problems.goals import Goal, OneGoal, check_pose, moved_goal
 from robotdiffuse.problems.goals import JointGoal as JointGoal
 from robotdiffuse.problems.goals import PoseGoal as PoseGoal
+from robotdiffuse.problems.goals import PosesGoal as PosesGoal
 from robotdiffuse.robots.dynamics import check_dynamics
 from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.robots.robot import Joint, Robot
@@ -41,8 +42,8 @@ imagines it; occupied. See `planners/unseen.py`."""
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """`goal` may be given as a configuration, a list of them, a JointGoal or a PoseGoal, or a list of those,
-    of which any is to be reached; so may each of the waypoints.
+    """`goal` may be given as a configuration, a list of them, a JointGoal, a PoseGoal or a PosesGoal, or a
+    list of those, of which any is to be reached; so may each of the waypoints.
 
     Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note; those of continuous joints are
     kept as they are, and whole turns of a goal do not matter. Raises InputError for everything else that no
@@ -153,13 +154,13 @@ class Problem:
             robot: Robot,
             scene: Scene,
             start: ArrayLike,
-            goal: ArrayLike | Goal | Sequence[JointGoal | PoseGoal],
+            goal: ArrayLike | Goal | Sequence[OneGoal],
             notes: tuple[str, ...] = (),
             clearance: float | None = None,
             views: Sequence[DepthView] = (),
             unseen: str = OPTIMISTIC,
             T_world_base: ArrayLike | None = None,
-            waypoints: Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]] = (),
+            waypoints: Sequence[ArrayLike | Goal | Sequence[OneGoal]] = (),
             constraints: Sequence[Constraint] = (),
             moving: Sequence[MovingObstacle] = (),
             start_velocity: ArrayLike | None = None,
@@ -174,12 +175,12 @@ class Problem:
         robot: Robot,
         scene: Scene,
         start: ArrayLike,
-        goal: "ArrayLike | Goal | Sequence[JointGoal | PoseGoal]",
+        goal: "ArrayLike | Goal | Sequence[OneGoal]",
         notes: tuple[str, ...] = (),
         clearance: float | None = None,
         views: "Sequence[DepthView]" = (),
         unseen: str = OPTIMISTIC,
-        waypoints: "Sequence[ArrayLike | Goal | Sequence[JointGoal | PoseGoal]]" = (),
+        waypoints: "Sequence[ArrayLike | Goal | Sequence[OneGoal]]" = (),
         constraints: "Sequence[Constraint]" = (),
         moving: "Sequence[MovingObstacle]" = (),
         start_velocity: ArrayLike | None = None,
@@ -326,7 +327,7 @@ def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
 
 def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
     """The goal as one of its classes, its configurations within limits."""
-    if isinstance(goal, list | tuple) and any(isinstance(one, JointGoal | PoseGoal) for one in goal):
+    if isinstance(goal, list | tuple) and any(isinstance(one, OneGoal) for one in goal):
         goal = AnyGoal(tuple(goal))
     if isinstance(goal, AnyGoal):
         fields = (f"{field}.goals[{i}]" for i in range(len(goal.goals)))
@@ -335,9 +336,24 @@ def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
     if isinstance(goal, PoseGoal):
         _check_moved(robot, f"{field}.frame", goal.frame)
         return goal
+    if isinstance(goal, PosesGoal):
+        _check_apart(robot, field, goal)
+        return goal
     rows = goal.positions if isinstance(goal, JointGoal) else JointGoal(goal).positions  # type: ignore[arg-type]
     fields = [field] if len(rows) == 1 else [f"{field}[{i}]" for i in range(len(rows))]
     return JointGoal(np.stack([_configuration(robot, *row, notes) for row in zip(fields, rows, strict=True)]))
+
+
+def _check_apart(robot: Robot, field: str, goal: PosesGoal) -> None:
+    """InputError unless planned joints move each link, and any two of them against each other."""
+    parts = dict[int, str]()
+    for pose in goal.poses:
+        _check_moved(robot, f"{field}.poses", pose.frame)
+        other = parts.setdefault(robot.link_frame(pose.frame), pose.frame)
+        if other != pose.frame:
+            raise InputError(
+                f"{field}.poses: {other} and {pose.frame} are one rigid part; give the pose of one of them"
+            )
 
 
 def _configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:
