@@ -184,9 +184,9 @@ def test_files_name_the_field(entry: object, message: str) -> None:
         problem_from_record(record | {"moving": entry})
 
 
-def test_moving_obstacles_stand_beside_neither_waypoints_nor_views() -> None:
+def test_moving_obstacles_stand_beside_neither_blends_nor_start_velocities() -> None:
     ball = rd.MovingObstacle(BALL, velocity=[0, 1, 0])
-    with pytest.raises(InputError, match="moving cannot be had beside waypoints"):
-        rd.Problem(PANDA, rd.Scene(), START, END, waypoints=[END], moving=[ball])
-    with pytest.raises(InputError, match="moving cannot be had beside start_velocity"):
+    with pytest.raises(InputError, match="moving cannot be had beside blend: the motion stops"):
+        rd.Problem(PANDA, rd.Scene(), START, END, waypoints=[END], moving=[ball], blend=0.1)
+    with pytest.raises(InputError, match="start_velocity cannot be had beside moving"):
         rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], start_velocity=[0.1] * 7)

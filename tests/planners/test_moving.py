@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import PLANNERS
 from robotdiffuse.planners.moving_kernel import WAITED, earliest
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.types import Status
 from robotdiffuse.verify import verify_trajectory
 
@@ -127,3 +129,56 @@ def test_start_velocity_beyond_what_scaling_leaves() -> None:
         rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
     with pytest.raises(InputError, match="jerk cannot be limited beside start_velocity"):
         rd.load_planner("rrt_connect").plan(task, jerk=100.0)
+
+
+UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
+BESIDE: dict[str, dict[str, object]] = {
+    "waypoints": {"waypoints": [(START + END) / 2 - [0, 0.3, 0, 0, 0, 0, 0], START]},
+    "constraints": {"constraints": [UPRIGHT]},
+    "payload": {"payload": rd.Payload(2.0)},
+    "all": {"waypoints": [[-0.6, *START[1:]]], "constraints": [UPRIGHT]},
+}
+
+
+@pytest.mark.parametrize("asked", BESIDE)
+def test_what_else_is_asked_holds_among_moving_obstacles(asked: str) -> None:
+    if asked == "payload":
+        pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
+    obstacle = PASSING if asked == "waypoints" else CROSSING
+    task = problem(obstacle, **BESIDE[asked])
+    found = rd.load_planner("rrt_connect").plan(task, 20.0)
+    assert found.trajectory is not None, found.reason
+    motion = found.trajectory
+    assert verify_trajectory(task, motion).valid
+    for t in np.arange(0.0, motion.duration, 0.02):
+        q = np.array([np.interp(t, motion.times, column) for column in motion.positions.T])
+        exact = ExactCollision(PANDA, rd.Scene([obstacle.at(t)]))
+        assert min(d.distance for d in exact.link_distances(q)) > 0
+        tilt = np.arccos(min(-link_pose(PANDA, q, "panda_hand")[2, 2], 1.0))
+        assert "constraints" not in BESIDE[asked] or tilt <= UPRIGHT.angle + 1e-6
+    resting = np.abs(motion.velocities).max(axis=1) < 1e-9
+    for waypoint in task.waypoints:
+        there = np.abs(motion.positions - waypoint.positions[0]).max(axis=1) < 1e-6  # type: ignore[union-attr]
+        assert (there & resting).any()
+    if asked != "payload":  # of which certificates say nothing
+        assert check(rd.certify(task, motion), task).valid
+
+
+def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
+    """The waypoint is on the straight line, where nothing would stop the motion; a ball is there first."""
+    middle = (START + END) / 2
+    at = link_pose(PANDA, middle, "panda_hand")[:3, 3]
+    ball = rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3])
+    task = problem(ball, waypoints=[middle])
+    found = rd.load_planner("rrt_connect").plan(task, 20.0)
+    assert found.trajectory is not None, found.reason
+    assert verify_trajectory(task, found.trajectory).valid
+    alone = rd.load_planner("rrt_connect").plan(replace(task, moving=()), 20.0).trajectory
+    assert alone is not None and found.trajectory.duration > alone.duration
+
+
+def test_the_loop_says_what_it_does_not_know() -> None:
+    ball = rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1, name="ball"), max_speed=0.1)
+    for more in BESIDE.values():
+        with pytest.raises(InputError, match=r"problem\.\w+: the replanner knows of none"):
+            rd.Replanner(problem(ball, **more))

@@ -135,9 +135,6 @@ def test_robots_without_inertias_are_refused_by_name() -> None:
     middle = (arm.lower + arm.upper) / 2
     with pytest.raises(InputError, match="iiwa14 has no inertia of what moves with joint joint_a1; its URDF"):
         rd.Problem(arm, rd.Scene(), middle, middle, payload=Payload(1.0))
-    with pytest.raises(InputError, match="moving cannot be had beside payload"):
-        ball = rd.MovingObstacle(rd.Sphere([5, 0, 0], 0.1), velocity=[0, 1, 0])
-        rd.Problem(PANDA, rd.Scene(), LOW, FAR, moving=[ball], payload=Payload(1.0))
 
 
 def test_files_keep_payloads(tmp_path: Path) -> None:

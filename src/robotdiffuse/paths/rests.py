@@ -1,6 +1,6 @@
 """Motions from rest to rest between places of one path, to and fro, for timings that wait and draw back."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.paths.blending import BlendedPolyline, half_widths
-from robotdiffuse.paths.speeds import Rows, TimingSettings, timed_piece
+from robotdiffuse.paths.speeds import NOTHING, Beside, Rows, TimingSettings, timed_piece
 from robotdiffuse.paths.timing import rounded_corners
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, Trajectory
@@ -42,11 +42,15 @@ class Rests:
         free: Callable[[Path], bool],
         settings: TimingSettings,
         step: float,
+        keeps: Callable[[ndarray], bool] = lambda _: True,
+        beside: Beside = NOTHING,
+        stops: Sequence[int] = (),
     ) -> None:
         """Every motion lasts a whole number of steps [s]. Corners are rounded where the path that is timed
-        without stops is `valid` then; `free` as in `time_parameterize`."""
-        self.joint_names, self.step = path.joint_names, step
-        waypoints, deviations = rounded_corners(robot, path, valid, free, settings)
+        without further stops is `valid` then; `free`, `keeps` and `beside` as in `time_parameterize`. No
+        motion goes through the path's rows `stops`: there it ends, and another begins."""
+        self.joint_names, self.step, self._beside = path.joint_names, step, beside
+        waypoints, deviations = rounded_corners(robot, path, valid, free, settings, keeps, beside, stops)
         self.line = BlendedPolyline(waypoints, half_widths(waypoints, deviations))
         self.places = self._places(deviations)
         self.motions = [
@@ -81,7 +85,7 @@ class Rests:
         part = BlendedPolyline(
             np.concatenate([ends[:1], line.waypoints[inner], ends[1:]]), line.half_widths[inner - 1]
         )
-        times, q, v, a = timed_piece(robot, part, settings)
+        times, q, v, a = timed_piece(robot, part, settings, beside=self._beside)
         q = q.copy()
         q[[0, -1]] = ends
         found = []

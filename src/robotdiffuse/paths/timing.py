@@ -1,6 +1,6 @@
 """Time-optimal timing of a path within velocity and acceleration limits."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -76,13 +76,18 @@ def rounded_corners(
     valid: Callable[[Trajectory], bool],
     free: Callable[[Path], bool],
     settings: TimingSettings = DEFAULT,
+    keeps: Callable[[ndarray], bool] = lambda _: True,
+    beside: Beside = NOTHING,
+    stops: Sequence[int] = (),
 ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "corners"]]:
     """The waypoints of a path that differ, two at least, and how far `time_parameterize` would round each
-    corner."""
+    corner; those at the rows `stops` not at all."""
     _check_limits(robot)
-    waypoints = path.positions[_distinct(path.positions)]
-    most = np.full(len(waypoints) - 2, settings.corner_deviation)
-    return waypoints, _rounded(robot, path, waypoints, most, valid, free, settings, lambda _: True, 0.0)[0]
+    rows = _distinct(path.positions)
+    most = np.full(len(rows), settings.corner_deviation)
+    most[np.searchsorted(rows, stops, side="right") - 1] = 0.0
+    given = path.positions[rows], most[1:-1]
+    return given[0], _rounded(robot, path, *given, valid, free, settings, keeps, 0.0, beside)[0]
 
 
 def _rounded(

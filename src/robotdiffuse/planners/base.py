@@ -86,14 +86,14 @@ class Planner(ABC, Generic[Own]):
         return replace(self._plan(problem, time_limit, seed, request), problem=problem)
 
     def _plan(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
-        if problem.waypoints:
-            from robotdiffuse.planners.legs import plan_by_waypoints
-
-            return plan_by_waypoints(self, problem, time_limit, seed, request)
         if problem.moving:
             from robotdiffuse.planners.moving import plan_among_moving
 
             return plan_among_moving(self, problem, time_limit, seed, request)
+        if problem.waypoints:
+            from robotdiffuse.planners.legs import plan_by_waypoints
+
+            return plan_by_waypoints(self, problem, time_limit, seed, request)
         if problem.start_velocity is not None:
             from robotdiffuse.planners.in_motion import plan_in_motion
 

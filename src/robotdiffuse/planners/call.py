@@ -199,7 +199,7 @@ class Call:
             self.timing,
             keeps,
             0.0 if problem.start_velocity is None else float(np.linalg.norm(problem.start_velocity)),
-            self._beside,
+            self.beside,
             deviations,
         )
         timed = motion.report(trajectory)
@@ -230,7 +230,7 @@ class Call:
         )
 
     @property
-    def _beside(self) -> Beside:
+    def beside(self) -> Beside:
         """The speeds that constraints bound, and the torques of a payload."""
         constraints, pace = self.judge.constraints, None
         if constraints is not None and len(constraints.paced):

@@ -31,7 +31,7 @@ from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.weights_at_hand import weights_for
 from robotdiffuse.planners.base import CONSTRAINTS
 from robotdiffuse.planners.call import Call
-from robotdiffuse.planners.constrained.search import SHARE
+from robotdiffuse.planners.constrained.search import SHARE, corner_kept
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.learned import LearnedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.problems.path_constraints import PathConstraints
@@ -157,11 +157,6 @@ def _projected(
     return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
 
 
-def _kept(constraints: PathConstraints | None, corner: Float[ndarray, "n dof"]) -> bool:
-    """Whether the way through configurations keeps a share of the tolerances."""
-    return constraints is None or constraints.first(corner, share=SHARE) is None
-
-
 class Diffusion(ModelSampler[DiffusionSettings]):
     """The paper's method as a planner; see the head of this file."""
 
@@ -192,7 +187,7 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         # where none is, the judge is asked about one once more, so that the result says what is wrong with it
         for path in sorted(valid or every[-1:], key=lambda path: path.length):
             how = f"solved by network: {reason}"
-            result = call.finish(path.positions, "network", how, keeps=partial(_kept, constraints))
+            result = call.finish(path.positions, "network", how, keeps=partial(corner_kept, constraints))
             if result is not None:
                 return result
         return call.unsolved(reason)

@@ -8,9 +8,13 @@ arm rested there before, or a motion that nothing is in the way of ends there (s
 M. Likhachev, "SIPP: Safe interval path planning for dynamic environments", ICRA 2011, on a grid). The grid
 only proposes: the motion as a whole is judged in time. Without success other paths are tried: other seeds,
 and ways round where the obstacles are at some time.
+
+A path by waypoints is timed as one: no motion between rests goes through a waypoint, so that the arm stops at
+each, in their order, waits there if it must, and may draw back to one before it.
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,10 +24,13 @@ from robotdiffuse.collision.moving import MovingCollision, links_of
 from robotdiffuse.paths.rests import APART, PACES, Rests
 from robotdiffuse.paths.timing import time_parameterize
 from robotdiffuse.planners.call import Call, Request
+from robotdiffuse.planners.constrained.search import corner_kept
+from robotdiffuse.planners.legs import plan_by_waypoints
 from robotdiffuse.planners.moving_kernel import earliest
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.tolerances import goal_error
 from robotdiffuse.types import Path, Status, Trajectory
 from robotdiffuse.verify import verifier
 
@@ -62,7 +69,8 @@ def plan_among_moving(
             time = float(rng.uniform(0.0, horizon))
             scene = Scene([*scene.shapes, *(one.at(time) for one in problem.moving if one.known)])
         limit = max(SHARE * (time_limit - call.elapsed), 1e-3)
-        found = planner.attempt(replace(still, scene=scene), limit, seed + attempt // 2, request)
+        asked = replace(still, scene=scene), limit, seed + attempt // 2, request
+        found = plan_by_waypoints(planner, *asked) if problem.waypoints else planner.attempt(*asked)
         attempt += 1
         if found.path is None or found.trajectory is None:
             if scene is problem.scene:
@@ -103,6 +111,15 @@ def _solved(
     )
 
 
+def _stops(problem: Problem, path: Path) -> list[int]:
+    """The rows of a path at its waypoints, the first of each after those before it."""
+    rows, stops = range(len(path.positions)), [0]
+    for goal in problem.waypoints:
+        there = (i for i in rows[stops[-1] :] if goal_error(problem.robot, goal, path.positions[i]) is None)
+        stops.append(next(there))
+    return stops[1:]
+
+
 def _timed(
     call: Call,
     problem: Problem,
@@ -114,7 +131,17 @@ def _timed(
     robot, judge = problem.robot, verifier(replace(problem, moving=()))
     if path.length < APART:
         return time_parameterize(robot, path, lambda _: True, judge.collision_free, call.timing)
-    rests = Rests(robot, path, lambda t: judge.trajectory(t).valid, judge.collision_free, call.timing, STEP)
+    rests = Rests(
+        robot,
+        path,
+        lambda t: judge.trajectory(t).valid,
+        judge.collision_free,
+        call.timing,
+        STEP,
+        partial(corner_kept, judge.constraints),
+        call.beside,
+        _stops(problem, path),
+    )
     links = links_of(robot)[1]
     s, configurations = rests.spaced(links.levers.max(axis=0), TRAVEL)
     longest = sum(motion.ticks for motion in rests.motions if motion.target == motion.source + 1) // len(

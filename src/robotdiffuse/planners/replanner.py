@@ -114,6 +114,9 @@ class Replanner:
         has no path among what stands still."""
         if not problem.moving:
             raise InputError("problem.moving is empty; a Replanner needs obstacles that move")
+        for what in ("waypoints", "constraints", "payload"):
+            if getattr(problem, what):
+                raise InputError(f"problem.{what}: the replanner knows of none; rd.plan does")
         self.problem, self.settings, self.seed = problem, settings, seed
         self._robot, self._still = problem.robot, replace(problem, moving=())
         self._judge = verifier(self._still)

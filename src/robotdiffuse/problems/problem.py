@@ -117,10 +117,13 @@ class Problem:
             "start_velocity": () if start_velocity is None else (start_velocity,),
             "payload": () if self.payload is None else (self.payload,),
         }
-        for one in ("moving", "start_velocity"):
-            others = [name for name, given in beside.items() if name != one and given]
-            if beside[one] and others:
-                raise InputError(f"{one} cannot be had beside {others[0]}")
+        others = [name for name, given in beside.items() if name != "start_velocity" and given]
+        if start_velocity is not None and others:
+            raise InputError(f"start_velocity cannot be had beside {others[0]}")
+        if moving and views:
+            raise InputError("moving cannot be had beside views")
+        if moving and any(blend):
+            raise InputError("moving cannot be had beside blend: the motion stops at waypoints")
         check_unseen("unseen", self.unseen)
         T_world_base = self.T_world_base
         if T_world_base is not None:

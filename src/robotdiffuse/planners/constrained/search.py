@@ -59,8 +59,7 @@ class ConstrainedSearch(AnytimeSearch):
 
     def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
         """Whether the way through configurations keeps clearance and constraints."""
-        rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
-        return self.constraints.first(rows, share=SHARE) is None and super().keeps_clearance(rows)
+        return corner_kept(self.constraints, q) and super().keeps_clearance(q)
 
     def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
         """Take a path between the ends that keeps the limits, simplified, if it is the shortest so far."""
@@ -97,3 +96,9 @@ class ConstrainedSearch(AnytimeSearch):
             self.found += 1
             self._trees = None
             self.offer(path, self.name)
+
+
+def corner_kept(constraints: PathConstraints | None, q: Float[ndarray, "n dof"]) -> bool:
+    """Whether the way through configurations, of a rounded corner say, keeps what the search keeps."""
+    rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
+    return constraints is None or constraints.first(rows, share=SHARE) is None
