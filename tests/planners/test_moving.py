@@ -31,7 +31,7 @@ def problem(*moving: rd.MovingObstacle, **more: object) -> rd.Problem:
 def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | None) -> None:
     task = problem(obstacle)
     planner = rd.load_planner("rrt_connect")
-    still = planner.plan(replace(task, moving=()), until="first", jerk=jerk).trajectory
+    still = planner.plan(replace(task, moving=()), 10.0, until="first", jerk=jerk).trajectory
     assert still is not None
     found = planner.plan(task, 10.0, jerk=jerk)
     assert found.status is Status.SOLVED, found.reason

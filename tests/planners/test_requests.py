@@ -122,6 +122,17 @@ def _all_of_it() -> Problem:
 
 
 ASKED["all of it"] = Asked(_all_of_it, {"clearance": 0.02, "jerk": 100.0}, (CONSTRAINTS, CLEARANCE))
+PASSING = rd.MovingObstacle(rd.Sphere([0.9, -0.6, 0.5], 0.1, name="ball"), velocity=[0.0, 0.8, 0.0])
+ASKED["moving"] = Asked(lambda: replace(PLAIN, moving=(PASSING,)))
+ASKED["moving and waypoints"] = Asked(
+    lambda: replace(PLAIN, moving=(PASSING,), waypoints=(rd.JointGoal((START + GOAL) / 2),))
+)
+ASKED["moving and a cone"] = Asked(
+    lambda: replace(PLAIN, moving=(PASSING,), constraints=(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2),)),
+    {},
+    (CONSTRAINTS,),
+)
+ASKED["start velocity"] = Asked(lambda: replace(PLAIN, start_velocity=[0.1, 0, 0, 0, 0, 0, 0]))
 ASKED["views and a cone"] = Asked(
     lambda: replace(_seen(), constraints=(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2),)), {}, (CONSTRAINTS,)
 )
@@ -149,7 +160,7 @@ def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> N
             planner.plan(problem, time_limit=3.0, **request)
         assert "\n" not in str(refused.value)
         return
-    result = planner.plan(problem, time_limit=10.0, **{"until": "first", **request})
+    result = planner.plan(problem, time_limit=40.0, **{"until": "first", **request})
     assert result.path is not None and result.trajectory is not None, result.reason
     assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
 

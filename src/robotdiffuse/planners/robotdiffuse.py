@@ -6,6 +6,9 @@ or, where none of them is free, the same after more gradient steps (refinement).
 the batches are smooth noise after as many such steps (see smooth_noise.py). What the batches propose is
 simplified by the same code as what search finds, and the shortest path of either bounds the next search.
 Everything goes through the judge, and the result names the stage that its path comes from.
+
+Under path constraints it is search alone: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
+shorter (the mean of 20 upright cups and of 20 lines; median: the same).
 """
 
 from collections.abc import Iterator
