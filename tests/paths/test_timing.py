@@ -11,11 +11,13 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.paths.blending import DEVIATION, BlendedPolyline, half_widths
 from robotdiffuse.paths.speeds import TimingSettings
 from robotdiffuse.paths.timing import SAME, time_parameterize
+from robotdiffuse.rates import RateTolerances, wrong_rates
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.types import Path, Trajectory
 
 VELOCITY = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
 ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+JUDGES = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
 
 
 def arm(velocity: tuple[float, ...] = VELOCITY, acceleration: tuple[float, ...] = ACCELERATION) -> Robot:
@@ -160,6 +162,17 @@ def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:
     assert np.array_equal(stopped.positions[nearest], p.positions[1])
     assert np.abs(stopped.velocities[nearest]).max() < 1e-9
     assert distance_to_polyline(stopped.positions, p.positions).max() < 1e-12
+
+
+@pytest.mark.parametrize("size", [1e-5, 1e-4, 1e-3, 5e-3, 0.02, 0.1])
+def test_rows_of_the_shortest_pieces_agree(size: float) -> None:
+    """Between two stops so near to each other, rows at sample times did not tell the acceleration."""
+    robot = arm()
+    q = np.zeros((4, 7))
+    q[1:, 0], q[2:, 2], q[3, 1] = 1.0, size, 1.0
+    for accept in (never, always):
+        t = time_parameterize(robot, path(robot, q), accept, accept)
+        assert wrong_rates(robot, t, JUDGES) == []
 
 
 def test_only_the_corner_that_fails_is_tightened() -> None:

@@ -18,6 +18,8 @@ from robotdiffuse.settings import Bound, Count, NotNegative, OneOf, Positive, Se
 COMPILED, TOPPRA = "compiled", "toppra"
 FINE = 0.001
 """Time between the rows that a limit of jerk is kept by [s]."""
+LEAST_STEPS = 4
+"""Between the rows of a motion however short, or its rows would not tell that it speeds up and brakes."""
 GENTLER = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
 """Shares of the acceleration limits of which the fastest motion of limited jerk is taken."""
 BETWEEN = 8
@@ -143,7 +145,8 @@ def timed_piece(
     grid, limits = timing_grid(line, settings), _limits(robot, settings)
     if settings.jerk is None:
         speeds = _slowed(line, grid, _speeds(line, grid, settings.solver, *limits, begins, beside), beside)
-        return sampled(line.arrays, grid, speeds, settings.sample_time)
+        step = min(settings.sample_time, _lasts(grid, speeds) / LEAST_STEPS)
+        return sampled(line.arrays, grid, speeds, step)
     every = max(round(settings.sample_time / FINE), 1)
     step, found = settings.sample_time / every, list[tuple[float, ndarray, int]]()
     for share in GENTLER:
@@ -151,7 +154,7 @@ def timed_piece(
         window = max(int(np.ceil(2 * acceleration.max() / settings.jerk / step)), 1)
         speeds = _speeds(line, grid, settings.solver, velocity, acceleration, beside=beside)
         speeds = _slowed(line, grid, speeds, beside)
-        lasts = float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
+        lasts = _lasts(grid, speeds)
         slower = np.ceil(lasts / step) * step / lasts  # whole steps
         found.append((lasts * slower + window * step, speeds / slower, window))
     _, speeds, window = min(found, key=lambda timed: timed[0])
@@ -160,6 +163,11 @@ def timed_piece(
     # the mean of motions within the torque limits may need a hair more
     slower = 1.0 if beside.dynamics is None else _times_too_fast(beside.dynamics, q, v, a)
     return (times * slower, q, v / slower, a / slower**2) if slower > 1 else (times, q, v, a)
+
+
+def _lasts(grid: Float[ndarray, "m"], speeds: Float[ndarray, "m"]) -> float:
+    """Duration of a motion with these speeds [s]."""
+    return float((2 * np.diff(grid) / (speeds[1:] + speeds[:-1])).sum())
 
 
 def can_begin(robot: Robot, line: BlendedPolyline, settings: TimingSettings, speed: float) -> bool:
