@@ -217,13 +217,13 @@ def keys_in_order(folder: Path, planner: str) -> list[tuple[str, int]]:
 
 
 def test_a_planner_with_settings_is_a_row_of_its_own(tmp_path: Path) -> None:
-    texts = "rrt_connect", "rrt_connect:optimize_time=0.05:shortcuts=0"
+    texts = "rrt_connect", "rrt_connect:optimize_time=0.05:tightenings=0"
     asked = replace(settings(tmp_path, count=1), planners=texts)
     assert run_bench(asked, quiet, quiet) == 2
     assert list(read_records(tmp_path)) == sorted(texts)
     planner = Contestant.of(texts[1]).load()
     assert isinstance(planner, RRTConnect)
-    assert (planner.settings.optimize_time, planner.settings.shortcuts) == (0.05, 0)
+    assert (planner.settings.optimize_time, planner.settings.tightenings) == (0.05, 0)
     calls = Contestant.of("aorrtc:until=limit:gain=0.01:clearance=0")
     assert calls.request()["until"] == "limit" and calls.request()["clearance"] == 0
     assert calls.load().settings == AORRTCSettings(gain=0.01)
@@ -294,7 +294,7 @@ def test_problems_of_files_and_folders(tmp_path: Path) -> None:
         ({"planners": ("rrt",)}, "unknown planner 'rrt'; known:"),
         ({"planners": ("rrt_connect", "rrt_connect")}, "called the same"),
         ({"planners": ("rrt_connect@.",)}, "rrt_connect has no weights"),
-        ({"planners": ("rrt_connect:stp=1",)}, "rrt_connect has no setting 'stp'; it has .*shortcuts"),
+        ({"planners": ("rrt_connect:stp=1",)}, "rrt_connect has no setting 'stp'; it has .*tightenings"),
         ({"planners": ("rrt_connect:range=-1",)}, "rrt_connect.range is -1.0; it must be positive"),
         ({"planners": ("rrt_connect:range",)}, "'range' is not NAME=VALUE"),
         ({"planners": ("robotdiffuse@nowhere",)}, "nowhere holds no model"),

@@ -11,7 +11,7 @@ from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
-from robotdiffuse.paths.simplify import simplify
+from robotdiffuse.paths.simplify import simplify, tighten
 from robotdiffuse.planners import call
 from robotdiffuse.planners.aorrtc import kernel
 from robotdiffuse.planners.aorrtc.planner import AORRTC, AORRTCSettings
@@ -208,8 +208,8 @@ def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
     for seed in range(5):
         state, trees = random_state(seed), kernel.make_trees(*ends(), 5_000)
         path = kernel.connect(space, trees, np.float32(1.0), 100_000, state)
-        for rounds, tries in ((0, 0), (1, 0), (4, 10)):
-            short = simplify(space, path, rounds, tries, state)
+        for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300)):
+            short = tighten(space, simplify(space, path, rounds), tries, state)
             assert np.array_equal(short[[0, -1]], path[[0, -1]])
             assert path_length(short) <= path_length(path) + 1e-4
             assert motions_free(space, short).all()

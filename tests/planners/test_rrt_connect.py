@@ -172,7 +172,7 @@ def test_no_way_through_times_out():
 
 @pytest.mark.parametrize(
     ("change", "what"),
-    [({"range": 0.0}, "range"), ({"resolution": -1.0}, "resolution"), ({"shortcuts": -1}, "shortcuts")],
+    [({"range": 0.0}, "range"), ({"resolution": -1.0}, "resolution"), ({"tightenings": -1}, "tightenings")],
 )
 def test_settings_are_checked(change, what):
     with pytest.raises(InputError, match=f"rrt_connect.{what} is"):

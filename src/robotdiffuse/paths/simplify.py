@@ -16,22 +16,27 @@ _ONE, _HALF = np.float32(1.0), np.float32(0.5)
 SMOOTHINGS = 5
 """Subdivisions of a path between two looks for waypoints that can be left out."""
 LEAST_MOVE = np.float32(0.005)
-"""A corner that smoothing would move less than this stays [rad]."""
+"""A corner that smoothing would move less than this stays, and tightening makes no shorter segments [rad]."""
 PAYS = np.float32(1e-3)
 """A round that takes off a smaller share of the length is the last."""
+CUT, LEAVE_OUT, PULL = np.float32(0.3), np.float32(0.4), np.float32(0.55)
+"""Of the changes that tighten a path: the share that cuts a corner; with what leaves a waypoint out; with
+what pulls it straight towards its neighbours' chord. The others move it at random besides."""
+FARTHEST, NEARER = np.float32(0.3), np.float32(5.0)
+"""Of random moves of a waypoint: the longest, in each joint [rad], and the logarithm of how much shorter the
+shortest are."""
+MOST_WAYPOINTS = 64
+"""Of a path that is tightened, unless it has more."""
 
 
 @njit(cache=True, nogil=True)
-def simplify(space, path, rounds, tries, state):
+def simplify(space, path, rounds):
     """A path between the same ends that is free and no longer.
 
     In each of the rounds waypoints that straight lines can skip are left out, corners are smoothed, and
-    skipped again; after them come `tries` random shortcuts between places on different segments, each
-    followed by the same number of moves of a waypoint into the chord of its neighbours.
+    skipped again.
     """
-    dof = path.shape[1]
-    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
-    a, b = np.empty(dof, np.float32), np.empty(dof, np.float32)
+    work, block, a, _ = _room(space, path)
     points = _skipped(space, path, block, work)
     length = path_length(points)
     for _ in range(rounds):
@@ -46,15 +51,54 @@ def simplify(space, path, rounds, tries, state):
         if shorter > length * (_ONE - PAYS):
             break
         length = shorter
+    return points
+
+
+@njit(cache=True, nogil=True)
+def shortcut(space, path, tries, state):
+    """A path between the same ends that is free and no longer: waypoints that straight lines can skip are
+    left out, then come `tries` attempts, in turn a random shortcut between places on different segments and a
+    move of a waypoint into the chord of its neighbours."""
+    work, block, a, b = _room(space, path)
+    points = _skipped(space, path, block, work)
     if tries == 0 or len(points) <= 2:
         return points
     return _shortcuts(space, points, tries, a, b, block, work, state)
 
 
 @njit(cache=True, nogil=True)
-def shortcut(space, path, tries, state):
-    """`simplify` without smoothing: what can be skipped is, then come `tries` random shortcuts."""
-    return simplify(space, path, 0, tries, state)
+def tighten(space, path, tries, state):
+    """A path between the same ends that is free and no longer, near a given one that is free: after so many
+    attempts at a waypoint drawn at random to cut its corner, to leave it out, or to move it.
+
+    Shortcuts and smoothing end a little above the shortest path of the same way round; this gets there.
+    """
+    work, block, a, b = _room(space, path)
+    n = len(path)
+    points = np.empty((max(n, MOST_WAYPOINTS), path.shape[1]), np.float32)
+    points[:n] = path
+    for _ in range(tries):
+        if n <= 2:
+            break
+        i = 1 + min(int(random(state) * np.float32(n - 2)), n - 3)
+        change = random(state)
+        if change < CUT:
+            n = _cut(space, points, n, i, a, b, block, work, state)
+        elif change < LEAVE_OUT:
+            if motion_free(space, points[i - 1], points[i + 1], block, work):
+                points[i : n - 1] = points[i + 1 : n].copy()
+                n -= 1
+        else:
+            _move(space, points, i, change >= PULL, a, block, work, state)
+    return points[:n].copy()
+
+
+@njit(cache=True)
+def _room(space, path):
+    """What the checks of motions need, and two configurations."""
+    dof = path.shape[1]
+    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
+    return work, block, np.empty(dof, np.float32), np.empty(dof, np.float32)
 
 
 @njit(cache=True)
@@ -185,3 +229,55 @@ def _pull_in(space, points, n, trial, block, work, state):
             points[i] = trial
             return
         pull *= np.float32(0.4)
+
+
+@njit(cache=True)
+def _cut(space, points, n, i, a, b, block, work, state):
+    """Puts two waypoints on the segments beside the i-th one in its place, if the way between them is free;
+    returns the number of waypoints."""
+    if n == len(points):
+        return n
+    share = random(state) ** 2
+    other = random(state) ** 2
+    before, at, after = points[i - 1], points[i], points[i + 1]
+    if random(state) < _HALF:  # as far from the corner on both
+        other = min(share * distance(before, at) / max(distance(at, after), np.float32(1e-9)), _ONE)
+    for j in range(points.shape[1]):
+        a[j] = at[j] + share * (before[j] - at[j])
+        b[j] = at[j] + other * (after[j] - at[j])
+    if min(distance(before, a), distance(a, b), distance(b, after)) < LEAST_MOVE:
+        return n
+    # the remnants of the segments are checked anew: their checks fall elsewhere than before
+    if (
+        not motion_free(space, a, b, block, work)
+        or not motion_free(space, before, a, block, work)
+        or not motion_free(space, b, after, block, work)
+    ):
+        return n
+    for m in range(n - 1, i, -1):
+        points[m + 1] = points[m]
+    points[i], points[i + 1] = a, b
+    return n + 1
+
+
+@njit(cache=True)
+def _move(space, points, i, anywhere, trial, block, work, state):
+    """Moves the i-th waypoint towards the chord of its neighbours, and at random if it may go anywhere, where
+    that is free and shorter."""
+    before, at, after = points[i - 1], points[i], points[i + 1]
+    d1, d2 = distance(before, at), distance(at, after)
+    share = d1 / max(d1 + d2, np.float32(1e-9))
+    pull = random(state) ** 2
+    far = FARTHEST * np.exp(-NEARER * random(state)) if anywhere else np.float32(0.0)
+    for j in range(points.shape[1]):
+        chord = before[j] + share * (after[j] - before[j])
+        aside = far * (np.float32(2.0) * random(state) - _ONE)
+        trial[j] = min(max(at[j] + pull * (chord - at[j]) + aside, space.lower[j]), space.upper[j])
+    new1, new2 = distance(before, trial), distance(trial, after)
+    if (
+        new1 + new2 < d1 + d2
+        and min(new1, new2) >= LEAST_MOVE
+        and motion_free(space, before, trial, block, work)
+        and motion_free(space, trial, after, block, work)
+    ):
+        points[i] = trial

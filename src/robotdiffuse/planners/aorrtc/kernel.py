@@ -13,11 +13,14 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free, random
-from robotdiffuse.collision.kernels.lanes import W, make_workspace
+from robotdiffuse.collision.kernels.lanes import make_workspace
 from robotdiffuse.collision.kernels.motions import distance, motion_free
+from robotdiffuse.collision.kernels.simd import W, lane, load
 
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _TAU = np.float32(6.283185307179586)
+_NOWHERE = np.float32(1e15)
+"""A coordinate that no node has, and whose square is a number [rad]."""
 
 
 class Trees(NamedTuple):
@@ -25,8 +28,10 @@ class Trees(NamedTuple):
 
     nodes: np.ndarray
     """[2, capacity, dof]"""
+    columns: np.ndarray
+    """[2 * dof, capacity in full lanes] the same by joint, to search through; nowhere beyond the last."""
     costs: np.ndarray
-    """[2, capacity] lengths of the ways from the roots [rad]."""
+    """[2, capacity in full lanes] lengths of the ways from the roots [rad]; theirs is 0, they come first."""
     parents: np.ndarray
     """[2, capacity] -1 for roots."""
     sizes: np.ndarray
@@ -36,15 +41,18 @@ class Trees(NamedTuple):
 @njit(cache=True)
 def make_trees(start, goals, capacity):
     """Trees with the start and the goals as their roots."""
-    nodes = np.empty((2, capacity, len(start)), np.float32)
-    nodes[0, 0] = start
-    nodes[1, : len(goals)] = goals
-    return Trees(
-        nodes,
-        np.zeros((2, capacity), np.float32),
-        np.full((2, capacity), -1, np.int32),
-        np.array([1, len(goals)], np.int32),
+    dof, lanes = len(start), (capacity + W - 1) // W * W
+    trees = Trees(
+        np.empty((2, capacity, dof), np.float32),
+        np.empty((2 * dof, lanes), np.float32),
+        np.zeros((2, lanes), np.float32),
+        np.empty((2, capacity), np.int32),
+        np.zeros(2, np.int32),
     )
+    _add(trees, 0, start, _ZERO, -1)
+    for goal in goals:
+        _add(trees, 1, goal, _ZERO, -1)
+    return trees
 
 
 @njit(cache=True, nogil=True)
@@ -55,7 +63,7 @@ def search(space, trees, goals, bound, longest, iterations, state):
     waypoints [n, dof] from the start to a goal, with n = 0 if none was found yet. Stops early when a tree is
     full.
     """
-    nodes, costs, parents, sizes = trees
+    nodes, costs, parents, sizes = trees.nodes, trees.costs, trees.parents, trees.sizes
     dof, bounded = nodes.shape[2], bound < np.float32(np.inf)
     work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
     sample, new = np.empty(dof, np.float32), np.empty(dof, np.float32)
@@ -74,7 +82,7 @@ def search(space, trees, goals, bound, longest, iterations, state):
         if bounded:
             least = _to_roots(nodes, tree, roots, sample)
             allowed = least + random(state) * (bound - _to_roots(nodes, other, other_roots, sample) - least)
-        near = _nearest(nodes, costs, tree, sizes[tree], sample, allowed)
+        near = _nearest(trees, tree, sample, allowed)
         gap = distance(nodes[tree, near], sample)
         share = min(longest / max(gap, np.float32(1e-6)), _ONE)
         for j in range(dof):
@@ -87,7 +95,7 @@ def search(space, trees, goals, bound, longest, iterations, state):
         if bounded:
             near, cost = _cheaper(space, trees, tree, roots, near, cost, new, block, work, state)
         here = _add(trees, tree, new, cost, near)
-        near = _nearest(nodes, costs, other, sizes[other], new, bound - cost)
+        near = _nearest(trees, other, new, bound - cost)
         while sizes[other] < nodes.shape[1]:
             gap = distance(nodes[other, near], new)
             if bounded and costs[other, near] + gap + cost >= bound:
@@ -113,9 +121,12 @@ def connect(space, trees, longest, iterations, state):
 
 @allocation_free(inline="always")
 def _add(trees, tree, q, cost, parent):
-    here = trees.sizes[tree]
-    for j in range(len(q)):
+    here, dof = trees.sizes[tree], len(q)
+    for j in range(dof):
         trees.nodes[tree, here, j] = q[j]
+        if here % W == 0:
+            trees.columns[tree * dof + j, here : here + W] = _NOWHERE
+        trees.columns[tree * dof + j, here] = q[j]
     trees.costs[tree, here], trees.parents[tree, here] = cost, parent
     trees.sizes[tree] += 1
     return here
@@ -131,32 +142,49 @@ def _to_roots(nodes, tree, roots, q):
 
 
 @allocation_free()
-def _nearest(nodes, costs, tree, size, q, allowed):
+def _nearest(trees, tree, q, allowed):
     """The nearest node by position and cost of those that reach q at a cost of at most `allowed`.
 
     The cost of q itself is thought to be `allowed`. Without a bound the nearest by position; where no node is
     near enough, the nearest root.
     """
-    dof = len(q)
-    weight = _ONE if allowed < np.float32(np.inf) else _ZERO
+    bounded = allowed < np.float32(np.inf)
     best, where = np.float32(np.inf), -1
-    root, nearest_root = np.float32(np.inf), 0
-    for n in range(size):
-        total = _ZERO
-        for j in range(dof):
-            d = nodes[tree, n, j] - q[j]
-            total += d * d
-        cost = costs[tree, n]
-        if cost == _ZERO and total < root:
-            root, nearest_root = total, n
-        if weight > _ZERO:
-            late = allowed - cost
-            both = total + late * late
-            if both < best and late >= _ZERO and total <= late * late:
-                best, where = both, n
-        elif total < best:
-            best, where = total, n
-    return where if where >= 0 else nearest_root
+    for part in range((trees.sizes[tree] + W - 1) // W):
+        apart = _squared(trees, tree, part, q)
+        if bounded:
+            late = allowed - load(trees.costs, tree, part)
+            both = apart + late * late
+            near = (both < best) & ~(late < _ZERO) & ~(late * late < apart)
+        else:
+            both = apart
+            near = both < best
+        i = 0
+        while near != 0:
+            if near & 1 and lane(both, i) < best:
+                best, where = lane(both, i), W * part + i
+            near, i = near >> 1, i + 1
+    if where >= 0:
+        return where
+    for n in range(trees.sizes[tree]):
+        if trees.parents[tree, n] >= 0:
+            break
+        apart = distance(trees.nodes[tree, n], q)
+        if apart < best:
+            best, where = apart, n
+    return where
+
+
+@allocation_free(inline="always")
+def _squared(trees, tree, part, q):
+    """Squared distances of sixteen nodes from q."""
+    dof = len(q)
+    aside = load(trees.columns, tree * dof, part) - q[0]
+    total = aside * aside
+    for j in range(1, dof):
+        aside = load(trees.columns, tree * dof + j, part) - q[j]
+        total = total + aside * aside
+    return total
 
 
 @njit(cache=True)
@@ -166,7 +194,7 @@ def _cheaper(space, trees, tree, roots, near, cost, new, block, work, state):
     least = _to_roots(trees.nodes, tree, roots, new)
     while cost > least:
         allowed = least + random(state) * (cost - least)
-        other = _nearest(trees.nodes, trees.costs, tree, trees.sizes[tree], new, allowed)
+        other = _nearest(trees, tree, new, allowed)
         through = trees.costs[tree, other] + distance(trees.nodes[tree, other], new)
         if other == near or through >= cost:
             break

@@ -1,8 +1,7 @@
-"""AORRTC: a first path by RRT-Connect, then ever shorter ones by searches below the length of the last.
+"""AORRTC: a first path by RRT-Connect, then ever shorter ones by searches below a bound.
 
-Each round has fresh trees, which hold no path that is not shorter than the best one known; what a round finds
-is simplified, and bounds the next. Where that finds nothing for a while, rounds without bound have a share of
-the work: a bound is a simplified path, what trees hold is not.
+Each round has fresh trees, which hold no path that is longer than a little above the best one known; what a
+round finds is simplified and tightened, and bounds the next if it is shorter.
 """
 
 from dataclasses import dataclass

@@ -11,7 +11,7 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motion import finer
-from robotdiffuse.paths.simplify import simplify
+from robotdiffuse.paths.simplify import simplify, tighten
 from robotdiffuse.planners.aorrtc import kernel
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import Ends
@@ -26,14 +26,16 @@ FIRST_TRIES = 400
 """Iterations at a clearance before the next lower one is tried."""
 HELP_AFTER = 8_000
 """Iterations without a path before others are asked for one, and between two times that they are."""
-RESTART_AFTER = 1_000
-"""Iterations without a shorter path after which every third slice is of a round without bound: where it is
-tight, trees hold longer paths than simplification has made of a first one that goes the long way round."""
+LOOSER = 1.15
+"""The bound of rounds, times the length of the best path: what trees hold is not simplified yet, and where it
+is tight they hold no path as short as a simplified one that goes the long way round."""
 JUDGE_AFTER = 4_000
 """Iterations between two shorter paths that are judged on the way: at the end of the time, what the judge
 refuses would cost all that was found since the last path that passed."""
 SLICE = 100
 """Iterations between two looks at the clock."""
+NEAR = 1.05
+"""Paths that are longer than the best one by more than this factor are not tightened: it takes off less."""
 NO_SHORTER = 1e-4
 """A path is the shortest there can be when it exceeds the straight line by no more than this share."""
 
@@ -49,8 +51,8 @@ class SearchSettings(Settings):
     covers the rest, and after a path that it refuses the search looks twice as closely."""
     smoothings: Natural = 1
     """Rounds of smoothing of each path that is found."""
-    shortcuts: Natural = 0
-    """Random shortcuts after them."""
+    tightenings: Natural = 100
+    """Attempts to shorten each path but the first a little, where it stands."""
     iterations: Count = 20_000
     """Most iterations of a round; its trees hold at most as many nodes."""
     keep_trees: bool = False
@@ -94,9 +96,10 @@ class AnytimeSearch:
         self.history = list[tuple[ndarray, str]]()
         """The shortest paths, each when it was found, and where they come from."""
         self._lengths = list[tuple[int, float]]()
+        self._loose = False
+        """Whether the best path is the first one, which is tightened once there is time to improve it."""
         self._state = random_state(call.seed)
-        self._rounds: list[_Round | None] = [None, None]
-        """The one below the bound, and one without bound."""
+        self._round: _Round | None = None
         self._grown: kernel.Trees | None = None
         """Those that found the shortest path of the search, or that grow."""
         wanted = [share * call.clearance for share in (1.0, 0.5, 0.25)]
@@ -128,8 +131,10 @@ class AnytimeSearch:
         """See `PlanResult.trees`."""
         if self._grown is None or not self.settings.keep_trees:
             return ()
-        nodes, _, parents, sizes = self._grown
-        return tuple(Tree(nodes[i, :n].copy(), parents[i, :n].copy()) for i, n in enumerate(sizes))
+        grown = self._grown
+        return tuple(
+            Tree(grown.nodes[i, :n].copy(), grown.parents[i, :n].copy()) for i, n in enumerate(grown.sizes)
+        )
 
     def first(self, until: float, help_out: Callable[[], None] | None = None, work: float = np.inf) -> bool:
         """Search until there is a path, or `until` [s since the call], or for so many more iterations;
@@ -149,6 +154,9 @@ class AnytimeSearch:
         """Rounds below the length of the best path, until `until` [s since the call], so many more
         iterations, or there can be no shorter path."""
         enough = self.work + work
+        if self._loose and self.best is not None:
+            self.offer(self.best, self.stage)
+            self._loose = False
         while not self.shortest and self.call.elapsed < until and self.work < enough:
             self._slice()
 
@@ -164,8 +172,13 @@ class AnytimeSearch:
         """Take a path between the ends that is free in `space`, simplified, if it is the shortest so far."""
         path = np.ascontiguousarray(path, np.float32)
         settings = self.settings
-        path = simplify(self.space, path, settings.smoothings, settings.shortcuts, self._state)
+        path = simplify(self.space, path, settings.smoothings)
         length = path_length(path)
+        if self.best is None:
+            self._loose = True
+        elif length < NEAR * self.length:
+            path = tighten(self.space, path, settings.tightenings, self._state)
+            length = path_length(path)
         return bool(length < self.length) and self._take(path, float(length), stage)
 
     def _take(self, path: Float[ndarray, "n dof"], length: float, stage: str) -> bool:
@@ -175,7 +188,7 @@ class AnytimeSearch:
         self.best, self.length, self.stage = path, np.float32(length), stage
         self.history.append((path, stage))
         self._lengths.append((self.work, length))
-        self._rounds[0] = None
+        self._round = None
         self.call.improved(length)
         return True
 
@@ -190,7 +203,7 @@ class AnytimeSearch:
         self.settings = replace(self.settings, resolution=finer(self.settings.resolution))
         self.best = accepted
         self.length = np.float32(np.inf if accepted is None else path_length(accepted))
-        self._rounds = [None, None]
+        self._round = None
         self._enter(self._level)
 
     def _enter(self, level: int) -> None:
@@ -217,13 +230,11 @@ class AnytimeSearch:
     def _slice(self) -> None:
         """Some iterations of a round, and what they find."""
         settings = self.settings
-        lost = self.work - (self._lengths[-1][0] if self._lengths else self.work)
-        free = self.bounded and lost >= RESTART_AFTER and self.work // SLICE % 3 == 2
-        now = self._rounds[free]
+        now = self._round
         if now is None or now.left <= 0 or now.trees.sizes.max() >= now.trees.nodes.shape[1]:
             trees = kernel.make_trees(self.start, self.goals, settings.iterations + len(self.goals))
-            now = self._rounds[free] = _Round(trees, settings.iterations)
-        bound = self.length if self.bounded and not free else np.float32(np.inf)
+            now = self._round = _Round(trees, settings.iterations)
+        bound = np.float32(LOOSER * self.length if self.bounded else np.inf)
         longest = np.float32(settings.range)
         path = kernel.search(self.space, now.trees, self.goals, bound, longest, SLICE, self._state)
         self.work, self._tried, now.left = self.work + SLICE, self._tried + SLICE, now.left - SLICE
@@ -231,7 +242,7 @@ class AnytimeSearch:
             self._grown = now.trees
         if len(path):
             self.found += 1
-            self._rounds[free] = None
+            self._round = None
             if self.offer(path, self.name):
                 self._grown = now.trees
 

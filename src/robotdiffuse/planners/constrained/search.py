@@ -64,8 +64,7 @@ class ConstrainedSearch(AnytimeSearch):
     def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
         """Take a path between the ends that keeps the limits, simplified, if it is the shortest so far."""
         settings = self.settings
-        tries = SHORTCUTS + settings.shortcuts
-        path = kernel.simplify(self.limits, path, settings.smoothings, tries, self._state)
+        path = kernel.simplify(self.limits, path, settings.smoothings, SHORTCUTS, self._state)
         length = kernel.length(path)
         return bool(length < self.length) and self._take(path, length, stage)
 
