@@ -1,12 +1,16 @@
-"""What people ask a planner for: objects carried, tools, bases elsewhere, goals that leave room, waypoints.
+"""What people ask a planner for: objects carried, tools, bases elsewhere, goals that leave room, waypoints,
+a pose for each hand.
 
     python benchmarks/requests.py --scenes FOLDER [--places 1] [--number 120] [--planner aorrtc]
+    python benchmarks/requests.py --kinds both_hands
 
 Carried: MotionBenchMaker's table_pick (FOLDER), with the can in the hand where its problems end, to random
 places on the table: upright, at any turn about the vertical, 5 mm above the top. Places that the can itself
 finds taken, or that no free configuration reaches, are drawn again. Together: held-out problems of the
 families shelf and table, with the base turned and moved, a tool of 6 cm, a held box of random size, the goal
-as a pose of that box with tolerances, and a waypoint; those that start in collision are left out.
+as a pose of that box with tolerances, and a waypoint; those that start in collision are left out. Both hands:
+Baxter, with a post on a table before it, from a random configuration to poses of both hands that a random one
+has; both configurations are free.
 
 Every motion that is returned goes before two oracles: Coal on the exact meshes, every 0.01 rad of the path
 and at every row of the timed motion; and PyBullet, which has robot and tool as a URDF of its own and, where
@@ -27,6 +31,7 @@ from numpy import ndarray
 from report import header, print_table, progress
 
 import robotdiffuse as rd
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.arrays import compile_robot
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.collision.motion import levers
@@ -35,7 +40,7 @@ from robotdiffuse.planners import call
 from robotdiffuse.planners.call import Call
 from robotdiffuse.planners.ends import usable_ends
 from robotdiffuse.problems.files import load_motion_bench_maker
-from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal
+from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
@@ -59,6 +64,7 @@ STEP, TOLERANCE = 0.01, 0.001
 LOOKING = 0.15
 """Time limit of a call that only looks for configurations at a place [s]."""
 CAN = "Can1"
+HANDS = ("left_gripper", "right_gripper")
 
 
 class CpuClock:
@@ -70,7 +76,6 @@ class CpuClock:
 class Asked(NamedTuple):
     name: str
     problem: Problem
-    held: str
 
 
 class Seen(NamedTuple):
@@ -80,7 +85,8 @@ class Seen(NamedTuple):
     """Configurations in collision."""
     bullet: int
     off: float
-    """Where the held object ends, off its goal beyond what was allowed, by PyBullet's kinematics [m]."""
+    """Where a held object or a hand ends, off its goal beyond what was allowed, by PyBullet's kinematics
+    [m]."""
 
 
 def carried(folder: Path, places: int) -> Iterator[Asked]:
@@ -96,7 +102,7 @@ def carried(folder: Path, places: int) -> Iterator[Asked]:
             goal = PoseGoal(CAN, _place(scene, entry.problem.scene, rng), [0, 0, 0], [0, 0, np.pi])
             problem = Problem(holding, scene, q, goal)
             if not isinstance(usable_ends(Call("places", problem, LOOKING, 0)), PlanResult):
-                yield Asked(f"{entry.name}-{kept}", problem, CAN)
+                yield Asked(f"{entry.name}-{kept}", problem)
                 kept += 1
             if kept == places:
                 break
@@ -142,7 +148,22 @@ def together(number: int) -> Iterator[Asked]:
             )
         except InputError:
             continue
-        yield Asked(f"{('shelf', 'table')[i % 2]}/{i // 2}", problem, "parcel")
+        yield Asked(f"{('shelf', 'table')[i % 2]}/{i // 2}", problem)
+
+
+def both_hands(number: int) -> Iterator[Asked]:
+    """Poses for both of Baxter's hands."""
+    robot = rd.load_robot("baxter")
+    table = rd.Box([0.75, 0.0, 0.05], [0.5, 1.2, 0.04], name="table")
+    scene = rd.Scene([table, rd.Box([0.75, 0.0, 0.27], [0.12, 0.12, 0.4], name="post")])
+    checker, rng = CollisionChecker(robot, scene), np.random.default_rng([SEED, 3])
+    for i in range(number):
+        free = np.zeros((0, robot.dof))
+        while len(free) < 2:
+            drawn = rng.uniform(robot.lower, robot.upper, (16, robot.dof))
+            free = np.concatenate([free, drawn[checker.free(drawn)]])
+        poses = [PoseGoal(hand, link_pose(robot, free[1], hand)) for hand in HANDS]
+        yield Asked(f"baxter/{i}", Problem(robot, scene, free[0], PosesGoal(poses)))
 
 
 def looked_at(asked: Asked, result: PlanResult) -> Seen:
@@ -157,19 +178,23 @@ def looked_at(asked: Asked, result: PlanResult) -> Seen:
     end = result.trajectory.positions[-1]
     with World(standing, rd.Scene()) as simulated:
         simulated.place(end)
-        state = pybullet.getLinkState(
-            simulated.body,
-            simulated.links[asked.held],
-            computeForwardKinematics=1,
-            physicsClientId=simulated.client,
-        )
+        off = max(_off(problem, pose, simulated) for pose in poses_of(problem.goal))
+    assert goal_error(problem.robot, problem.goal, end) is None
+    return Seen(coal, bullet, off)
+
+
+def _off(problem: Problem, pose: PoseGoal, simulated: World) -> float:
+    """How far a link of the simulated robot is off its pose beyond what was allowed [m]."""
+    state = pybullet.getLinkState(
+        simulated.body,
+        simulated.links[pose.frame],
+        computeForwardKinematics=1,
+        physicsClientId=simulated.client,
+    )
     T = np.eye(4) if problem.T_world_base is None else problem.T_world_base
-    goal = problem.goal
-    assert isinstance(goal, PoseGoal)
-    there = inverse(T @ goal.T_base_frame) @ [*state[4], 1.0]
-    allowed = np.zeros(3) if goal.xyz_tolerance is None else goal.xyz_tolerance
-    assert goal_error(problem.robot, goal, end) is None
-    return Seen(coal, bullet, float(np.maximum(np.abs(there[:3]) - allowed, 0.0).max()))
+    there = inverse(T @ pose.T_base_frame) @ [*state[4], 1.0]
+    allowed = np.zeros(3) if pose.xyz_tolerance is None else pose.xyz_tolerance
+    return float(np.maximum(np.abs(there[:3]) - allowed, 0.0).max())
 
 
 def _dense(path: JointPath) -> ndarray:
@@ -207,7 +232,7 @@ def measured(title: str, every: list[Asked], name: str) -> None:
             ("in collision by Coal", str(sum(s.coal > 0 for s in seen))),
             ("in collision by PyBullet", str(sum(s.bullet > 0 for s in seen))),
             (
-                "held object off its goal at the end, most, by PyBullet",
+                "held object or hand off its goal at the end, most, by PyBullet",
                 f"{1e3 * max(s.off for s in seen):.3f} mm",
             ),
         ],
@@ -239,21 +264,29 @@ def attaching() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Requests: held objects, tools, bases, goals, waypoints.")
-    parser.add_argument("--scenes", type=Path, required=True, help="folder of table_pick")
+    parser.add_argument("--kinds", default="carried,together,both_hands", help="(all three)")
+    parser.add_argument("--scenes", type=Path, help="folder of table_pick, for carried")
     parser.add_argument("--places", type=int, default=1, help="of each scene (1)")
-    parser.add_argument("--number", type=int, default=120, help="of problems with all of it (120)")
+    parser.add_argument("--number", type=int, default=120, help="of problems of each other kind (120)")
     parser.add_argument("--planner", default="aorrtc", help="(aorrtc)")
     arguments = parser.parse_args()
     call.time = CpuClock  # type: ignore[attr-defined]
     print(header("numba", "numpy", "coal", "pybullet"))
-    attaching()
-    measured("Carried", list(carried(arguments.scenes, arguments.places)), arguments.planner)
-    usable = [
-        asked
-        for asked in together(arguments.number)
-        if not ExactCollision(asked.problem.robot, asked.problem.scene).collides(asked.problem.start[None])[0]
-    ]
-    measured("Together", usable, arguments.planner)
+    kinds = arguments.kinds.split(",")
+    if "carried" in kinds:
+        attaching()
+        measured("Carried", list(carried(arguments.scenes, arguments.places)), arguments.planner)
+    if "together" in kinds:
+        every = together(arguments.number)
+        usable = [asked for asked in every if not _touches(asked.problem)]
+        measured("Together", usable, arguments.planner)
+    if "both_hands" in kinds:
+        measured("Both hands", list(both_hands(arguments.number)), arguments.planner)
+
+
+def _touches(problem: Problem) -> bool:
+    """Whether the start is in collision."""
+    return bool(ExactCollision(problem.robot, problem.scene).collides(problem.start[None])[0])
 
 
 if __name__ == "__main__":
