@@ -76,8 +76,8 @@ def test_weights_are_used_with_their_own_sampler_and_steps(monkeypatch: pytest.M
 def test_batches_repeat_until_one_has_a_valid_sample(monkeypatch: pytest.MonkeyPatch) -> None:
     batches = []
 
-    def draw(self, *arguments, own=Diffusion.draw):
-        batches.append(own(self, *arguments))
+    def draw(self, *arguments, own=Diffusion.draw, **more):
+        batches.append(own(self, *arguments, **more))
         if len(batches) < 3:
             batches[-1][:, 24] = LEFT + 1.5  # away and back: not valid
         return batches[-1]
@@ -96,7 +96,7 @@ def test_more_batches_after_the_first_path_make_it_no_longer() -> None:
 
 
 def test_no_valid_sample_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    def line(self, _model, _checker, _code, start, goals, _rng):
+    def line(self, _model, _checker, _code, start, goals, _rng, of_problem):
         return (start + np.linspace(0, 1, 48)[:, None] * (goals[0] - start))[None]
 
     monkeypatch.setattr(Diffusion, "draw", line)
