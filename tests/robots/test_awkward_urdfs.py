@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from helpers.awkward_urdfs import REFUSED, WORKS
+from helpers.made_arms import BALL, chain, row, written
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import load_planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.add import add_robot
 from robotdiffuse.robots.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.preparation import PreparationSettings
+from robotdiffuse.robots.preparation import LARGE, PreparationSettings
+from robotdiffuse.robots.scaled import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.verify import verify
 
@@ -44,3 +46,28 @@ def test_what_cannot_work_is_refused_by_one_line_that_says_what_to_do(name: str,
         add_robot(make(tmp_path), out=tmp_path / "robot", settings=QUICK)
     assert "\n" not in str(error.value)
     assert not (tmp_path / "robot").exists()
+
+
+def test_an_arm_four_times_as_large_takes_no_more_spheres(tmp_path: Path) -> None:
+    """An ABB IRB140 of which a package holds a model with 3 m of reach took over 400 s: spheres 15 mm from
+    links of 2 m."""
+    counts = []
+    for size in (2, 8):
+        length, width = 0.4 * size, 0.06 * size
+        box = (
+            f'<collision><origin xyz="0 0 {length / 2}"/><geometry><box size="{width} {width} {length}"/>'
+            "</geometry></collision>"
+        )
+        parts = chain("base", row("j", 4), xyz=f"0 0 {length}").replace(BALL, box)
+        report = add_robot(written(tmp_path, parts), out=tmp_path / f"{size}", settings=QUICK)
+        assert all(part.covered for part in report.links) and reach(report.robot) > LARGE
+        counts.append(report.sphere_count)
+    assert counts[1] == pytest.approx(counts[0], rel=0.2) and min(counts) > 10
+
+
+def test_settings_are_those_of_arms_of_up_to_a_metre_and_a_half() -> None:
+    settings = PreparationSettings()
+    assert settings.for_reach(0.9) == settings
+    twice = settings.for_reach(2 * LARGE)
+    assert twice.spheres.first_half == 2 * settings.spheres.first_half and twice.finest == 2 * settings.finest
+    assert twice.parts.concavity == 2 * settings.parts.concavity and twice.parts.most == settings.parts.most

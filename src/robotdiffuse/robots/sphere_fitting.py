@@ -37,6 +37,8 @@ BURIED = 1e-9
 """What lies deeper in another part is no surface of the union [m]."""
 SLACK = 0.1
 """Of the spacing of the grid, what room a sphere may lack."""
+COARSE, FINE = (5.0, 90_000), (8.0, 230_000)
+"""Cells to choose spheres by, and to fit them to in the end: how many to the radius of a disc, and in all."""
 APART = 0.02
 """Spheres that are added at once begin at least so far from each other [m]."""
 
@@ -97,7 +99,7 @@ def fit_spheres(
     room = solid.room(bounds)
     inside = solid.inside
     # sticking out of a flat face by e, a sphere covers a disc of radius sqrt(2 r e); cells are much smaller
-    coarse, fine = _Cells.of(solid, bounds, 5), _Cells.of(solid, bounds, 8)
+    coarse, fine = (_Cells.of(solid, bounds, *size) for size in (COARSE, FINE))
     covers = []
     for _ in range(settings.starts):
         places = rng.permutation(inside)[: settings.candidates] + rng.uniform(-0.5, 0.5, 3) * solid.spacing
@@ -152,9 +154,9 @@ class _Cells:
     """Vertices of the meshes; all other points lie between neighbours on a face or an edge."""
 
     @staticmethod
-    def of(solid: Solid, bounds: Bounds, cut: int) -> "_Cells":
+    def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "_Cells":
         """Triangles, without those inside another mesh, whose edges are a fraction of the largest disc that a
-        sphere within bounds can cover."""
+        sphere within bounds can cover; a larger one where there would be more than `most`."""
         soup, vertices, left_out = [], [], False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
         for k, mesh in enumerate(solid.meshes):
@@ -172,6 +174,9 @@ class _Cells:
             vertices.append(mesh.vertices)
             left_out |= bool(hidden.any() or bounds.varies)
         corners = np.concatenate(soup).reshape(-1, 3)
+        crowd = len(corners) / 3 / most
+        if crowd > 1:
+            return _Cells.of(solid, bounds, cut / np.sqrt(1.1 * crowd), most)
         points = np.concatenate([*vertices, corners])
         lattice = np.round((points - points.min(0)) * (2**20 / np.ptp(points, axis=0).max())).astype(np.int64)
         _, first, index = np.unique(lattice @ (1, 2**21, 2**42), return_index=True, return_inverse=True)
