@@ -199,28 +199,8 @@ def place(case: str, sites: list[str], folder: Path) -> Path | None:
     return next((file for file in places if file.is_file()), None)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Awkward URDFs, made and found.")
-    cases = (*MADE, *FOUND)
-    parser.add_argument("--cases", nargs="+", choices=cases, default=cases, metavar="CASE", help="(all)")
-    parser.add_argument("--sites", nargs="+", default=[], metavar="FOLDER", help="with unpacked packages")
-    parser.add_argument("--one", nargs=2, metavar=("CASE", "URDF"), help="in this process, as JSON")
-    arguments = parser.parse_args()
-    if arguments.one:
-        name, urdf = arguments.one
-        print(json.dumps(asdict(outcome(Path(urdf), FOUND.get(name)))))
-        return
-    print(header("numpy", "numba", "coal", "example-robot-data"))
-    of: dict[str, Outcome] = {}
-    missing = []
-    for name in progress(arguments.cases, "URDFs"):
-        with TemporaryDirectory() as folder:
-            urdf = place(name, arguments.sites, Path(folder))
-            if urdf is None:
-                missing.append(name)
-            else:
-                of[name] = alone(name, urdf)
-                print(name, of[name], file=sys.stderr)
+def report(of: dict[str, Outcome]) -> None:
+    """Print what became of the URDFs."""
     prepared = {name: one for name, one in of.items() if not one.line}
     columns = ("URDF", "joints", "spheres", "refused", "CPU s", "MiB", "empty", "past a box")
     rows = [
@@ -245,6 +225,31 @@ def main() -> None:
     wrong = [name for name, one in of.items() if "\n" in one.line or one.line.startswith("DEFECT")]
     print(f"More than {SECONDS} s or {MEBIBYTES} MiB: {', '.join(over) or 'none'}")
     print(f"No single line, or a defect: {', '.join(wrong) or 'none'}")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Awkward URDFs, made and found.")
+    cases = (*MADE, *FOUND)
+    parser.add_argument("--cases", nargs="+", choices=cases, default=cases, metavar="CASE", help="(all)")
+    parser.add_argument("--sites", nargs="+", default=[], metavar="FOLDER", help="with unpacked packages")
+    parser.add_argument("--one", nargs=2, metavar=("CASE", "URDF"), help="in this process, as JSON")
+    arguments = parser.parse_args()
+    if arguments.one:
+        name, urdf = arguments.one
+        print(json.dumps(asdict(outcome(Path(urdf), FOUND.get(name)))))
+        return
+    print(header("numpy", "numba", "coal", "example-robot-data"))
+    of: dict[str, Outcome] = {}
+    missing = []
+    for name in progress(arguments.cases, "URDFs"):
+        with TemporaryDirectory() as folder:
+            urdf = place(name, arguments.sites, Path(folder))
+            if urdf is None:
+                missing.append(name)
+            else:
+                of[name] = alone(name, urdf)
+                print(name, of[name], file=sys.stderr)
+    report(of)
     if missing:
         print(f"Left out, as their packages are not installed: {', '.join(missing)}")
 

@@ -65,6 +65,15 @@ def test_an_arm_four_times_as_large_takes_no_more_spheres(tmp_path: Path) -> Non
     assert counts[1] == pytest.approx(counts[0], rel=0.2) and min(counts) > 10
 
 
+def test_an_arm_on_a_long_rail_is_no_larger(tmp_path: Path) -> None:
+    rail = chain("base", ["rail"], kind="prismatic", limits='lower="-9" upper="9"')
+    counts = []
+    for parts in (rail + chain("rail_link", row("j", 4)), chain("base", ["rail", *row("j", 4)])):
+        report = add_robot(written(tmp_path, parts), out=tmp_path / "robot", settings=QUICK)
+        counts.append(report.sphere_count)
+    assert counts[0] == counts[1]
+
+
 def test_settings_are_those_of_arms_of_up_to_a_metre_and_a_half() -> None:
     settings = PreparationSettings()
     assert settings.for_reach(0.9) == settings

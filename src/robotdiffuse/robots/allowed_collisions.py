@@ -3,16 +3,16 @@
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
 
-from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import coal
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
+from scipy.optimize import linprog
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.robots.convex_parts import planes_of
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.robots.sphere_kernels import ball_distances, deepest_touches
 from robotdiffuse.transforms import rotation_about
@@ -31,7 +31,7 @@ variance of colliding that the other joints may explain, at most."""
 COARSE = 0.03
 """Meshes of links that overlap in a named pose by no more are taken for coarse there [m]."""
 ROUNDING = 1e-9
-"""What balls are larger by [m]: more than rounding takes away."""
+"""What balls around meshes are larger by, and those within smaller [m]: more than rounding takes away."""
 NEAR = 0.1
 """Links whose balls never come so near [m] are driven towards each other from few samples."""
 
@@ -198,6 +198,10 @@ class Links:
         self.upper = np.array([joint.upper for joint in self.joints])
         self.hulls = {link: [_coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
         self.balls = {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in robot.meshes.items()}
+        self.inner = {
+            link: np.stack([_inner(mesh) for mesh in parts]) for link, parts in robot.meshes.items()
+        }
+        self._hit: dict[tuple[str, str], tuple[int, int]] = {}
         self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
         self._leading: dict[frozenset[str], list[Joint]] = {}
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
@@ -261,10 +265,17 @@ class Links:
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""
+        inside = ball_distances(poses[a][i], poses[b][i], self.inner[a], self.inner[b])
+        if (inside < 0).any():
+            return True
         T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
-        for _, first, second in self._near(poses, a, b, i, 0.0):
+        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
+        near = list(zip(*np.nonzero(apart <= 0), strict=True))
+        hit = self._hit.get((a, b))
+        for m, n in [hit, *near] if hit in near else near:
             self.result.clear()
-            if coal.collide(first, T_a, second, T_b, self.request, self.result):
+            if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.request, self.result):
+                self._hit[a, b] = m, n
                 return True
         return False
 
@@ -272,24 +283,17 @@ class Links:
         """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
         T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
         least = np.inf
-        for at_least, first, second in self._near(poses, a, b, i, np.inf):
-            if at_least >= least:
+        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
+        for k in apart.argsort(axis=None):
+            m, n = divmod(int(k), apart.shape[1])
+            if apart[m, n] >= least:
                 break
             self.distance_result.clear()
-            distance = coal.distance(first, T_a, second, T_b, self.distance_request, self.distance_result)
+            distance = coal.distance(
+                self.hulls[a][m], T_a, self.hulls[b][n], T_b, self.distance_request, self.distance_result
+            )
             least = min(least, distance)
         return float(least)
-
-    def _near(
-        self, poses: dict[str, ndarray], a: str, b: str, i: int, limit: float
-    ) -> Iterator[tuple[float, Any, Any]]:
-        """Hulls of two links whose balls are within a limit [m] of each other in configuration i, the nearest
-        first, with that distance: theirs is at least that."""
-        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
-        count = apart.shape[1]
-        near = np.flatnonzero(apart.ravel() <= limit)
-        for k in near[np.argsort(apart.ravel()[near])]:
-            yield apart.ravel()[k], self.hulls[a][k // count], self.hulls[b][k % count]
 
 
 def _motions(axis: Float[ndarray, "3"], prismatic: bool, q: Float[ndarray, "n"]) -> Float[ndarray, "n 4 4"]:
@@ -311,6 +315,14 @@ def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
     """Centre and radius of a ball that holds a mesh."""
     center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
     return np.append(center, np.linalg.norm(mesh.vertices - center, axis=1).max() + ROUNDING)
+
+
+def _inner(mesh: ConvexMesh) -> Float[ndarray, "4"]:
+    """Centre and radius of a largest ball within a convex mesh."""
+    normals, offsets = planes_of(mesh)
+    planes = np.column_stack([normals, np.ones(len(normals))])
+    found = linprog([0, 0, 0, -1], planes, offsets, bounds=[(None, None)] * 3 + [(0, None)])
+    return np.append(found.x[:3], found.x[3] - ROUNDING) if found.success else np.array([0, 0, 0, -np.inf])
 
 
 def _coal_hull(mesh: ConvexMesh) -> "coal.Convex":

@@ -143,7 +143,7 @@ def prepare(
     `surfaces` are the meshes by link, in the links' frames; `allowed` pairs, with reasons, that need no check
     whatever sampling says. The same input and seed give the same robot.
     """
-    settings = settings.for_reach(reach(robot))
+    settings = settings.for_reach(_turning_reach(robot))
     links = {name: _Link(name, meshes, settings.parts) for name, meshes in surfaces.items()}
     steps = 2 * len(links) + 1 + settings.rounds
     for step, link in enumerate(links.values()):
@@ -173,6 +173,12 @@ def prepare(
     progress("done", steps, steps)
     _, _, robot, refusals = min(tried, key=lambda one: one[:2])  # finer is not always better
     return Prepared(robot, tuple(_report(robot, name) for name in links), pairs, sampled, refusals)
+
+
+def _turning_reach(robot: Robot) -> float:
+    """What the arm reaches without its rails [m]: an arm on a long one is no larger."""
+    slides = {j.name: (j.lower + j.upper) / 2 for j in robot.planned_joints if j.kind == "prismatic"}
+    return 0.0 if len(slides) == robot.dof else reach(robot.with_locked(slides))
 
 
 def _report(robot: Robot, link: str) -> LinkReport:
