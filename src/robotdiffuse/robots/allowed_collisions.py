@@ -25,6 +25,8 @@ BINS = 24
 """Of a joint's range, to see whether it alone says where two links collide."""
 STOPPED = 5.2
 """A joint whose range is narrower has a stop [rad]; that of wider ones may be chosen."""
+FEWER = 10
+"""Of so many samples one is looked at for adjacent links, which are allowed whatever it says."""
 OFTEN, UNCERTAIN = 0.2, 0.25
 """Share of the configurations in which links collide that a joint's stops keep apart, at least, and of the
 variance of colliding that the other joints may explain, at most."""
@@ -110,9 +112,10 @@ def find_allowed_collisions(
         return CHECKED
 
     reports = []
+    few = {link: T[: max(len(q) // FEWER, 1)] for link, T in poses.items()}
     for a, b in _moving_pairs(robot):
-        near = links.sphere_distance(poses, a, b)
-        colliding = np.zeros(len(q), dtype=bool)
+        near = links.sphere_distance(few if frozenset((a, b)) in adjacent else poses, a, b)
+        colliding = np.zeros(len(near), dtype=bool)
         for i in np.flatnonzero(near <= 0):
             colliding[i] = links.collide(poses, a, b, int(i))
         reports.append(PairReport((a, b), reason(a, b, near, colliding), float(colliding.mean())))

@@ -37,7 +37,7 @@ BURIED = 1e-9
 """What lies deeper in another part is no surface of the union [m]."""
 SLACK = 0.1
 """Of the spacing of the grid, what room a sphere may lack."""
-COARSE, FINE = (5.0, 90_000), (8.0, 230_000)
+COARSE, FINE = (5.0, 60_000), (8.0, 150_000)
 """Cells to choose spheres by, and to fit them to in the end: how many to the radius of a disc, and in all."""
 APART = 0.02
 """Spheres that are added at once begin at least so far from each other [m]."""
