@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.robots.sphere_kernels import within
-from robotdiffuse.robots.sphere_room import stacked_planes
+from robotdiffuse.robots.sphere_room import Planes, stacked_planes
 from robotdiffuse.transforms import inverse
 
 ANGLES = 9
@@ -53,7 +53,7 @@ def neighbours(robot: Robot, link: str) -> tuple[Neighbour, ...]:
 
 def hidden_by_neighbours(robot: Robot, link: str) -> Callable[[Float[ndarray, "n 3"]], Bool[ndarray, "n"]]:
     """Which points, in the link's frame, are inside one neighbour at all values of the joint between them."""
-    beside = []
+    beside: list[tuple[Neighbour, tuple[ndarray, ndarray], Planes]] = []
     for other in neighbours(robot, link):
         corners = np.concatenate([mesh.vertices for mesh in robot.meshes[other.link]])
         box = corners.min(0) - BESIDE, corners.max(0) + BESIDE
