@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 LIMIT = 5.0
-"""Longest processor time of an input [s]."""
+"""Longest processor time of an input [s]; of a request to a server see fuzz_socket.py."""
 PATIENCE = 60.0
 """Until an input that does not end is given up [s]."""
 MEMORY = 12 * 2**30
@@ -528,12 +528,8 @@ def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return read
 
 
-def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """Bodies of requests, read and answered as a worker of `robotdiffuse serve` does."""
-    from robotdiffuse.errors import InputError
-    from robotdiffuse.robots import load_robot
-    from robotdiffuse.serve import worker
-
+def asked(rng: np.random.Generator) -> tuple[str, bytes]:
+    """What a request over HTTP is for, and its body."""
     rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
     problem = (
         PROBLEM | {"scene": PROBLEM["scene"][: rng.integers(7)]} | (EQUIPPED if rng.random() < 0.1 else {})
@@ -547,8 +543,17 @@ def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         "path": motion,
         "trajectory": motion | {"times": [0.0, 1.0, 2.0]} | rates,
     }
-    what = worker.VERIFY if rng.random() < 0.5 else worker.PLAN
-    body = text_of(rng, judged if what == worker.VERIFY else plan, ".json")
+    what = "verify" if rng.random() < 0.5 else "plan"
+    return what, text_of(rng, judged if what == "verify" else plan, ".json")
+
+
+def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Bodies of requests, read and answered as a worker of `robotdiffuse serve` does."""
+    from robotdiffuse.errors import InputError
+    from robotdiffuse.robots import load_robot
+    from robotdiffuse.serve import worker
+
+    what, body = asked(rng)
 
     def ask() -> None:
         worker.accept({"panda": load_robot("panda")}, 0.1, worker.Shared())
@@ -556,6 +561,27 @@ def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         if answer.code == 400:
             raise InputError(json.loads(answer.body)["error"])
         assert answer.code == 200, answer.body.decode()
+
+    return ask
+
+
+def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
+    """Requests to a running `robotdiffuse serve`; the server itself is checked now and then."""
+    import fuzz_socket
+
+    from robotdiffuse.errors import InputError
+
+    (what, body), (_, other) = asked(rng), asked(rng)
+    sent = fuzz_socket.sent(rng, fuzz_socket.draft(rng, what, body, other), damaged)
+    looks = rng.random() < 1 / fuzz_socket.EVERY
+
+    def ask() -> None:
+        server = fuzz_socket.server()
+        said = fuzz_socket.exchange(server.address, sent)
+        if looks:
+            server.check()
+        if said:
+            raise InputError(said)
 
     return ask
 
@@ -731,6 +757,7 @@ KINDS: dict[str, Make] = {
     "result": _result,
     "bundle": _bundle,
     "http": _http,
+    "socket": _socket,
     "motion": _motion,
     "certificate": _certificate,
     "depth": _depth,
@@ -749,10 +776,12 @@ def _work(pipe: Connection, seed: int, count: int, kinds: tuple[str, ...]) -> No
     os.dup2(quiet, 2)
     with tempfile.TemporaryDirectory() as folder:
         for i in range(seed, seed + count):
-            kind, begun = kinds[i % len(kinds)], time.process_time()
+            kind = kinds[i % len(kinds)]
+            clock = time.monotonic if kind == "socket" else time.process_time
+            begun = clock()
             inner = FilePath(folder) / str(i)
             inner.mkdir()
-            pipe.send((*one(kind, i, inner), time.process_time() - begun))
+            pipe.send((*one(kind, i, inner), clock() - begun))
             shutil.rmtree(inner)
 
 
@@ -777,7 +806,7 @@ def run(seconds: float, seed: int, kinds: tuple[str, ...]) -> tuple[Counter, lis
                 worker.join()
                 ended, result, said = True, "fault", f"the process ended with {worker.exitcode}"
             took = 0.0 if first else took  # which loads compiled code
-            if took > LIMIT:
+            if took > LIMIT and kind != "socket":
                 result, said = "fault", f"{took:.1f} s"
             counts[kind, result] += 1
             slowest[kind] = max(slowest[kind], took)

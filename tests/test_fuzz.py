@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-spec = importlib.util.spec_from_file_location("fuzz", Path(__file__).parents[1] / "benchmarks" / "fuzz.py")
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+spec = importlib.util.spec_from_file_location("fuzz", BENCHMARKS / "fuzz.py")
 assert spec is not None
 assert spec.loader is not None
 fuzz = importlib.util.module_from_spec(spec)
@@ -23,6 +24,7 @@ COUNTS = {
     "result": 400,
     "bundle": 100,
     "http": 300,
+    "socket": 300,
     "motion": 120,
     "certificate": 250,
     "depth": 150,
@@ -35,7 +37,8 @@ COUNTS = {
 
 
 @pytest.mark.parametrize("kind", fuzz.KINDS)
-def test_damaged_inputs(kind: str, tmp_path: Path) -> None:
+def test_damaged_inputs(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
     faults = []
     for seed in range(COUNTS[kind]):
         folder = tmp_path / str(seed)

@@ -50,7 +50,7 @@ class Door:
         await (refused or self.app)(scope, receive, send)
 
     def _refused(self, request: Request) -> Response | None:
-        host = urlsplit(f"//{request.headers.get('host', '')}").hostname or ""
+        host = request.headers.get("host", "")
         if self.settings.on_loopback and not _local(host):
             return _error(421, f"the host is {shown(host)}; this server is known as localhost")
         given, token = request.headers.get("authorization", ""), self.settings.token
@@ -62,16 +62,23 @@ class Door:
 
 
 def _local(host: str) -> bool:
+    """Of what a header says, with or without a port."""
     try:
-        return ip_address(host).is_loopback
+        name = urlsplit(f"//{host}").hostname or ""
+        return name == "localhost" or ip_address(name).is_loopback
     except ValueError:
-        return host == "localhost"
+        return False
 
 
 def make_app(pool: Pool, robots: dict[str, Robot]) -> FastAPI:
     """The application; the pool is started by others."""
     app = FastAPI(
-        title="RobotDiffuse", version=__version__, description=page.ABOUT, docs_url=None, redoc_url=None
+        title="RobotDiffuse",
+        version=__version__,
+        description=page.ABOUT,
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
     )
     app.add_middleware(Door, settings=pool.settings)
     app.exception_handler(RequestError)(_refused)

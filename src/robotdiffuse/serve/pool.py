@@ -138,6 +138,7 @@ class Pool:
     async def _ended(self, seat: _Seat, current: "Future[Answer]") -> Answer:
         """The answer; TimeoutError where a call goes on for longer than it may, and than it said."""
         began, waiting = time.monotonic(), asyncio.wrap_future(current)
+        waiting.add_done_callback(_seen)
         until = began + self.settings.longest + GRACE
         while time.monotonic() < until:
             await asyncio.wait({waiting}, timeout=until - time.monotonic())
@@ -236,3 +237,9 @@ class Pool:
         task = asyncio.ensure_future(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+
+
+def _seen(done: "asyncio.Future[Answer]") -> None:
+    """asyncio writes down errors that nobody has looked at, such as those of calls that were left."""
+    if not done.cancelled():
+        done.exception()

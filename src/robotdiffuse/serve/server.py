@@ -11,8 +11,9 @@ import uvicorn
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.serve.app import make_app
+from robotdiffuse.serve.connection import Connection
 from robotdiffuse.serve.pool import Pool
-from robotdiffuse.serve.settings import GRACE, ServeSettings
+from robotdiffuse.serve.settings import GRACE, KEPT, ServeSettings
 
 BACKLOG = 128
 """Connections that wait to be taken."""
@@ -69,9 +70,11 @@ async def _serve(
     config = uvicorn.Config(
         make_app(pool, robots),
         lifespan="off",
-        log_level="warning",
+        http=Connection,
+        log_level="error",  # what clients do wrong is for them
         access_log=False,
         server_header=False,
+        timeout_keep_alive=KEPT,
         timeout_graceful_shutdown=int(settings.longest + GRACE) + 1,
         ws="none",
     )

@@ -14,6 +14,10 @@ CANCELLING = 1.0
 """Until a worker that was told to leave its call is killed [s]."""
 SENDING = 10.0
 """For a client to send a request [s]."""
+TAKING = 60.0
+"""For a client to take what waits for it [s]."""
+KEPT = 5
+"""For a connection to be used again [s]."""
 
 
 @dataclass(frozen=True)

@@ -116,6 +116,7 @@ def respond(number: int, what: str, body: bytes) -> Answer:
     assert _state is not None
     try:
         _state.call = number
+        _leave()  # told so before it began
         answer = (_plan if what == PLAN else _judge)(_state, body)
         return answer._replace(memory=_memory())
     except InputError as error:
