@@ -528,8 +528,8 @@ def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return read
 
 
-def asked(rng: np.random.Generator) -> tuple[str, bytes]:
-    """What a request over HTTP is for, and its body."""
+def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
+    """What a request over HTTP is for, and its body; as often as `right` says it is not damaged."""
     rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
     problem = (
         PROBLEM | {"scene": PROBLEM["scene"][: rng.integers(7)]} | (EQUIPPED if rng.random() < 0.1 else {})
@@ -544,7 +544,8 @@ def asked(rng: np.random.Generator) -> tuple[str, bytes]:
         "trajectory": motion | {"times": [0.0, 1.0, 2.0]} | rates,
     }
     what = "verify" if rng.random() < 0.5 else "plan"
-    return what, text_of(rng, judged if what == "verify" else plan, ".json")
+    body = judged if what == "verify" else plan
+    return what, json.dumps(body).encode() if rng.random() < right else text_of(rng, body, ".json")
 
 
 def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
@@ -571,7 +572,7 @@ def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
     from robotdiffuse.errors import InputError
 
-    (what, body), (_, other) = asked(rng), asked(rng)
+    (what, body), (_, other) = asked(rng, 0.5), asked(rng, 0.5)
     sent = fuzz_socket.sent(rng, fuzz_socket.draft(rng, what, body, other), damaged)
     looks = rng.random() < 1 / fuzz_socket.EVERY
 

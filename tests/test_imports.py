@@ -29,6 +29,7 @@ CHAIN = (
     "collision",
     "problems",
     "rates",
+    "torques",
     "tolerances",
     "verify",
     "violations",

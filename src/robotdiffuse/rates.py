@@ -96,26 +96,6 @@ def between_rows(trajectory: Trajectory, chord: float) -> tuple[Float[ndarray, "
     return np.append(times[row] + (u * h)[:, 0], times[-1]), np.concatenate([between, q[-1:]])
 
 
-def states_between(trajectory: Trajectory, step: float) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Times at most a step [s] apart, and positions, velocities and accelerations of a trajectory there: on
-    the cubics through its rows, and on lines between the accelerations that it says."""
-    times, q, v, a = trajectory.times, trajectory.positions, trajectory.velocities, trajectory.accelerations
-    lasts = np.diff(times)
-    counts = np.maximum(np.ceil(lasts / step - 1e-9), 1).astype(int)
-    row = np.repeat(np.arange(len(counts)), counts)
-    u = np.concatenate([[], *(np.arange(n) / n for n in counts)])[:, None]
-    h = lasts[row][:, None]
-    mean = (q[row + 1] - q[row]) / h
-    first, last = v[row] - mean, v[row + 1] - mean
-    between = q[row] + h * (u * mean + u * (1 - u) ** 2 * first - u**2 * (1 - u) * last)
-    speeds = mean + (1 - u) * (1 - 3 * u) * first - u * (2 - 3 * u) * last
-    pulls = (1 - u) * a[row] + u * a[row + 1]
-    at = times[row] + (u * h)[:, 0]
-    ends = (at, times[-1:]), (between, q[-1:]), (speeds, v[-1:]), (pulls, a[-1:])
-    at, between, speeds, pulls = (np.concatenate(column) for column in ends)
-    return at, between, speeds, pulls
-
-
 class _Check(NamedTuple):
     """Rows are those of the trajectory, from its first."""
 

@@ -36,8 +36,8 @@ class VerifySettings(Settings, name="verify"):
     rest: NotNegative = 1e-6
     """A motion stands still where no joint is faster than this [rad/s] or [m/s]."""
     rate_slack: NotNegative = 0.01
-    """Share by which a trajectory may exceed velocity and acceleration limits; also the share of a velocity
-    limit by which the velocities that it says may be off, and at which it is at rest."""
+    """Share by which a trajectory may exceed velocity, acceleration and effort limits; also the share of a
+    velocity limit by which the velocities that it says may be off, and at which it is at rest."""
     rate_agreement: NotNegative = 0.5
     """Share of the greatest acceleration of the joint by which one that a trajectory says may lie outside of
     the mean ones before and after its row."""
@@ -55,11 +55,6 @@ class VerifySettings(Settings, name="verify"):
     """... if the straight moves before and after it are both at least this long [rad, joint-space L2]."""
     reversals: Natural = 3
     """More sharp reversals than this are twitching."""
-    torque_step: Positive = 0.002
-    """Between the times at which torques of a payload are looked at [s]; they may exceed their limits by
-    `rate_slack`."""
-    torque_resolution: Positive = 0.02
-    """Between configurations of a path without times at which what holds it is [rad, joint-space L2]."""
     tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
     """Each clearance of a `Report` is at least this share of the least one that was measured, in (0, 1)."""
 

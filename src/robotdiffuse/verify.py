@@ -19,9 +19,10 @@ from robotdiffuse.collision.moving import MovingCollision, TimedContact
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.rates import RateTolerances, between_rows, states_between, wrong_rates
+from robotdiffuse.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.tolerances import DEFAULT, VerifySettings, goal_error, looked_at, passes
+from robotdiffuse.tolerances import DEFAULT, VerifySettings, goal_error, passes
+from robotdiffuse.torques import Pieces, first_beyond, pieces_held, pieces_of
 from robotdiffuse.types import Path, Trajectory
 
 LONGEST = 1e5
@@ -95,8 +96,8 @@ class Verifier:
         self._check_shape(path.joint_names, path.positions)
         found = []
         if self.dynamics is not None and within(path.positions):
-            places, q = looked_at(path.positions, self.settings.torque_resolution)
-            found = self._torques(places, q, 0 * q, 0 * q)
+            clock = np.arange(len(path.positions), dtype=float)
+            found = self._torques(clock, pieces_held(path.positions), " to hold the payload")
         return self._report(path.positions, None, found)
 
     def trajectory(self, trajectory: Trajectory) -> Report:
@@ -132,7 +133,7 @@ class Verifier:
         still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
         along = None
         if not found and self.dynamics is not None:
-            found += self._torques(*states_between(trajectory, self.settings.torque_step))
+            found += self._torques(trajectory.times, pieces_of(trajectory), ", with the payload")
         if self.constraints is not None:
             found += self._too_fast(trajectory)
             along = between_rows(trajectory, self.settings.constraint_chord) if not found else None
@@ -250,19 +251,18 @@ class Verifier:
         message = f"{one.frame} moves at {speeds[i, k]:.4g} m/s; {one.kind} allows {most:.4g} m/s"
         return [Violation("speed", at, message, one.frame, one.kind, float(excess[:, k].max()))]
 
-    def _torques(self, clock: ndarray, q: ndarray, v: ndarray, a: ndarray) -> list[Violation]:
-        """Where a joint's torque is first beyond its effort limit, with the problem's payload."""
+    def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> list[Violation]:
+        """Where a joint's torque is first not proved to be within its effort limit, with the payload."""
         assert self.dynamics is not None
-        torques = np.abs(self.dynamics.torques(q, v, a))
-        excess = torques - self.dynamics.limits * (1 + self.settings.rate_slack)
-        bad = np.flatnonzero((excess > 0).any(axis=1))
-        if not len(bad):
+        beyond = first_beyond(self.dynamics, pieces, self.settings.rate_slack)
+        if beyond is None:
             return []
-        i, j = int(bad[0]), int(excess[bad[0]].argmax())
-        message = self.dynamics.words(j, torques[i, j])
-        what = f"{message}, with the payload" if v.any() else f"{message} to hold the payload"
-        name = self.robot.joint_names[j]
-        return [Violation("torque", float(clock[i]), what, name, None, float(excess[:, j].max()))]
+        at, name = (
+            float(np.interp(beyond.place, np.arange(len(clock)), clock)),
+            self.robot.joint_names[beyond.joint],
+        )
+        message = self.dynamics.words(beyond.joint, beyond.torque) + what
+        return [Violation("torque", at, message, name, None, beyond.excess)]
 
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
         """More sharp reversals than allowed, counted on waypoints at least `reversal_step` apart."""

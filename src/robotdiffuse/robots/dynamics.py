@@ -9,6 +9,7 @@ from numpy import ndarray
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.inertias import Inertia, Payload
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.torque_bounds import Body, Stretches, bend
 
 GRAVITY = 9.81
 """Along -z of the world [m/s²]."""
@@ -46,6 +47,18 @@ class Dynamics:
         up = np.array([0.0, 0.0, 1.0]) if T_world_base is None else T_world_base[2, :3]
         model.gravity.linear = -GRAVITY * up
         self._model, self._data = model, model.createData()
+        inner = model.inertias.tolist()[1:]
+        self._bodies = [
+            Body(
+                int(robot.parents[j]) - 1,
+                bool(robot.prismatic[j]),
+                float(np.linalg.norm(T[:3, 3])),
+                float(inner[j].mass),
+                float(np.linalg.norm(inner[j].lever)),
+                float(np.linalg.eigvalsh(inner[j].inertia)[-1]),
+            )
+            for j, T in enumerate(robot.frame_offsets)
+        ]
 
     def torques(
         self, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
@@ -55,6 +68,10 @@ class Dynamics:
         for i in range(len(q)):
             out[i] = self._rnea(self._model, self._data, q[i], v[i], a[i])
         return out
+
+    def bends(self, along: Stretches) -> Float[ndarray, "n dof"]:
+        """Second derivatives of torques along stretches at most, by what theirs are by."""
+        return bend(self._bodies, GRAVITY, along)
 
     def holding(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
         """Torques of standing still."""
