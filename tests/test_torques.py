@@ -4,48 +4,17 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.robots.inertias import Payload, inertia_of
-from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.torques import Pieces, first_beyond, pieces_held, pieces_of
-from robotdiffuse.transforms import rotation_about, transform
 from robotdiffuse.types import Path as JointPath
 from robotdiffuse.types import Trajectory
 from robotdiffuse.verify import verify, verify_trajectory
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
-TURNED = transform(np.array([0.1, 0.0, 0.3]), rotation_about(np.array([0.6, 0.0, 0.8]), 0.7))
 LOOKS = 41
-
-
-def sliding() -> Robot:
-    """Turns, slides, turns and slides, about and along axes of all directions."""
-    kinds, axes = ("revolute", "prismatic", "revolute", "prismatic"), np.eye(3)[[2, 0, 1, 2]]
-    joints, inertias = [], {}
-    for k, (kind, axis) in enumerate(zip(kinds, axes, strict=True)):
-        limits = (-1.0, 1.0, 2.0, 8.0, 80.0)
-        offset = transform(np.array([0.1, 0.2, 0.1 * k]), rotation_about(axes[(k + 1) % 4], 0.5 * k))
-        joints.append(
-            Joint(
-                f"j{k}", kind, "base" if k == 0 else f"l{k}", f"l{k + 1}", offset, axis, *limits, effort=50.0
-            )
-        )
-        inertias[f"l{k + 1}"] = inertia_of([2.0 - 0.4 * k, 0.05, -0.1, 0.1, 0.02, 0.001, 0, 0.01, 0, 0.03])
-    return Robot("sliding", "base", "l4", tuple(joints), inertias=inertias)
-
-
-ROBOTS = {"panda": lambda: rd.load_robot("panda"), "ur5": lambda: rd.load_robot("ur5"), "sliding": sliding}
-
-
-def wild(robot: Robot, rng: np.random.Generator, step: float) -> Trajectory:
-    """Random rows, as far apart as they are fast; accelerations are whatever they say."""
-    v, a = rng.uniform(-1, 1, (2, 6, robot.dof)) * np.stack([robot.velocity, robot.acceleration])[:, None]
-    q = (
-        rng.uniform(-1, 1, robot.dof)
-        + np.concatenate([np.zeros((1, robot.dof)), np.cumsum((v[1:] + v[:-1]) / 2, 0)]) * step
-    )
-    return Trajectory(robot.joint_names, step * np.arange(6.0), q, v, a)
 
 
 def farthest_off(dynamics: Dynamics, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
@@ -78,14 +47,6 @@ def test_bounds_of_what_bends_most_are_near() -> None:
     assert off[0, 0] <= bulges[0, 0] <= 1.01 * off[0, 0]
 
 
-def pendulum(effort: float) -> Robot:
-    """A rod of 2 kg and 1 m that hangs down at 0, about y."""
-    y = np.array([0.0, 1.0, 0.0])
-    hinge = Joint("hinge", "revolute", "base", "rod", np.eye(4), y, -3.0, 3.0, 2.0, 8.0, 80.0, effort=effort)
-    rod = inertia_of([2.0, 0.0, 0.0, -0.5, 2 / 12, 0, 0, 2 / 12, 0, 0])
-    return Robot("pendulum", "base", "rod", (hinge,), inertias={"rod": rod})
-
-
 @pytest.mark.parametrize(("effort", "valid"), [(9.70, False), (9.73, True)])
 def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
     """It bears 9.81 N m where it is level, which no row is; the judge allows a hundredth more."""
@@ -110,6 +71,13 @@ def test_a_peak_between_two_times_is_found() -> None:
         assert (found is not None) == beyond
         if found is not None:
             assert 1 < found.place < 2 and 1.01 * effort < found.torque < 9.82
+
+
+def test_a_motion_of_one_row_is_held() -> None:
+    row, still = np.array([[1.5]]), np.zeros((1, 1))
+    for pieces in (pieces_held(row), pieces_of(Trajectory(("hinge",), np.zeros(1), row, still, still))):
+        assert first_beyond(Dynamics(pendulum(10.0), Payload(0.0)), pieces, 0.01) is None
+        assert first_beyond(Dynamics(pendulum(9.0), Payload(0.0)), pieces, 0.01) is not None
 
 
 def test_a_torque_that_touches_its_limit_is_settled() -> None:

@@ -48,6 +48,8 @@ def pieces_of(trajectory: Trajectory) -> Pieces:
     """Between the rows of a trajectory at increasing times: cubics through positions and velocities, lines
     between the accelerations that it says."""
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
+    if len(q) == 1:
+        return pieces_held(q)
     h = np.diff(trajectory.times)[:, None]
     mean, change = np.diff(q, axis=0) / h, np.diff(a, axis=0)
     first, last = v[:-1] - mean, v[1:] - mean
@@ -69,6 +71,7 @@ def pieces_of(trajectory: Trajectory) -> Pieces:
 
 def pieces_held(q: Float[ndarray, "n dof"]) -> Pieces:
     """Between configurations that are held, on straight lines."""
+    q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
     step = np.diff(q, axis=0)
     still = np.zeros((3, *step.shape))
 
@@ -103,10 +106,11 @@ def first_beyond(dynamics: Dynamics, pieces: Pieces, slack: float) -> Beyond | N
         most = np.maximum(at_low, at_high)
         open_ = most + bulge > allowed
         begun, goes_on = (at_low > allowed).any(axis=1), (at_high > allowed).any(axis=1)
-        over, lost = begun | goes_on, (open_ & (bulge <= RESOLUTION * dynamics.limits)).any(axis=1)
+        unsure = np.minimum(bulge, RESOLUTION * dynamics.limits)
+        over, lost = begun | goes_on, (open_ & (bulge == unsure)).any(axis=1)
         wrong = np.flatnonzero(over | lost)
         places.append(piece[wrong] + np.where(over & ~begun, high, low)[wrong])
-        torques.append(np.where(most > allowed, most, most + bulge * lost[:, None])[wrong])
+        torques.append(np.where(most > allowed, most, most + unsure)[wrong])
         coarse = over & (begun != goes_on) & (high - low > FINE)
         halved = open_.any(axis=1) & (coarse | ~(over | lost))
         piece, low, high = piece[halved], low[halved], high[halved]

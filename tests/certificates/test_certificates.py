@@ -257,17 +257,6 @@ def test_rates_are_checked_anew(planned: tuple[Problem, rd.PlanResult]) -> None:
     assert any("exceeds its limit of velocity" in line for line in found)
 
 
-def test_what_certificates_do_not_prove_is_refused_by_name() -> None:
-    problem, path = problem_of(SWING)
-    certificate = certify(problem, path)
-    object.__setattr__(problem, "payload", rd.Payload(1.0))
-    with pytest.raises(InputError, match="the problem has payload, which certificates do not prove"):
-        certify(problem, path)
-    assert (
-        "problem: certificates do not prove anything about payload" in certificate.check(problem).differences
-    )
-
-
 def test_tolerances_are_those_of_the_judge() -> None:
     """The checker does not import the judge."""
     settings = VerifySettings()

@@ -94,6 +94,10 @@ class Certificate:
     """Stretches that are free of obstacles that move; None without such."""
     constraints: tuple[tuple[str, float], ...] = ()
     """For each quantity of a path constraint, what it is at most all along [m] or [rad]."""
+    looks: Float[ndarray, "looks"] = field(default_factory=lambda: np.zeros(0))
+    """Where, between the rows, torques of a payload are looked at too, as `between`."""
+    torques: tuple[tuple[str, float], ...] = ()
+    """For each joint, what it bears at most all along with the payload [N m] or [N]."""
 
     def check(self, problem: "Problem | None" = None, at_most: Tolerances | None = None) -> "Findings":
         """Re-check everything for a problem, by default the one that is in here, with tolerances of at most
@@ -152,6 +156,8 @@ def _record(certificate: Certificate) -> dict[str, Any]:
         "request_parts": certificate.request_parts,
         "moving": None if certificate.moving is None else _proof_record(certificate.moving),
         "constraints": [list(one) for one in certificate.constraints],
+        "looks": certificate.looks.tolist(),
+        "torques": [list(one) for one in certificate.torques],
     }
 
 
@@ -200,7 +206,9 @@ def _certificate(record: dict[str, Any]) -> Certificate:
         problem,
         _texts("request_parts", record.get("request_parts", {})),
         None if record.get("moving") is None else _proof(record["moving"]),
-        tuple((str(name), _number(str(name), most)) for name, most in record.get("constraints", [])),
+        _named(record.get("constraints", [])),
+        _vector("looks", record.get("looks", [])),
+        _named(record.get("torques", [])),
     )
 
 
@@ -244,6 +252,10 @@ def _proof(record: list[dict[str, Any]]) -> Proof:
     return Proof(
         tuple(claims), stretches, by_planes, joined["clearance"], joined["displacement"], tuple(planes)
     )
+
+
+def _named(rows: list[Any]) -> tuple[tuple[str, float], ...]:
+    return tuple((str(name), _number(str(name), most)) for name, most in rows)
 
 
 def _texts(name: str, value: object) -> dict[str, str]:

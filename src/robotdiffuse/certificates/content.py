@@ -50,8 +50,15 @@ def scene_parts(scene: Scene) -> dict[str, str]:
 
 
 def request_parts(problem: Problem) -> dict[str, str]:
-    """Obstacles that move, with their motions, and path constraints."""
+    """Obstacles that move, with their motions, path constraints, and a payload with what bears it."""
     parts = {}
+    if problem.payload is not None:
+        robot, carried = problem.robot, problem.payload
+        links = sorted(robot.inertias)
+        rows = [robot.inertias[link].values for link in links]
+        own, T_world_base = [carried.mass, *carried.com, *carried.moments], problem.T_world_base
+        stands = np.eye(4) if T_world_base is None else T_world_base
+        parts["payload"] = _hash([carried.link, *links], own, stands, robot.effort, rows)
     for one in problem.moving:
         ways = [np.zeros(0) if v is None else v for v in (one.velocity, one.times, one.poses, one.max_speed)]
         parts[f"moving {one.name}"] = _hash(one.shape.kind, *_numbers(one.shape), *ways)

@@ -9,6 +9,7 @@ from numpy import ndarray
 from robotdiffuse.certificates.certificate import AGREEMENT, Certificate, Tolerances
 from robotdiffuse.certificates.constraints import kept, too_fast
 from robotdiffuse.certificates.kinematics import Linkage
+from robotdiffuse.certificates.torques import most_torques
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
@@ -47,11 +48,7 @@ def _cubic(motion: Trajectory, at: Float[ndarray, "k"]) -> Float[ndarray, "k dof
 def not_covered(problem: Problem, motion: Path | Trajectory) -> list[str]:
     """What a problem asks for and no certificate of such a motion proves."""
     untimed = not isinstance(motion, Trajectory)
-    asked = {
-        "payload": problem.payload is not None,
-        "moving, without times": untimed and len(problem.moving) > 0,
-    }
-    return [name for name, given in asked.items() if given]
+    return ["moving, without times"] if untimed and problem.moving else []
 
 
 def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
@@ -77,6 +74,28 @@ def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
         yield from _wrong_rates(robot, motion, certificate, begins)
         yield from too_fast(problem, motion, tolerances.rate_slack)
     yield from _not_kept(problem, certificate, q)
+    yield from _not_borne(problem, certificate)
+
+
+def _not_borne(problem: Problem, certificate: Certificate) -> Iterator[str]:
+    """What is not shown of the torques of a payload, or not as the certificate says."""
+    motion, said = certificate.motion, dict(certificate.torques)
+    if problem.payload is None:
+        if said:
+            yield "torques: the problem has no payload"
+        return
+    if [*said] != [*problem.robot.joint_names]:
+        yield "torques: the certificate is not about those of the robot's joints"
+        return
+    if isinstance(motion, Trajectory) and not (np.diff(motion.times) > 0).all():
+        return
+    most = most_torques(problem, motion, certificate.looks).max(axis=0)
+    allowed = problem.robot.effort * (1 + certificate.tolerances.rate_slack)
+    for name, torque, limit in zip(said, most, allowed, strict=True):
+        if abs(torque - said[name]) > AGREEMENT:
+            yield f"torques: {name} bears at most {torque:.6f}, not {said[name]:.6f}"
+        if not torque <= limit:
+            yield f"torques: {name} is not shown to keep its limit: {torque:.6f}, of {limit:.6f}"
 
 
 def _not_kept(problem: Problem, certificate: Certificate, q: Float[ndarray, "n dof"]) -> Iterator[str]:

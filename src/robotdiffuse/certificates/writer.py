@@ -20,6 +20,7 @@ from robotdiffuse.certificates.content import request_parts, robot_parts, scene_
 from robotdiffuse.certificates.moving import MovingProver
 from robotdiffuse.certificates.planes import PlaneFinder
 from robotdiffuse.certificates.requests import configurations, not_covered
+from robotdiffuse.certificates.torques import most_torques
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.types import Path, Trajectory
@@ -67,6 +68,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     if problem.constraints:
         tolerances = replace(tolerances, chord=settings.constraint_chord)
     between, bounds = _keeping(problem, motion, _between(motion, tolerances.chord), tolerances.chord)
+    looks, torques = _bearing(problem, motion, tolerances.rate_slack)
     q = configurations(motion, between)
     proof, left = _prove(Prover(problem.robot, problem.scene, q), least)
     moving = None
@@ -89,6 +91,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         request_parts(problem),
         moving,
         bounds,
+        looks,
+        torques,
     )
 
 
@@ -112,6 +116,28 @@ def _keeping(
         if len(between) > MOST_STRETCHES:
             break
     raise InputError("no proof was found for the path constraints: the motion is too near to their limits")
+
+
+def _bearing(
+    problem: Problem, motion: Path | Trajectory, slack: float
+) -> tuple[Float[ndarray, "k"], tuple[tuple[str, float], ...]]:
+    """Times, or places of a path, between the rows from which to which all torques are shown to be within
+    their limits; and what they are at most."""
+    looks = np.zeros(0)
+    if problem.payload is None:
+        return looks, ()
+    timed = isinstance(motion, Trajectory)
+    rows = motion.times if timed else np.arange(len(motion.positions), dtype=float)
+    for _ in range(HALVINGS):
+        most = most_torques(problem, motion, looks)
+        open_ = (most > problem.robot.effort * (1 + slack)).any(axis=1)
+        if not open_.any():
+            return looks, tuple(zip(problem.robot.joint_names, most.max(axis=0).tolist(), strict=True))
+        at = np.sort(np.concatenate([rows, looks]))
+        if len(at) == 1 or len(at) > MOST_STRETCHES:
+            break
+        looks = np.sort(np.concatenate([looks, ((at[:-1] + at[1:]) / 2)[open_]]))
+    raise InputError("no proof was found for the torques: the motion is too near to their limits")
 
 
 def _record(problem: Problem) -> dict[str, object] | None:
@@ -156,7 +182,7 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
     tools = None if in_time else PlaneFinder(prover)
     done: list[_Found] = []
     total = 0
-    while len(todo.claim):
+    while len(todo.claim) or not done:  # robots without bodies have nothing to prove
         n = len(todo.claim)
         found = prover.bounds(todo, np.zeros(n, bool), [])
         clearance, displacement = _down(found.clearance), _up(found.displacement)

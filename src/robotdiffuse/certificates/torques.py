@@ -1,0 +1,218 @@
+"""Torques of a payload along a motion: the checker's own inverse dynamics and its proof from look to look.
+
+Between two looks positions are cubics, or straight, velocities what these amount to, and accelerations lines
+between those of the rows. A torque then leaves its chord by at most an eighth of its greatest second
+derivative times the square of the time between. Torques are sums and products of vectors that turn with the
+links, so the product rule bounds that derivative by what links and joints do at most along the way.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.certificates.kinematics import Linkage
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.inertias import Inertia
+from robotdiffuse.types import Path, Trajectory
+
+GRAVITY = 9.81
+"""Along -z of the world [m/s²]."""
+ALMOST = 1e-9
+"""Lightest mass that counts [kg]."""
+
+
+class Bound(NamedTuple):
+    """Of the length of vectors, or the size of numbers, and of their first two derivatives."""
+
+    size: ndarray
+    first: ndarray
+    second: ndarray
+
+    def __add__(self, other: "Bound") -> "Bound":  # type: ignore[override]
+        return Bound(*(a + b for a, b in zip(self, other, strict=True)))
+
+    def __mul__(self, other: "Bound") -> "Bound":  # type: ignore[override]
+        second = self.second * other.size + 2 * self.first * other.first + self.size * other.second
+        return Bound(self.size * other.size, self.first * other.size + self.size * other.first, second)
+
+    def scaled(self, by: float) -> "Bound":
+        return Bound(*(by * part for part in self))
+
+
+class States(NamedTuple):
+    """At looks; and bounds [m, dof] by time, of paths by the share, from each look to the next."""
+
+    q: Float[ndarray, "n dof"]
+    v: Float[ndarray, "n dof"]
+    a: Float[ndarray, "n dof"]
+    lasts: Float[ndarray, "m"]
+    """From look to look [s]; 1 for a path."""
+    places: Bound
+    """Of positions."""
+    speeds: Bound
+    """Of velocities; 0 where configurations are held."""
+    pulls: Bound
+    """Of accelerations."""
+
+
+def most_torques(
+    problem: Problem, motion: Path | Trajectory, looks: Float[ndarray, "k"]
+) -> Float[ndarray, "m dof"]:
+    """What each joint bears at most from each look to the next [N m] or [N]. Looks are the rows and, between
+    them, further times, or places of a path: rows plus shares."""
+    states = _states(motion, looks)
+    torques = np.abs(inverse_dynamics(problem, states.q, states.v, states.a))
+    bends = _bends(problem, states)
+    return np.maximum(torques[:-1], torques[1:]) + bends * states.lasts[:, None] ** 2 / 8
+
+
+def _states(motion: Path | Trajectory, looks: Float[ndarray, "k"]) -> States:
+    if not isinstance(motion, Trajectory) or len(motion.times) == 1:
+        return _held(motion.positions, looks)
+    times, h = motion.times, np.diff(motion.times)[:, None]
+    at = np.sort(np.concatenate([times, looks]))
+    row = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
+    u = (at - times[row])[:, None] / h[row]
+    rows = motion.positions, motion.velocities, motion.accelerations
+    (q0, v0, a0), (q1, v1, a1) = ([of[:-1] for of in rows], [of[1:] for of in rows])
+    mean = (q1 - q0) / h
+    # Hermite's basis, its derivative, and both derivatives of that, of which the first is linear
+    q = (1 - u) ** 2 * ((1 + 2 * u) * q0[row] + h[row] * u * v0[row])
+    q += u**2 * ((3 - 2 * u) * q1[row] - h[row] * (1 - u) * v1[row])
+    v = 6 * u * (1 - u) * mean[row] + (1 - u) * (1 - 3 * u) * v0[row] + u * (3 * u - 2) * v1[row]
+    third = np.abs(6 * (v0 + v1) - 12 * mean) / h**2
+    second = np.maximum(np.abs(6 * mean - 4 * v0 - 2 * v1), np.abs(6 * mean - 2 * v0 - 4 * v1)) / h
+    first = np.maximum(np.abs(v0), np.abs(v1)) + third * h**2 / 8
+    far = np.maximum(np.abs(q0), np.abs(q1)) + first * h / 2
+    pulls = np.maximum(np.abs(a0), np.abs(a1)), np.abs(a1 - a0) / h, 0 * h + 0 * a0
+    along = row[:-1]
+    return States(
+        q,
+        v,
+        (1 - u) * a0[row] + u * a1[row],
+        np.diff(at),
+        Bound(far[along], first[along], second[along]),
+        Bound(first[along], second[along], third[along]),
+        Bound(*(pull[along] for pull in pulls)),
+    )
+
+
+def _held(positions: Float[ndarray, "n dof"], looks: Float[ndarray, "k"]) -> States:
+    rows = np.arange(len(positions))
+    at = np.sort(np.concatenate([rows, looks]))
+    q = np.column_stack([np.interp(at, rows, joint) for joint in positions.T])
+    q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
+    step = np.abs(np.diff(q, axis=0))
+    places = Bound(np.maximum(np.abs(q[1:]), np.abs(q[:-1])), step, 0 * step)
+    none = Bound(0 * step, 0 * step, 0 * step)
+    return States(q, 0 * q, 0 * q, np.ones(len(step)), places, none, none)
+
+
+def inverse_dynamics(
+    problem: Problem, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
+) -> Float[ndarray, "n dof"]:
+    """Torques by Newton's and Euler's equations for each link, in the frame of the base."""
+    robot, linkage = problem.robot, Linkage(problem.robot)
+    postures, number = linkage.place(q), {joint.name: j for j, joint in enumerate(robot.planned_joints)}
+    T = {link: postures.T[:, k] for k, link in enumerate(linkage.links)}
+    up = np.eye(4)[2, :3] if problem.T_world_base is None else problem.T_world_base[2, :3]
+    still = np.zeros((len(q), 3))
+    turning = {robot.base: (still, still, still + GRAVITY * up)}
+    for joint in robot.joints:
+        w, dw, pull = turning[joint.parent]
+        arm = T[joint.child][:, :3, 3] - T[joint.parent][:, :3, 3]
+        pull = pull + np.cross(dw, arm) + np.cross(w, np.cross(w, arm))
+        j = number.get(joint.name)
+        if j is not None:
+            along, bent = v[:, j, None] * postures.axes[:, j], a[:, j, None] * postures.axes[:, j]
+            if linkage.slides[j]:
+                pull = pull + bent + 2 * np.cross(w, along)
+            else:
+                w, dw = w + along, dw + bent + np.cross(w, along)
+        turning[joint.child] = w, dw, pull
+    carried = _carried(problem)
+    force, moment = ({link: still for link in linkage.links} for _ in range(2))
+    torques = np.empty_like(q)
+    for joint in reversed(robot.joints):
+        link, (w, dw, pull) = joint.child, turning[joint.child]
+        for body in carried.get(link, ()):
+            R = T[link][:, :3, :3]
+            arm, inertia = R @ body.com, R @ body.moments @ R.transpose(0, 2, 1)
+            own = body.mass * (pull + np.cross(dw, arm) + np.cross(w, np.cross(w, arm)))
+            spin = np.einsum("nij,nj->ni", inertia, w)
+            force[link] = force[link] + own
+            turn = np.einsum("nij,nj->ni", inertia, dw) + np.cross(w, spin) + np.cross(arm, own)
+            moment[link] = moment[link] + turn
+        j = number.get(joint.name)
+        if j is not None:
+            of = force[link] if linkage.slides[j] else moment[link]
+            torques[:, j] = (postures.axes[:, j] * of).sum(axis=1)
+        arm = T[link][:, :3, 3] - T[joint.parent][:, :3, 3]
+        force[joint.parent] = force[joint.parent] + force[link]
+        moment[joint.parent] = moment[joint.parent] + moment[link] + np.cross(arm, force[link])
+    return torques
+
+
+def _bends(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
+    """Second derivatives of torques at most, from each look to the next: the same equations in bounds."""
+    robot, linkage = problem.robot, Linkage(problem.robot)
+    number = {joint.name: j for j, joint in enumerate(robot.planned_joints)}
+    none = np.zeros(len(states.lasts))
+    still = Bound(none, none, none)
+    turning = {robot.base: (still, still, still, Bound(none + GRAVITY, none, none))}
+    axes, arms = dict[str, Bound](), dict[str, Bound]()
+    for joint in robot.joints:
+        seen, w, dw, pull = turning[joint.parent]
+        held = joint.motion(robot.locked.get(joint.name, 0.0)) if joint.name not in number else np.eye(4)
+        reach = float(np.linalg.norm((joint.T_parent_joint @ held)[:3, 3]))
+        axis, arm = _turned(1.0, seen), _turned(reach, seen)
+        j = number.get(joint.name)
+        if j is None:
+            pull = pull + dw * arm + w * (w * arm)
+        else:
+            place, speed, bent = (Bound(*(part[:, j] for part in of)) for of in states[4:])
+            along, rate = speed * axis, Bound(place.first, place.second, none) * axis
+            if linkage.slides[j]:
+                arm = arm + place * axis
+                pull = pull + dw * arm + w * (w * arm) + bent * axis + (w * along).scaled(2.0)
+            else:
+                pull = pull + dw * arm + w * (w * arm)
+                seen, w, dw = seen + rate, w + along, dw + bent * axis + w * along
+        turning[joint.child], axes[joint.child], arms[joint.child] = (seen, w, dw, pull), axis, arm
+    carried = _carried(problem)
+    force, moment = ({link: still for link in linkage.links} for _ in range(2))
+    bends = np.empty((len(none), robot.dof))
+    for joint in reversed(robot.joints):
+        link, (seen, w, dw, pull) = joint.child, turning[joint.child]
+        for body in carried.get(link, ()):
+            arm, most = (
+                _turned(float(np.linalg.norm(body.com)), seen),
+                float(np.linalg.eigvalsh(body.moments)[-1]),
+            )
+            inertia = Bound(none + most, 2 * most * seen.size, most * (2 * seen.first + 4 * seen.size**2))
+            own = (pull + dw * arm + w * (w * arm)).scaled(body.mass)
+            force[link] = force[link] + own
+            moment[link] = moment[link] + inertia * dw + w * (inertia * w) + arm * own
+        j = number.get(joint.name)
+        if j is not None:
+            bends[:, j] = (axes[link] * (force[link] if linkage.slides[j] else moment[link])).second
+        force[joint.parent] = force[joint.parent] + force[link]
+        moment[joint.parent] = moment[joint.parent] + moment[link] + arms[link] * force[link]
+    return bends
+
+
+def _turned(length: float, seen: Bound) -> Bound:
+    """A vector of a link, which turns with it as it is seen."""
+    return Bound(length + 0 * seen.size, length * seen.size, length * (seen.first + seen.size**2))
+
+
+def _carried(problem: Problem) -> dict[str, list[Inertia]]:
+    """What each link weighs, and the payload."""
+    payload, found = problem.payload, {link: [of] for link, of in problem.robot.inertias.items()}
+    assert payload is not None
+    if payload.mass > ALMOST:
+        link = payload.link or problem.robot.tip
+        found.setdefault(link, []).append(Inertia(payload.mass, payload.com, np.diag(payload.moments)))
+    return found

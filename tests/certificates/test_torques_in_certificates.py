@@ -1,0 +1,143 @@
+"""Certificates of motions with payloads: the checker's own dynamics, its bounds, and tampering."""
+
+import re
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
+from robotdiffuse.certificates.certificate import Certificate, load_certificate
+from robotdiffuse.certificates.content import request_parts
+from robotdiffuse.certificates.torques import inverse_dynamics, most_torques
+from robotdiffuse.certificates.writer import certify
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.dynamics import Dynamics
+from robotdiffuse.robots.inertias import Payload
+from robotdiffuse.types import Path, Trajectory
+
+pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
+LOW, FAR = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2], [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]
+PAYLOAD = Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03])
+
+
+@cache
+def certified() -> tuple[Problem, Certificate]:
+    """A motion at the limit of a joint's torque."""
+    payload = Payload(3.0, [0.0, 0.0, 0.1])
+    problem = Problem(rd.load_robot("panda"), rd.Scene(), LOW, FAR, payload=payload)
+    motion = rd.plan(problem, time_limit=20.0).trajectory
+    assert motion is not None
+    return problem, certify(problem, motion)
+
+
+def loaded(name: str) -> Problem:
+    robot = ROBOTS[name]()
+    middle = (robot.lower + robot.upper) / 2
+    return Problem(robot, rd.Scene(), middle, middle, payload=PAYLOAD, T_world_base=TURNED)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_dynamics_are_pinocchios(name: str) -> None:
+    problem, rng = loaded(name), np.random.default_rng(0)
+    q, v, a = rng.normal(size=(3, 50, problem.robot.dof))
+    expected = Dynamics(problem.robot, PAYLOAD, TURNED).torques(q, v, a)
+    assert np.allclose(inverse_dynamics(problem, q, v, a), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("step", [0.2, 0.02])
+def test_bounds_are_bounds(name: str, step: float) -> None:
+    """Against torques of motions with a row at each of many looks, by which nothing of the motion changes."""
+    problem, rng = loaded(name), np.random.default_rng(1)
+    for _ in range(5):
+        motion = wild(problem.robot, rng, step)
+        looks = np.linspace(0, motion.times[-1], 201)[1:-1]
+        for one, at in ((motion, looks), (Path(motion.joint_names, motion.positions), looks / step)):
+            few = most_torques(problem, one, np.zeros(0))
+            dense = most_torques(problem, one, at)
+            rows = np.sort(np.concatenate([motion.times / step, looks / step]))
+            piece = np.clip(((rows[1:] + rows[:-1]) / 2).astype(int), 0, len(few) - 1)
+            assert (dense <= few[piece] + 1e-9).all()
+
+
+def test_a_payload_is_proved_and_its_file_holds_without_pinocchio(
+    tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, certificate = certified()
+    certificate.save(tmp_path / "certificate.json")
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    read = load_certificate(tmp_path / "certificate.json")
+    assert read.check().differences == () and read.check(problem).differences == ()
+    assert dict(read.torques)["panda_joint2"] == pytest.approx(87.0, rel=0.02)
+
+
+def test_paths_are_proved_to_be_held() -> None:
+    problem, certificate = certified()
+    path = Path(problem.robot.joint_names, certificate.motion.positions[[0, -1]])
+    held = certify(problem, path)
+    assert held.check(problem).valid and len(held.torques) == 7
+
+
+def test_a_peak_between_rows_needs_looks() -> None:
+    """Of a robot without bodies, which has nothing else to prove."""
+    problem = Problem(pendulum(9.75), rd.Scene(), [1.0], [2.0], payload=Payload(0.0))
+    certificate = certify(problem, Path(("hinge",), np.array([[1.0], [2.0]])))
+    assert len(certificate.looks) and certificate.check(problem).valid
+    found = replace(certificate, looks=np.zeros(0)).check(problem).differences
+    assert any("hinge is not shown to keep its limit" in line for line in found)
+
+
+def lighter(certificate: Certificate) -> Certificate:
+    return replace(certificate, torques=tuple((name, most / 2) for name, most in certificate.torques))
+
+
+def silent(certificate: Certificate) -> Certificate:
+    return replace(certificate, torques=())
+
+
+def other(certificate: Certificate) -> Certificate:
+    return replace(certificate, torques=(*certificate.torques[1:], ("elbow", 1.0)))
+
+
+TAMPERED: dict[str, tuple[Callable[[Certificate], Certificate], str]] = {
+    "torques": (lighter, r"torques: panda_joint\d bears at most "),
+    "none": (silent, "torques: the certificate is not about those of the robot's joints"),
+    "other joints": (other, "torques: the certificate is not about those of the robot's joints"),
+}
+
+
+@pytest.mark.parametrize("case", TAMPERED)
+def test_tampering_is_caught(case: str) -> None:
+    tampered, wanted = TAMPERED[case]
+    problem, certificate = certified()
+    found = tampered(certificate).check(problem).differences
+    assert any(re.match(wanted, line) for line in found), found
+
+
+def test_a_heavier_payload_needs_another_proof() -> None:
+    problem, certificate = certified()
+    problem = replace(problem, payload=Payload(3.5, [0.0, 0.0, 0.1]))
+    assert "requests: payload is not as it was" in certificate.check(problem).differences
+    found = replace(certificate, request_parts=request_parts(problem)).check(problem).differences
+    assert any("panda_joint2 is not shown to keep its limit" in line for line in found), found
+
+
+def test_torques_without_a_payload_are_refused() -> None:
+    problem, certificate = certified()
+    bare = replace(problem, payload=None)
+    found = replace(certificate, request_parts=request_parts(bare)).check(bare).differences
+    assert "torques: the problem has no payload" in found
+
+
+def test_a_motion_of_one_row() -> None:
+    problem, _ = certified()
+    row, still = np.array([LOW]), np.zeros((1, 7))
+    there = replace(problem, goal=rd.JointGoal([LOW]))
+    motion = Trajectory(problem.robot.joint_names, np.zeros(1), row, still, still)
+    assert certify(there, motion).check(there).valid
