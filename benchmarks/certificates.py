@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import ndarray
@@ -249,10 +249,42 @@ def main() -> None:
         measure(drawn, judged, Path(name), arguments.commands)
 
 
+LOW, FAR = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2], [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
+TABLE = rd.Box([0.55, 0.0, 0.0], [0.5, 1.0, 0.2], name="table")
+POST = rd.Cylinder([0.42, 0.35, 0.4], 0.06, 0.6, name="post")
+REQUESTS: dict[str, dict[str, Any]] = {
+    "axis cone": {"constraints": [rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.1745)]},
+    "straight line": {"constraints": [rd.CartesianLine("panda_hand", 0.002, 0.02, 0.2)]},
+    "moving obstacle": {"moving": [rd.MovingObstacle(POST, velocity=[0.25, -0.1, 0.0])]},
+    "start velocity": {"start_velocity": [0.5, 0, 0, 0, 0, 0, 0]},
+    "payload of 3 kg": {"payload": rd.Payload(3.0, [0.0, 0.0, 0.1])},
+}
+
+
+def of_requests(folder: Path, count: int) -> None:
+    """One motion over a table for each kind of request: what its proof costs."""
+    robot, rows = rd.load_robot("panda"), []
+    for name, asked in REQUESTS.items():
+        problem = Problem(robot, rd.Scene([TABLE]), LOW, FAR, **asked)
+        result = rd.load_planner("aorrtc").plan(problem, time_limit=20.0)
+        assert result.trajectory is not None, result.reason
+        one = cost(problem, result.trajectory, folder)
+        verified, checked = (float(np.median(times)) for times in commands(problem, result, folder, count))
+        numbers = [f"{one.judge:.1f}", f"{one.write:.0f}", f"{one.check:.1f}", f"{one.check / one.write:.2f}"]
+        rows.append([name, *numbers, f"{verified:.2f}", f"{checked:.2f}", f"{checked / verified:.2f}"])
+    columns = ["", "judge ms", "certify ms", "check ms", "of certify", "verify s", "check s", "of verify"]
+    print_table(
+        "Requests, a motion each: CPU time in one warm process; wall time of commands",
+        columns,
+        rows,
+    )
+
+
 def measure(drawn: list[Motion], judged: list[Seen], folder: Path, count: int) -> None:
     """What is valid, as the planner returned it, and what this package plans for the same problems."""
     rough, smooth, failed = [], [], 0
     verified, checked = list[float](), list[float]()
+    of_requests(folder, count)
     problems = list({id(motion.problem): motion.problem for motion in drawn}.values())
     for motion, one in progress(list(zip(drawn, judged, strict=True)), "certifying"):
         if one.report.valid:

@@ -65,10 +65,11 @@ def kept(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[Kep
     `chord`, each joint [rad] or [m]. Raises InputError for a line whose goal does not say one pose."""
     linkage = Linkage(problem.robot)
     q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
-    postures = linkage.place(q)
+    frames = {constraint.frame for constraint in problem.constraints}
+    placed = linkage.place(q, *frames) if len(frames) == 1 else linkage.place(q)
     found = []
     for constraint in problem.constraints:
-        along = _along(linkage, postures, q, constraint.frame)
+        along = _along(linkage, placed, q, constraint.frame)
         name = f"{constraint.kind} of {constraint.frame}"
         if isinstance(constraint, AxisCone):
             cosines = along.R @ constraint.axis @ constraint.direction
@@ -97,7 +98,7 @@ def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
     for one in problem.constraints:
         if not isinstance(one, CartesianLine) or one.speed is None:
             continue
-        postures = linkage.place(motion.positions)
+        postures = linkage.place(motion.positions, one.frame)
         joints = np.flatnonzero(linkage.moved[linkage.links.index(one.frame)])
         p = postures.T[:, linkage.links.index(one.frame), :3, 3]
         rates = np.cross(postures.axes[:, joints], p[:, None] - postures.origins[:, joints])

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot import Joint, Robot
 
 
 class Postures(NamedTuple):
@@ -43,22 +43,41 @@ class Linkage:
                 moved[joint.child][self._planned[joint.name]] = True
         return np.stack([moved[link] for link in self.links])
 
-    def place(self, q: Float[ndarray, "n dof"]) -> Postures:
-        """The arm at configurations."""
+    def place(self, q: Float[ndarray, "n dof"], link: str | None = None) -> Postures:
+        """The arm at configurations; with a link, nothing but what that hangs from, the rest at zeros."""
         n, dof = len(q), len(self._planned)
-        at = {self.robot.base: np.broadcast_to(np.eye(4), (n, 4, 4))}
-        origins, axes = np.zeros((n, dof, 3)), np.zeros((n, dof, 3))
-        for joint in self.robot.joints:
-            T = at[joint.parent] @ joint.T_parent_joint
-            if joint.name in self._planned:
-                j = self._planned[joint.name]
-                origins[:, j], axes[:, j] = T[:, :3, 3], T[:, :3, :3] @ joint.axis
-                T = T @ _motion(joint.kind, joint.axis, q[:, j])
-            elif joint.kind != "fixed":
-                held = np.array([self.robot.locked.get(joint.name, 0.0)])
-                T = T @ _motion(joint.kind, joint.axis, held)
-            at[joint.child] = T
-        return Postures(np.stack([at[link] for link in self.links], axis=1), origins, axes)
+        T, origins, axes = np.zeros((n, len(self.links), 4, 4)), np.zeros((n, dof, 3)), np.zeros((n, dof, 3))
+        T[:, :, 3, 3], sines, rests = 1.0, np.sin(q).T[:, :, None, None], 1 - np.cos(q).T[:, :, None, None]
+        at = {self.robot.base: (np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)))}
+        for joint in self.robot.joints if link is None else self._up_to(link):
+            R, p = at[joint.parent]
+            turn, along = joint.T_parent_joint[:3, :3], joint.axis
+            p = p + R @ joint.T_parent_joint[:3, 3]
+            j = self._planned.get(joint.name)
+            if j is None and joint.kind != "fixed":
+                held = _motion(joint.kind, along, self.robot.locked.get(joint.name, 0.0))
+                p, turn = p + R @ (turn @ held[:3, 3]), turn @ held[:3, :3]
+            if j is not None:
+                origins[:, j], axes[:, j] = p, R @ (turn @ along)
+            if j is not None and not self.slides[j]:
+                K = _cross(along)  # of Rodrigues' formula
+                R = _times(R, turn) + sines[j] * _times(R, turn @ K) + rests[j] * _times(R, turn @ K @ K)
+            else:
+                R = _times(R, turn)
+                p = p if j is None else p + q[:, j, None] * axes[:, j]
+            at[joint.child] = R, p
+        for k, name in enumerate(self.links):
+            if name in at:
+                T[:, k, :3, :3], T[:, k, :3, 3] = at[name]
+        return Postures(T, origins, axes)
+
+    def _up_to(self, link: str) -> list[Joint]:
+        """Joints, parents first."""
+        found, above = list[Joint](), {joint.child: joint for joint in self.robot.joints}
+        while link in above:
+            found.append(above[link])
+            link = above[link].parent
+        return found[::-1]
 
     def displacement(
         self,
@@ -117,12 +136,19 @@ class Linkage:
         return np.minimum(np.maximum(towards, 0.0) + rest, went)
 
 
-def _motion(kind: str, axis: Float[ndarray, "3"], q: Float[ndarray, "n"]) -> Float[ndarray, "n 4 4"]:
-    T = np.tile(np.eye(4), (len(q), 1, 1))
-    if kind == "prismatic":
-        T[:, :3, 3] = q[:, None] * axis
-        return T
+def _times(R: Float[ndarray, "n 3 3"], right: Float[ndarray, "3 m"]) -> Float[ndarray, "n 3 m"]:
+    return (R.reshape(-1, 3) @ right).reshape(len(R), 3, right.shape[1])
+
+
+def _cross(axis: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
     x, y, z = axis
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    T[:, :3, :3] += np.sin(q)[:, None, None] * K + (1 - np.cos(q))[:, None, None] * (K @ K)
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+def _motion(kind: str, axis: Float[ndarray, "3"], q: float) -> Float[ndarray, "4 4"]:
+    T, K = np.eye(4), _cross(axis)
+    if kind == "prismatic":
+        T[:3, 3] = q * axis
+    else:
+        T[:3, :3] += np.sin(q) * K + (1 - np.cos(q)) * (K @ K)
     return T
