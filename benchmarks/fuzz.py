@@ -545,7 +545,9 @@ def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
     }
     what = "verify" if rng.random() < 0.5 else "plan"
     body = judged if what == "verify" else plan
-    return what, json.dumps(body).encode() if rng.random() < right else text_of(rng, body, ".json")
+    if right and rng.random() < right:
+        return what, json.dumps(body).encode()
+    return what, text_of(rng, body, ".json")
 
 
 def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
