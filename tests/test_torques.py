@@ -73,6 +73,13 @@ def test_a_peak_between_two_times_is_found() -> None:
             assert 1 < found.place < 2 and 1.01 * effort < found.torque < 9.82
 
 
+def test_a_motion_that_winds_on_and_on_is_refused_in_bounded_time() -> None:
+    winds = Trajectory(
+        ("hinge",), np.array([0.0, 1e5]), np.zeros((2, 1)), np.full((2, 1), 2.0), np.zeros((2, 1))
+    )
+    assert first_beyond(Dynamics(pendulum(9.9), Payload(0.0)), pieces_of(winds), 0.01) is not None
+
+
 def test_a_motion_of_one_row_is_held() -> None:
     row, still = np.array([[1.5]]), np.zeros((1, 1))
     for pieces in (pieces_held(row), pieces_of(Trajectory(("hinge",), np.zeros(1), row, still, still))):

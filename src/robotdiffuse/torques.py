@@ -17,9 +17,11 @@ from robotdiffuse.robots.torque_bounds import Stretches
 from robotdiffuse.types import Trajectory
 
 RESOLUTION = 1e-3
-"""Share of a limit to which a torque between two looks is told from one beyond it, ..."""
+"""Share of a limit to which a torque between two looks is told from one beyond it."""
+MOST_OPEN = 100_000
+"""Stretches that are halved at a time; of more, as of motions that wind on and on, nothing is shown."""
 FINE = 1 / 64
-"""... and of a piece to which the place is found where a torque comes to be beyond."""
+"""Of a piece, to which the place is found where a torque comes to be beyond."""
 States = tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]
 """Positions, velocities and accelerations."""
 
@@ -107,7 +109,8 @@ def first_beyond(dynamics: Dynamics, pieces: Pieces, slack: float) -> Beyond | N
         open_ = most + bulge > allowed
         begun, goes_on = (at_low > allowed).any(axis=1), (at_high > allowed).any(axis=1)
         unsure = np.minimum(bulge, RESOLUTION * dynamics.limits)
-        over, lost = begun | goes_on, (open_ & (bulge == unsure)).any(axis=1)
+        last = bulge <= unsure if len(piece) <= MOST_OPEN else np.ones_like(open_)
+        over, lost = begun | goes_on, (open_ & last).any(axis=1)
         wrong = np.flatnonzero(over | lost)
         places.append(piece[wrong] + np.where(over & ~begun, high, low)[wrong])
         torques.append(np.where(most > allowed, most, most + unsure)[wrong])
