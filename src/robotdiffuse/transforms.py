@@ -93,6 +93,11 @@ def transform(
     return T
 
 
+def pose_entry(T: Float[ndarray, "4 4"]) -> dict[str, list[float]]:
+    """A pose as files have it: `xyz` [m] and `wxyz`."""
+    return {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}
+
+
 def inverse(T: Float[ndarray, "4 4"]) -> Float[ndarray, "4 4"]:
     """Inverse of a rigid transform."""
     return transform(-T[:3, :3].T @ T[:3, 3], T[:3, :3].T)

@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import coal
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import SCENE, Claim, Part, Plane, Prover, Stretches, gaps, placed
 from robotdiffuse.certificates.obstacles import Rounded, Surface
+from robotdiffuse.robots.coal_bodies import coal_convex, coal_pose
 from robotdiffuse.transforms import transform
 
 MOST_PLANES = 64
@@ -88,7 +89,7 @@ def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterat
         asked[element] = True
         corners = surface.corners[element]
         if len(corners) == 3:
-            second = _Body(_convex(corners, np.array([[0, 1, 2], [0, 2, 1]])), np.eye(4))
+            second = _Body(coal_convex(corners, np.array([[0, 1, 2], [0, 2, 1]])), np.eye(4))
         else:
             second = _Body(coal.Sphere(surface.radius), transform(corners[0]))
         normal = _normal(first, second)
@@ -100,10 +101,8 @@ def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterat
 
 def _normal(first: _Body, second: _Body) -> Normal | None:
     """From the nearest point of the second to that of the first; None if they touch."""
-    result = coal.DistanceResult()
-    coal.distance(
-        first.geometry, _place(first.T), second.geometry, _place(second.T), coal.DistanceRequest(), result
-    )
+    request, result = coal.DistanceRequest(), coal.DistanceResult()
+    coal.distance(first.geometry, coal_pose(first.T), second.geometry, coal_pose(second.T), request, result)
     between = np.asarray(result.getNearestPoint1()) - np.asarray(result.getNearestPoint2())
     distance = float(np.linalg.norm(between))
     if not result.min_distance > 0 or distance < 1e-9:
@@ -112,23 +111,10 @@ def _normal(first: _Body, second: _Body) -> Normal | None:
     return x, y, z
 
 
-def _place(T: Float[ndarray, "4 4"]) -> coal.Transform3s:
-    return coal.Transform3s(np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]))
-
-
 def _hull(part: Part) -> _Body:
     if len(part.vertices) == 1:
         return _Body(coal.Sphere(part.rounding), transform(part.vertices[0]))
-    return _Body(_convex(part.vertices, part.faces), np.eye(4))
-
-
-def _convex(vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]) -> coal.Convex:
-    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-    for vertex in vertices:
-        points.append(vertex)
-    for a, b, c in faces.tolist():
-        triangles.append(coal.Triangle(a, b, c))
-    return coal.Convex(points, triangles)
+    return _Body(coal_convex(part.vertices, part.faces), np.eye(4))
 
 
 def _rounded(body: Rounded) -> _Body:

@@ -28,6 +28,7 @@ from robotdiffuse.collision.hulls import (
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
 from robotdiffuse.deadline import check_time
+from robotdiffuse.robots.coal_bodies import coal_convex, coal_pose, coal_surface
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
@@ -80,27 +81,9 @@ def forward_frames(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "
     return kernel.forward(robot.frame_offsets, robot.branching, slides, np.asarray(q, np.float64))
 
 
-def _convex(vertices: ndarray, faces: ndarray) -> coal.Convex:
-    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-    for vertex in vertices:
-        points.append(vertex)
-    for a, b, c in faces.tolist():
-        triangles.append(coal.Triangle(a, b, c))
-    return coal.Convex(points, triangles)
-
-
-def _surface(vertices: ndarray, faces: ndarray) -> coal.BVHModelOBBRSS:
-    model = coal.BVHModelOBBRSS()
-    model.beginModel(len(faces), len(vertices))
-    model.addVertices(np.ascontiguousarray(vertices))
-    model.addTriangles(np.ascontiguousarray(faces, dtype=np.int32))
-    model.endModel()
-    return model
-
-
 def _piece(part: Part) -> _Piece:
     if len(part.faces):
-        return _Piece(_convex(part.vertices, part.faces), part.frame, None)
+        return _Piece(coal_convex(part.vertices, part.faces), part.frame, None)
     return _Piece(coal.Sphere(part.rounding), part.frame, transform(part.center))
 
 
@@ -118,10 +101,6 @@ def _balls(robot: Robot) -> dict[str, tuple[int, ndarray, ndarray]]:
     }
 
 
-def _transform3(T: ndarray) -> coal.Transform3s:
-    return coal.Transform3s(T[:3, :3], T[:3, 3])
-
-
 def _obstacle(solid: Solid) -> _Obstacle:
     """The Coal object of a shape."""
     shape = solid.shape
@@ -135,14 +114,14 @@ def _obstacle(solid: Solid) -> _Obstacle:
         case Capsule():
             geometry = coal.Capsule(shape.radius, shape.height)
         case Triangulated():
-            geometry = _surface(shape.mesh.world_vertices, shape.mesh.faces)
+            geometry = coal_surface(shape.mesh.world_vertices, shape.mesh.faces)
         case PointCloud():
             # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
-            geometry = _surface(shape.points, np.repeat(np.arange(len(shape.points))[:, None], 3, axis=1))
+            geometry = coal_surface(shape.points, np.repeat(np.arange(len(shape.points))[:, None], 3, axis=1))
         case _:
             raise TypeError(f"no collision geometry for a {type(shape).__name__}")
     # surfaces are given in the base frame
-    T = coal.Transform3s.Identity() if solid.bounds else _transform3(solid.T_base_box)
+    T = coal.Transform3s.Identity() if solid.bounds else coal_pose(solid.T_base_box)
     inflation = solid.rounding if solid.bounds else 0.0
     return _Obstacle(shape.name, geometry, T, solid.bounds, inflation)
 
@@ -234,7 +213,7 @@ class ExactCollision:
 
     def _place(self, piece: _Piece, frames: ndarray) -> coal.Transform3s:
         T = frames[piece.frame]
-        return _transform3(T if piece.T_frame_piece is None else T @ piece.T_frame_piece)
+        return coal_pose(T if piece.T_frame_piece is None else T @ piece.T_frame_piece)
 
     def _signed(
         self, piece: _Piece, other: _Piece | _Obstacle, frames: ndarray, cutoff: float, depth: bool

@@ -16,8 +16,9 @@ from numpy import ndarray
 
 from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint, PositionBox
-from robotdiffuse.problems.equipment import pose_entry, pose_of
+from robotdiffuse.problems.equipment import pose_of
 from robotdiffuse.scenes.files import check_fields
+from robotdiffuse.transforms import pose_entry
 
 POSE = ("xyz", "wxyz")
 

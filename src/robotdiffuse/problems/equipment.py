@@ -21,7 +21,7 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import IDENTITY, Shape
-from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.transforms import pose_entry, rotation_from_quaternion, transform
 
 ORIGIN = (0.0, 0.0, 0.0)
 DIGITS = 12
@@ -37,11 +37,6 @@ def pose_of(where: str, values: dict[str, Any]) -> Float[ndarray, "4 4"]:
     """The transform of the fields xyz and wxyz among others, each of which may be left out."""
     xyz = vector(where, "xyz", values.get("xyz", ORIGIN), 3)
     return transform(xyz, rotation_from_quaternion(unit_quaternion(where, values.get("wxyz", IDENTITY))))
-
-
-def pose_entry(T: Float[ndarray, "4 4"]) -> dict[str, Any]:
-    """What `read_pose` takes."""
-    return {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}
 
 
 def equipped(robot: Robot, tool: object, attached: object, folder: Path) -> tuple[Robot, tuple[str, ...]]:

@@ -15,7 +15,6 @@ from robotdiffuse.problems.equipment import (
     equipment_entries,
     equipped,
     payload_entry,
-    pose_entry,
     read_payload,
     read_pose,
     rounded,
@@ -44,6 +43,7 @@ from robotdiffuse.scenes.depth_view import DepthView
 from robotdiffuse.scenes.depth_view_files import read_views, view_entry
 from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.transforms import pose_entry
 
 FIELDS = ("robot", "scene", "start", "goal")
 OPTIONAL = (

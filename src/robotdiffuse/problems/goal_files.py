@@ -15,11 +15,12 @@ from numpy import ndarray
 
 from robotdiffuse.checks import numbers
 from robotdiffuse.errors import InputError, shown, unknown_name
-from robotdiffuse.problems.equipment import pose_entry, pose_of
+from robotdiffuse.problems.equipment import pose_of
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.placement import placed
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.transforms import pose_entry
 
 GOALS = ("joints", "joint_set", "pose", "poses", "any")
 TOLERANCES = ("xyz_tolerance", "rpy_tolerance")

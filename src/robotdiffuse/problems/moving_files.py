@@ -9,10 +9,11 @@ moving:
 from pathlib import Path
 
 from robotdiffuse.errors import InputError, shown
-from robotdiffuse.problems.equipment import one_shape, pose_entry, read_pose
+from robotdiffuse.problems.equipment import one_shape, read_pose
 from robotdiffuse.scenes.files import SHAPES, scene_entries
 from robotdiffuse.scenes.moving import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.transforms import pose_entry
 
 MOTION = ("velocity", "times", "poses", "max_speed")
 

@@ -12,6 +12,7 @@ from numpy import ndarray
 from scipy.optimize import linprog
 
 from robotdiffuse.errors import InputError
+from robotdiffuse.robots.coal_bodies import coal_convex, coal_pose
 from robotdiffuse.robots.convex_parts import planes_of
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.robots.sphere_kernels import ball_distances, deepest_touches
@@ -199,7 +200,10 @@ class Links:
         self.joints = [j for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None]
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
-        self.hulls = {link: [_coal_hull(mesh) for mesh in parts] for link, parts in robot.meshes.items()}
+        self.hulls = {
+            link: [coal_convex(mesh.vertices, mesh.faces) for mesh in parts]
+            for link, parts in robot.meshes.items()
+        }
         self.balls = {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in robot.meshes.items()}
         self.inner = {
             link: np.stack([_inner(mesh) for mesh in parts]) for link, parts in robot.meshes.items()
@@ -310,10 +314,6 @@ def _motions(axis: Float[ndarray, "3"], prismatic: bool, q: Float[ndarray, "n"])
     return T
 
 
-def coal_pose(T: Float[ndarray, "4 4"]) -> "coal.Transform3s":
-    return coal.Transform3s(np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3]))
-
-
 def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
     """Centre and radius of a ball that holds a mesh."""
     center = (mesh.vertices.min(0) + mesh.vertices.max(0)) / 2
@@ -326,12 +326,3 @@ def _inner(mesh: ConvexMesh) -> Float[ndarray, "4"]:
     planes = np.column_stack([normals, np.ones(len(normals))])
     found = linprog([0, 0, 0, -1], planes, offsets, bounds=[(None, None)] * 3 + [(0, None)])
     return np.append(found.x[:3], found.x[3] - ROUNDING) if found.success else np.array([0, 0, 0, -np.inf])
-
-
-def _coal_hull(mesh: ConvexMesh) -> "coal.Convex":
-    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
-    for vertex in mesh.vertices:
-        points.append(vertex)
-    for face in mesh.faces:
-        triangles.append(coal.Triangle(*map(int, face)))
-    return coal.Convex(points, triangles)

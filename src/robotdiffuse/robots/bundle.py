@@ -15,7 +15,7 @@ from robotdiffuse.errors import InputError, shortened, shown
 from robotdiffuse.reading import read_arrays, read_json
 from robotdiffuse.robots.inertias import inertia_of
 from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
-from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.transforms import pose_entry, rotation_from_quaternion, transform
 
 FORMAT = 2
 """2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""
@@ -111,7 +111,7 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
         "tip": robot.tip,
         **({"other_tips": list(robot.other_tips)} if robot.other_tips else {}),
         "root": robot.root or robot.base,
-        "above": {link: _pose_to_json(T_base_link) for link, T_base_link in robot.above.items()},
+        "above": {link: pose_entry(T_base_link) for link, T_base_link in robot.above.items()},
         "locked": robot.locked,
         "poses": robot.poses,
         "joints": [_joint_to_json(joint) for joint in robot.joints],
@@ -128,7 +128,7 @@ def _joint_to_json(joint: Joint) -> dict:
         "kind": joint.kind,
         "parent": joint.parent,
         "child": joint.child,
-        **_pose_to_json(joint.T_parent_joint),
+        **pose_entry(joint.T_parent_joint),
     }
     if joint.kind in MOVING_KINDS:
         data |= {"axis": joint.axis.tolist()} | {name: getattr(joint, name) for name in LIMITS}
@@ -137,10 +137,6 @@ def _joint_to_json(joint: Joint) -> dict:
     if joint.mimic is not None:
         data["mimic"] = list(joint.mimic)
     return data
-
-
-def _pose_to_json(T: Float[ndarray, "4 4"]) -> dict[str, list[float]]:
-    return {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}
 
 
 def _dump(data: dict) -> str:

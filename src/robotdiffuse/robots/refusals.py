@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.robots.allowed_collisions import Links, coal_pose
+from robotdiffuse.robots.allowed_collisions import Links
+from robotdiffuse.robots.coal_bodies import coal_pose, coal_surface
 from robotdiffuse.robots.convex_parts import Surface
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.sphere_kernels import deepest_touches
@@ -69,7 +70,10 @@ def measure_refusals(
         if joint.name in robot.locked:
             q[:, column] = robot.locked[joint.name]
     poses = links.poses(q)
-    trees = {link: tuple(map(_tree, parts)) for link, parts in surfaces.items()}
+    trees = {
+        link: tuple(coal_surface(part.vertices, part.faces) for part in parts)
+        for link, parts in surfaces.items()
+    }
     found = []
     for a, b in robot.checked_pairs():
         depth, middle = deepest_touches(poses[a], poses[b], robot.spheres[a], robot.spheres[b], 0.0, 0.0)
@@ -114,15 +118,6 @@ def _one_per_cube(points: Float[ndarray, "n 3"], gaps: Float[ndarray, "n"]) -> F
     order = np.argsort(gaps)
     rows = np.column_stack([points, gaps])[order]
     return rows[np.unique(np.floor(rows[:, :3] / CUBE), axis=0, return_index=True)[1]]
-
-
-def _tree(surface: Surface) -> "coal.BVHModelOBBRSS":
-    model = coal.BVHModelOBBRSS()
-    model.beginModel(len(surface.faces), len(surface.vertices))
-    model.addVertices(np.ascontiguousarray(surface.vertices))
-    model.addTriangles(np.ascontiguousarray(surface.faces, dtype=np.int32))
-    model.endModel()
-    return model
 
 
 def _collide(

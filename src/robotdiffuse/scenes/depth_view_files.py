@@ -17,7 +17,7 @@ from robotdiffuse.reading import input_file, read_arrays
 from robotdiffuse.scenes.depth_view import DepthView
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
-from robotdiffuse.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.transforms import pose_entry, rotation_from_quaternion, transform
 
 DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
 MILLIMETRE = 0.001
@@ -160,9 +160,7 @@ def view_entry(view: DepthView, folder: Path | None) -> dict[str, Any]:
         entry["depth"] = image.tolist()
     if view.cloud is None:
         entry["intrinsics"] = list(view.intrinsics)
-    T = view.T_base_camera
-    wxyz = quaternion_from_rotation(T[:3, :3]).tolist()
-    entry["camera"] = {"xyz": T[:3, 3].tolist(), "wxyz": wxyz}
+    entry["camera"] = pose_entry(view.T_base_camera)
     if view.configuration is not None:
         entry["configuration"] = view.configuration.tolist()
     return entry

@@ -1,0 +1,33 @@
+"""Poses and meshes as Coal has them."""
+
+# Coal's Python module has no type information.
+# pyright: reportAttributeAccessIssue=false
+
+import coal
+import numpy as np
+from jaxtyping import Float, Integer
+from numpy import ndarray
+
+
+def coal_pose(T: Float[ndarray, "4 4"]) -> coal.Transform3s:
+    return coal.Transform3s(T[:3, :3], T[:3, 3])
+
+
+def coal_convex(vertices: Float[ndarray, "v 3"], faces: Integer[ndarray, "f 3"]) -> coal.Convex:
+    """A solid, whose vertices and triangles are those of its hull."""
+    points, triangles = coal.StdVec_Vec3s(), coal.StdVec_Triangle()
+    for vertex in vertices:
+        points.append(vertex)
+    for a, b, c in faces.tolist():
+        triangles.append(coal.Triangle(a, b, c))
+    return coal.Convex(points, triangles)
+
+
+def coal_surface(vertices: Float[ndarray, "v 3"], faces: Integer[ndarray, "f 3"]) -> coal.BVHModelOBBRSS:
+    """Triangles that need enclose nothing, in a tree."""
+    model = coal.BVHModelOBBRSS()
+    model.beginModel(len(faces), len(vertices))
+    model.addVertices(np.ascontiguousarray(vertices))
+    model.addTriangles(np.ascontiguousarray(faces, dtype=np.int32))
+    model.endModel()
+    return model
