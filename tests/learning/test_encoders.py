@@ -263,7 +263,7 @@ def test_neighbours_count():
 def test_training_alone(name, tmp_path, monkeypatch):
     monkeypatch.setattr(encoder_training, "READ", 256)
     training_settings = EncoderTraining(
-        name=name, minutes=None, samples=3200, batch=16, points=64, warmup_steps=10, encoder=SMALL[name]
+        name=name, minutes=None, samples=1600, batch=16, points=64, warmup_steps=10, encoder=SMALL[name]
     )
     drawn = set()
 
@@ -328,6 +328,7 @@ def planner(data, encoder, **changes) -> PlannerTraining:
     planned = PlannerTraining(
         data=str(data), encoder=encoder, minutes=None, samples=96, batch=16, warmup_steps=1,
         denoiser_settings=TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8),
+        validation_problems=1,
     )  # fmt: skip
     return replace(planned, **changes)
 
