@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from helpers.made_arms import chain, row, written
+from helpers.quick_preparation import QUICK
 from robotdiffuse.cli import main
 from robotdiffuse.cli.background_factory import filled_meanwhile
 from robotdiffuse.data.manifest import read_manifest, write_manifest
@@ -26,8 +27,6 @@ from robotdiffuse.learning.training.configs import CONFIGS
 from robotdiffuse.planners import PLANNERS, planner_settings
 from robotdiffuse.results import PlanResult, load_result
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.preparation import PreparationSettings
 from robotdiffuse.types import Status
 
 ROOT = Path(__file__).parents[2]
@@ -364,8 +363,7 @@ def test_robot_add_with_srdf_and_robot_list(
 ) -> None:
     """Pairs that an SRDF or the command allows, the comparison with sampling, progress without a terminal."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
-    quick = PreparationSettings(sampling=SamplingSettings(samples=100), samples=100, rounds=0)
-    monkeypatch.setattr("robotdiffuse.robots.add.PreparationSettings", lambda: quick)
+    monkeypatch.setattr("robotdiffuse.robots.add.PreparationSettings", lambda: QUICK)
     file = written(tmp_path, chain("base", row("j", 4), xyz="0 0 0.07", limits='lower="-3" upper="3"'))
     pairs = ("base", "j4_link", "User"), ("base", "j3_link", "Never"), ("base", "j1_link", "Adjacent")
     rows = (f'<disable_collisions link1="{a}" link2="{b}" reason="{why}"/>' for a, b, why in pairs)

@@ -25,12 +25,10 @@ from typing import Any
 import numpy as np
 import yaml
 
+from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.cli import build_parser, main
 from robotdiffuse.problems.files import load_problem
 from robotdiffuse.robots.add import add_robot
-from robotdiffuse.robots.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.preparation import PreparationSettings
-from robotdiffuse.robots.sphere_fitting import SphereSettings
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -101,10 +99,9 @@ def rop_data(folder: Path) -> None:
 
 
 def bench_arm(folder: Path) -> None:
-    """The robot of arm.urdf, with few spheres and few samples: `robot add` itself takes a minute."""
-    coarse = SphereSettings(first_half=0.06, second_half=0.06, candidates=200, rounds=3, starts=1)
-    settings = PreparationSettings(spheres=coarse, sampling=SamplingSettings(500), rounds=0, samples=500)
-    add_robot("arm.urdf", base="base", limits="joint_limits.yaml", settings=settings)
+    """The robot of arm.urdf, with few, fat spheres: `robot add` itself takes a minute."""
+    with coarse_grids():
+        add_robot("arm.urdf", base="base", limits="joint_limits.yaml", settings=QUICK)
 
 
 def shelf(folder: Path) -> None:

@@ -7,18 +7,16 @@ import pytest
 
 from helpers.awkward_urdfs import REFUSED, WORKS
 from helpers.made_arms import BALL, chain, row, written
+from helpers.quick_preparation import QUICK, coarse_grids
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import load_planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.add import add_robot
-from robotdiffuse.robots.allowed_collisions import SamplingSettings
 from robotdiffuse.robots.preparation import LARGE, PreparationSettings
 from robotdiffuse.robots.scaled import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.verify import verify
-
-QUICK = PreparationSettings(sampling=SamplingSettings(samples=100, descents=1), samples=100, rounds=0)
 
 
 @pytest.mark.parametrize("name", WORKS)
@@ -26,7 +24,8 @@ def test_awkward_arms_are_prepared_and_plan(name: str, tmp_path: Path) -> None:
     if name == "xacro":
         pytest.importorskip("xacrodoc")
     make, dof = WORKS[name]
-    report = add_robot(make(tmp_path), out=tmp_path / "robot", settings=QUICK)
+    with coarse_grids():
+        report = add_robot(make(tmp_path), out=tmp_path / "robot", settings=QUICK)
     made = report.robot
     assert made.dof == dof and all(part.covered for part in report.links)
     rng = np.random.default_rng(0)
