@@ -11,7 +11,7 @@ import robotdiffuse as rd
 from robotdiffuse.planners import load_planner
 from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.kinematics import link_pose, link_poses
 from robotdiffuse.transforms import rotation_angle, rotation_from_rpy, transform
 from robotdiffuse.types import Path, Status
 from robotdiffuse.verify import verify, verify_trajectory
@@ -39,29 +39,28 @@ def problem(constraints: list[Constraint], scene: rd.Scene | None = None) -> Pro
 
 
 def excess(constraint: Constraint, q: np.ndarray) -> float:
-    """How far a configuration is beyond a constraint [m] or [rad], by hand."""
-    T = link_pose(PANDA, q, constraint.frame)
-    p = T[:3, 3]
+    """How far the worst of configurations [n, dof] is beyond a constraint [m] or [rad], by hand."""
+    T = link_poses(PANDA, q, constraint.frame)
+    p = T[:, :3, 3]
     if isinstance(constraint, rd.AxisCone):
-        return (
-            float(np.arccos(min(T[:3, :3] @ constraint.axis @ constraint.direction, 1.0))) - constraint.angle
-        )
+        cosines = T[:, :3, :3] @ constraint.axis @ constraint.direction
+        return float(np.arccos(min(cosines.min(), 1.0))) - constraint.angle
     if isinstance(constraint, rd.PositionBox):
         return float(np.maximum(constraint.low - p, p - constraint.high).max())
     if isinstance(constraint, rd.OnPlane):
-        return abs(float((p - constraint.point) @ constraint.normal)) - constraint.tolerance
+        return float(np.abs((p - constraint.point) @ constraint.normal).max()) - constraint.tolerance
     if isinstance(constraint, rd.OnLine):
-        return (
-            float(np.linalg.norm(np.cross(p - constraint.point, constraint.direction))) - constraint.tolerance
-        )
+        off = np.linalg.norm(np.cross(p - constraint.point, constraint.direction), axis=1)
+        return float(off.max()) - constraint.tolerance
     first, last = link_pose(PANDA, START, HAND), link_pose(PANDA, GOAL, HAND)
     way = last[:3, 3] - first[:3, 3]
     share = np.clip((p - first[:3, 3]) @ way / (way @ way), 0, 1)
-    off = float(np.linalg.norm(p - first[:3, 3] - share * way)) - constraint.tolerance
+    off = np.linalg.norm(p - first[:3, 3] - share[:, None] * way, axis=1) - constraint.tolerance
     # start and goal have the same orientation here but for a turn of the base joint, about the vertical
-    up = rotation_from_rpy(0.0, 0.0, 1.2 * float(share)) @ first[:3, :3]
+    ups = (rotation_from_rpy(0.0, 0.0, 1.2 * one) @ first[:3, :3] for one in share.tolist())
     assert constraint.angle is not None
-    return max(off, rotation_angle(up.T @ T[:3, :3]) - constraint.angle)
+    turned = max(rotation_angle(up.T @ R) for up, R in zip(ups, T[:, :3, :3], strict=True))
+    return max(float(off.max()), turned - constraint.angle)
 
 
 @pytest.mark.parametrize(
@@ -79,15 +78,15 @@ def test_motions_keep_constraints_at_every_millimetre(
     for rows in (result.path.positions, result.trajectory.positions):
         for a, b in pairwise(rows):
             steps = int(np.abs(b - a).sum() / 1e-3) + 2  # lever arms are below 1 m
-            for share in np.linspace(0, 1, steps):
-                assert max(excess(one, a + share * (b - a)) for one in constraints) <= 1e-9
+            between = a + np.linspace(0, 1, steps)[:, None] * (b - a)
+            assert max(excess(one, between) for one in constraints) <= 1e-9
 
 
 def test_speed_of_a_line_is_kept_and_used() -> None:
     result = load_planner("aorrtc").plan(problem([LINE]), time_limit=20.0)
     assert result.trajectory is not None, result.reason
     t = result.trajectory
-    at = np.array([link_pose(PANDA, q, HAND)[:3, 3] for q in t.positions])
+    at = link_poses(PANDA, t.positions, HAND)[:, :3, 3]
     speeds = np.linalg.norm(np.diff(at, axis=0), axis=1) / np.diff(t.times)
     assert speeds.max() <= 0.25 * 1.001 and np.median(speeds) >= 0.24
     slower = problem([replace(LINE, speed=0.2)])

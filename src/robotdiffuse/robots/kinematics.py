@@ -22,8 +22,8 @@ def _motion(robot: Robot, j: int, q: float) -> Float[ndarray, "4 4"]:
     return transform(Z * q) if robot.prismatic[j] else transform(0 * Z, rotation_about(Z, q))
 
 
-def link_origins(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 3"]:
-    """Where a link's origin is at many configurations [m]; InputError for an unknown link."""
+def link_poses(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 4 4"]:
+    """T_base_link at many configurations; InputError for an unknown link."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for j in robot.chain(link):
         motion = np.broadcast_to(np.eye(4), (len(q), 4, 4)).copy()
@@ -34,7 +34,12 @@ def link_origins(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[n
             motion[:, 1, 0] = np.sin(q[:, j])
             motion[:, 0, 1] = -motion[:, 1, 0]
         T = T @ robot.frame_offsets[j] @ motion
-    return (T @ robot.T_frame_link(link))[:, :3, 3]
+    return T @ robot.T_frame_link(link)
+
+
+def link_origins(robot: Robot, q: Float[ndarray, "n dof"], link: str) -> Float[ndarray, "n 3"]:
+    """Where a link's origin is at many configurations [m]; InputError for an unknown link."""
+    return link_poses(robot, q, link)[:, :3, 3]
 
 
 @once_per_robot
