@@ -53,11 +53,15 @@ def keys(records: list[Record]) -> Counter:
 
 
 def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -> None:
-    asked = replace(settings(tmp_path), seeds=2)
-    assert run_bench(asked, quiet, quiet) == 6
+    plain, with_settings = "rrt_connect", "rrt_connect:optimize_time=0.05:tightenings=0"
+    asked = replace(settings(tmp_path, f"{plain},{with_settings}", count=2), seeds=2)
+    assert run_bench(asked, quiet, quiet) == 8
     assert run_bench(asked, quiet, quiet) == 0
-    records = read_records(tmp_path)["rrt_connect"]
-    assert keys(records) == {("rop", f"rop/{i}", seed, 2.0): 1 for i in range(3) for seed in range(2)}
+    rows = read_records(tmp_path)
+    assert list(rows) == [plain, with_settings], "a planner with settings is a row of its own"
+    for records in rows.values():
+        assert keys(records) == {("rop", f"rop/{i}", seed, 2.0): 1 for i in range(2) for seed in range(2)}
+    records = rows[plain]
     solved = [record for record in records if record.solved]
     runs = [json.loads(line) for line in (tmp_path / "runs.jsonl").read_text().splitlines()]
     assert solved and len(runs) == 2
@@ -71,7 +75,7 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
         assert (record.workers, record.run) == (1, runs[0]["run"])
         assert record.load is not None and record.cpu is not None
         assert record.trivial == (line_length(problem, judge) is not None)
-    assert run_bench(replace(asked, count=4), quiet, quiet) == 2
+    assert run_bench(replace(asked, count=3, planners=(plain,)), quiet, quiet) == 2
     assert len(runs[0]["versions"]) > 3
 
 
@@ -118,7 +122,7 @@ def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pyt
 
 def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Path) -> None:
     arguments = ["bench", "run", "--planners", "rrt_connect,shared_tree_rrt_star", "--problems", "rop"]
-    arguments += ["--count", "4", "--time-limit", "2", "--workers", "2", "--out", str(tmp_path)]
+    arguments += ["--count", "3", "--time-limit", "2", "--workers", "2", "--out", str(tmp_path)]
     command = [sys.executable, "-m", "robotdiffuse", *arguments]
     run = subprocess.Popen(command, start_new_session=True, stderr=subprocess.DEVNULL)
     first = tmp_path / "records" / "rrt_connect.jsonl"
@@ -132,7 +136,7 @@ def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Pat
     assert main(arguments) == 0
     for file in (tmp_path / "records").iterdir():
         assert file.read_text().startswith(before.get(file, "").rpartition("\n")[0])
-        assert keys(RecordFile(file).records) == {("rop", f"rop/{i}", 0, 2.0): 1 for i in range(4)}
+        assert keys(RecordFile(file).records) == {("rop", f"rop/{i}", 0, 2.0): 1 for i in range(3)}
 
 
 def test_what_ended_by_itself_is_not_asked_again_with_more_time(tmp_path: Path) -> None:
@@ -216,12 +220,8 @@ def keys_in_order(folder: Path, planner: str) -> list[tuple[str, int]]:
     return [(record.name, record.seed) for record in read_records(folder)[planner]]
 
 
-def test_a_planner_with_settings_is_a_row_of_its_own(tmp_path: Path) -> None:
-    texts = "rrt_connect", "rrt_connect:optimize_time=0.05:tightenings=0"
-    asked = replace(settings(tmp_path, count=1), planners=texts)
-    assert run_bench(asked, quiet, quiet) == 2
-    assert list(read_records(tmp_path)) == sorted(texts)
-    planner = Contestant.of(texts[1]).load()
+def test_a_planner_with_settings() -> None:
+    planner = Contestant.of("rrt_connect:optimize_time=0.05:tightenings=0").load()
     assert isinstance(planner, RRTConnect)
     assert (planner.settings.optimize_time, planner.settings.tightenings) == (0.05, 0)
     calls = Contestant.of("aorrtc:until=limit:gain=0.01:clearance=0")

@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import lru_cache
 from math import ceil
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -19,7 +19,6 @@ from robotdiffuse.evaluation.metrics import Measure
 from robotdiffuse.evaluation.records import ENDED, RAISED, RESTARTABLE, SOLVED
 from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial
 from robotdiffuse.learning.guidance import CollisionGuidance
-from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
 from robotdiffuse.planners.base import Planner
 from robotdiffuse.planners.diffusion import ModelSampler, encode
 from robotdiffuse.planners.robotdiffuse import RobotDiffuseSettings, unlearned_starts
@@ -28,6 +27,9 @@ from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.types import Path, Status
 from robotdiffuse.verify import Report, VerifySettings, verifier
+
+if TYPE_CHECKING:
+    from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
 
 NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4)
 """How networks are sampled where they are looked at alone: without guidance, the planner's steps are few."""
@@ -204,7 +206,7 @@ def from_network(
     return draw
 
 
-def nothing_near(model: MotionModel) -> ClearanceFn:
+def nothing_near(model: "MotionModel") -> "ClearanceFn":
     """What a model is told of the obstacles where there are none."""
     links, width = len(model.robot.links), model.dof if model.settings.sees_gradients else 0
 

@@ -6,12 +6,12 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.collision.exact import forward_frames
 from robotdiffuse.results import PlanResult
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.types import Path, Trajectory
 from robotdiffuse.verify import Report
@@ -39,28 +39,33 @@ class Kinematics:
     """Of one robot: the ways of its links."""
 
     def __init__(self, robot: Robot) -> None:
-        self._kinematics, self._tip = ForwardKinematics(robot, torch.float64), robot.tip
-        self._links = [i for i, link in enumerate(robot.link_names) if robot.link_frame(link) > 0]
+        moving = [link for link in robot.link_names if robot.link_frame(link) > 0]
+        self._robot = robot
+        self._frames = [robot.link_frame(link) for link in moving]
+        self._origins = np.stack([robot.T_frame_link(link)[:, 3] for link in moving])
 
     def link_length(self, q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
         """The paper's path length: the sum over all moving links of the way that the origin travels [m]."""
-        with torch.inference_mode():
-            T = self._kinematics.links(torch.from_numpy(np.asarray(q, np.float64)))
-        at = T[..., self._links, :3, 3].numpy()
-        return np.linalg.norm(np.diff(at, axis=-3), axis=-1).sum(axis=(-2, -1))
+        T = forward_frames(self._robot, np.asarray(q, np.float64).reshape(-1, q.shape[-1]))
+        at = np.einsum("nlij,lj->nli", T[:, self._frames, :3], self._origins)
+        at = at.reshape(*q.shape[:2], *at.shape[1:])
+        return np.linalg.norm(np.diff(at, axis=1), axis=-1).sum(axis=(1, 2))
 
     def tip_length(self, q: Float[ndarray, "waypoints dof"]) -> float:
         """The way of the origin of the robot's tip [m]."""
-        with torch.inference_mode():
-            tip = self._kinematics.link(torch.from_numpy(q), self._tip)[:, :3, 3].numpy()
+        tip = link_origins(self._robot, q, self._robot.tip)
         return float(np.linalg.norm(np.diff(tip, axis=0), axis=1).sum())
 
     def tip_speed(self, motion: Trajectory) -> Float[ndarray, "n"]:
         """Of the origin of the robot's tip at each row [m/s]."""
-        with torch.inference_mode():
-            rows = torch.from_numpy(motion.positions)
-            jacobian = self._kinematics.jacobian(rows, self._tip)[:, :3].numpy()
-        return np.linalg.norm(np.einsum("nij,nj->ni", jacobian, motion.velocities), axis=1)
+        robot, q = self._robot, motion.positions
+        joints = list(robot.chain(robot.tip))
+        T = forward_frames(robot, q)[:, [j + 1 for j in joints]]
+        tip = link_origins(robot, q, robot.tip)
+        slides = np.array(robot.prismatic)[joints][:, None]
+        axes, arms = T[..., :3, 2], tip[:, None] - T[..., :3, 3]
+        rates = np.where(slides, axes, np.cross(axes, arms))
+        return np.linalg.norm((rates * motion.velocities[:, joints, None]).sum(axis=1), axis=1)
 
 
 @dataclass(frozen=True, eq=False)

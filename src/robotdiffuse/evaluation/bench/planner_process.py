@@ -149,9 +149,7 @@ def main() -> None:
     """The far side. What the planner prints goes to stderr, so that answers alone are on the pipe."""
     answers = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
-    import torch
-
-    torch.set_num_threads(1)
+    os.environ["OMP_NUM_THREADS"] = "1"  # of PyTorch, which only planners with a network load
     path, entries = json.loads(sys.argv[2])
     sys.path += [place for place in path if place not in sys.path]
     take_over({what: {n: Entry(*e) for n, e in table.items()} for what, table in entries.items()})
