@@ -227,7 +227,7 @@ def test_links_with_any_number_of_spheres(count: int) -> None:
         for link in arm.spheres
     }
     robot, scene = replace(arm, spheres=spheres), solids()
-    q = rows(robot, 600, seed=2)
+    q = rows(robot, 200, seed=2)
     least = np.minimum(link_distances(robot, scene, q).min(axis=1), pair_distances(robot, q).min(axis=1))
     clear = np.abs(least) > TOLERANCE
     np.testing.assert_array_equal(CollisionChecker(robot, scene).free(q)[clear], (least > 0)[clear])
