@@ -1,4 +1,4 @@
-"""A few thousand inputs of benchmarks/fuzz.py: an answer or a one-line error."""
+"""Some thousand inputs of benchmarks/fuzz.py: an answer or a one-line error."""
 
 import importlib.util
 import shutil
@@ -16,21 +16,21 @@ sys.modules["fuzz"] = fuzz
 spec.loader.exec_module(fuzz)
 
 COUNTS = {
-    "problem": 300,
-    "moveit": 400,
+    "problem": 150,
+    "moveit": 150,
     "cloud": 1000,
-    "mesh": 300,
-    "urdf": 400,
+    "mesh": 150,
+    "urdf": 200,
     "result": 400,
     "bundle": 100,
     "http": 300,
-    "socket": 300,
-    "motion": 120,
+    "socket": 120,
+    "motion": 50,
     "certificate": 250,
-    "depth": 150,
+    "depth": 60,
     "upload": 120,
     "head": 500,
-    "settings": 150,
+    "settings": 80,
     "weights": 100,
     "npz": 80,
 }
