@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.collision.exact import forward_frames
 from robotdiffuse.results import PlanResult
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual import load_visual
 from robotdiffuse.scenes.depth_view import SeenPoints, UnseenPoints
@@ -98,7 +97,8 @@ def robot_surfaces(robot: Robot) -> list[Surface]:
 
 def frames(robot: Robot, q: Float[ndarray, "*batch dof"]) -> Float[ndarray, "*batch frames 4 4"]:
     """T_base_frame of all frames."""
-    return ForwardKinematics(robot, torch.float64)(torch.from_numpy(np.array(q, np.float64))).numpy()
+    T = forward_frames(robot, q.reshape(-1, robot.dof))
+    return T.reshape(*q.shape[:-1], *T.shape[1:])
 
 
 def posed(surfaces: list[Surface], T_base_frame: Float[ndarray, "frames 4 4"]) -> Surface:

@@ -4,8 +4,6 @@ import html
 from functools import partial
 from pathlib import Path as FilePath
 
-import numpy as np
-import torch
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -15,7 +13,7 @@ from robotdiffuse.evaluation.data.plots import PLOTS, Plot
 from robotdiffuse.evaluation.data.report import DataFigures, facts, read_figures
 from robotdiffuse.files import check_output, write_atomically
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
 
 
@@ -75,6 +73,4 @@ def _footer(data: DataFigures) -> str:
 
 def _tips(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n 3"]:
     """Positions of the tip link's origin [m]."""
-    with torch.inference_mode():
-        kinematics = ForwardKinematics(robot, torch.float32)
-        return kinematics.link(torch.from_numpy(np.asarray(q, np.float32)), robot.tip)[:, :3, 3].numpy()
+    return link_origins(robot, q, robot.tip)
