@@ -99,10 +99,7 @@ def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
         if not isinstance(one, CartesianLine) or one.speed is None:
             continue
         postures = linkage.place(motion.positions, one.frame)
-        joints = np.flatnonzero(linkage.moved[linkage.links.index(one.frame)])
-        p = postures.T[:, linkage.links.index(one.frame), :3, 3]
-        rates = np.cross(postures.axes[:, joints], p[:, None] - postures.origins[:, joints])
-        rates[:, linkage.slides[joints]] = postures.axes[:, joints][:, linkage.slides[joints]]
+        joints, rates = linkage.rates(postures, one.frame)
         speeds = np.linalg.norm((rates * motion.velocities[:, joints, None]).sum(axis=1), axis=1)
         if speeds.max() > one.speed * (1 + slack):
             lines.append(f"motion: {one.frame} moves at {speeds.max():.4g} m/s, of {one.speed:g} allowed")
@@ -110,12 +107,9 @@ def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
 
 
 def _along(linkage: Linkage, postures: Postures, q: ndarray, frame: str) -> _Along:
-    k = linkage.links.index(frame)
-    joints, T = np.flatnonzero(linkage.moved[k]), postures.T[:, k]
+    T, (joints, rates) = postures.T[:, linkage.links.index(frame)], linkage.rates(postures, frame)
     step = np.abs(np.diff(q, axis=0))[:, joints]
-    across = np.cross(T[:-1, None, :3, 3] - postures.origins[:-1, joints], postures.axes[:-1, joints])
-    lengths = np.linalg.norm(across, axis=2)
-    lengths[:, linkage.slides[joints]] = 1.0
+    lengths = np.linalg.norm(rates[:-1], axis=2)
     went, sag = np.zeros(len(step)), np.zeros(len(step))
     for j in reversed(range(len(joints))):
         if not linkage.slides[joints[j]]:

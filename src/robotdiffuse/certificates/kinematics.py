@@ -79,6 +79,16 @@ class Linkage:
             link = above[link].parent
         return found[::-1]
 
+    def rates(
+        self, postures: Postures, link: str
+    ) -> tuple[Int[ndarray, "joints"], Float[ndarray, "n joints 3"]]:
+        """The planned joints that move a link, and how far each moves its origin in 1 rad or m, to first
+        order [m]."""
+        k = self.links.index(link)
+        joints = np.flatnonzero(self.moved[k])
+        arms, axes = postures.T[:, k, None, :3, 3] - postures.origins[:, joints], postures.axes[:, joints]
+        return joints, np.where(self.slides[joints][:, None], axes, np.cross(axes, arms))
+
     def displacement(
         self,
         postures: Postures,

@@ -14,7 +14,7 @@ from robotdiffuse.planners.unseen_space import UnseenSpace
 from robotdiffuse.problems.problem import IMAGINED, Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.scenes.depth_view import DepthView
+from robotdiffuse.scenes.depth_view import camera_pose
 from robotdiffuse.scenes.observed_volume import LOW, observe
 from robotdiffuse.scenes.ray_caster import looking_at
 
@@ -61,10 +61,11 @@ def next_view(
         raise InputError("next_view: the problem has no views; it is for scenes that cameras saw")
     if result.path is None:
         raise InputError(f"next_view: the result has no motion ({result.status.value})")
-    candidates = poses_around() if poses is None else list(poses)
+    candidates = (
+        poses_around() if poses is None else [camera_pose("next_view: T_base_camera", T) for T in poses]
+    )
     if not candidates:
         raise InputError("next_view: poses is empty; at least one camera pose is needed")
-    views = [DepthView(np.zeros((1, 1)), (1.0, 1.0, 0.0, 0.0), pose) for pose in candidates]
     volume = observe(problem.views, problem.robot, problem.start)
     imagined = None
     if problem.unseen == IMAGINED:
@@ -78,14 +79,14 @@ def next_view(
     at = np.argwhere(likely > LEAST)
     weights = likely[tuple(at.T)]
     if not len(at):
-        return NextView(views[0].T_base_camera, 1.0)
+        return NextView(candidates[0], 1.0)
     filled = fine(volume.occupied).astype(np.float32)
     if imagined is not None:
         np.maximum(filled, imagined, out=filled)
     filled[voxels_in(placed_spheres(problem.robot, problem.start).astype(np.float32))] = 1.0
     image = problem.views[0]
     seen = seen_weights(
-        np.stack([view.T_base_camera for view in views]).astype(np.float32),
+        np.stack(candidates).astype(np.float32),
         np.array(image.intrinsics, np.float32),
         image.depth.shape,
         at,
@@ -95,4 +96,4 @@ def next_view(
         np.float32(FINE),
     )
     best = int(seen.argmax())
-    return NextView(views[best].T_base_camera, float(seen[best] / weights.sum()))
+    return NextView(candidates[best], float(seen[best] / weights.sum()))

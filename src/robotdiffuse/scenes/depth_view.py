@@ -21,6 +21,18 @@ CLOUD_WIDTH, CLOUD_HEIGHT = 320, 240
 """Most pixels of the image that a cloud becomes: coarser where its points are sparse."""
 
 
+def camera_pose(what: str, value: object) -> Float[ndarray, "4 4"]:
+    """A pose as an array; InputError, which names `what`, for anything that is none."""
+    T = numbers(value)
+    if T is None or T.shape != (4, 4) or not within(T):
+        raise InputError(f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{LARGEST:g}")
+    rotation = T[:3, :3]
+    orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
+    if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():
+        raise InputError(f"{what} is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1")
+    return T
+
+
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class DepthView:
@@ -45,25 +57,13 @@ class DepthView:
     """How a problem file names the picture: `depth`, a file, and its `scale`, or `cloud`."""
 
     def __post_init__(self) -> None:
-        depth, T = numbers(self.depth), numbers(self.T_base_camera)
+        depth = numbers(self.depth)
         if depth is None or depth.ndim != 2 or depth.size == 0:
             form = "not numbers" if depth is None else f"an array of {' x '.join(map(str, depth.shape))}"
             raise InputError(f"view.depth is {form}; it must be an image of height x width")
         intrinsics = vector("view", "intrinsics", self.intrinsics, 4, FASTEST)
         if intrinsics[0] <= 0 or intrinsics[1] <= 0:
             raise InputError(f"view.intrinsics is {shown(intrinsics)}; fx and fy must be positive [pixels]")
-        if T is None or T.shape != (4, 4) or not within(T):
-            raise InputError(
-                f"view.T_base_camera is {shown(self.T_base_camera)}; it must be 4 x 4 finite numbers "
-                f"within ±{LARGEST:g}"
-            )
-        rotation = T[:3, :3]
-        orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
-        if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():
-            raise InputError(
-                f"view.T_base_camera is {shown(T)}; it must be a rotation and a translation over "
-                "a row 0 0 0 1"
-            )
         configuration = self.configuration
         if configuration is not None:
             array = numbers(configuration)
@@ -71,7 +71,7 @@ class DepthView:
         for key, value in {
             "depth": np.ascontiguousarray(depth, np.float32),
             "intrinsics": tuple(intrinsics.tolist()),
-            "T_base_camera": T,
+            "T_base_camera": camera_pose("view.T_base_camera", self.T_base_camera),
             "configuration": configuration,
         }.items():
             object.__setattr__(self, key, value)
