@@ -19,14 +19,12 @@ LEAST_MOVE = np.float32(0.005)
 """A corner that smoothing would move less than this stays, and tightening makes no shorter segments [rad]."""
 PAYS = np.float32(1e-3)
 """A round that takes off a smaller share of the length is the last."""
-CUT, LEAVE_OUT, PULL = np.float32(0.3), np.float32(0.4), np.float32(0.55)
-"""Of the changes that tighten a path: the share that cuts a corner; with what leaves a waypoint out; with
-what pulls it straight towards its neighbours' chord. The others move it at random besides."""
+LEAVE_OUT, PULL = np.float32(0.1), np.float32(0.35)
+"""Of the changes that tighten a path: the share that leaves a waypoint out, and with that which pulls it
+straight towards its neighbours' chord. The others move it at random besides."""
 FARTHEST, NEARER = np.float32(0.3), np.float32(5.0)
 """Of random moves of a waypoint: the longest, in each joint [rad], and the logarithm of how much shorter the
 shortest are."""
-MOST_WAYPOINTS = 64
-"""Of a path that is tightened, unless it has more."""
 
 
 @njit(cache=True, nogil=True)
@@ -69,22 +67,19 @@ def shortcut(space, path, tries, state):
 @njit(cache=True, nogil=True)
 def tighten(space, path, tries, state):
     """A path between the same ends that is free and no longer, near a given one that is free: after so many
-    attempts at a waypoint drawn at random to cut its corner, to leave it out, or to move it.
+    attempts to leave out a waypoint drawn at random, or to move it.
 
-    Shortcuts and smoothing end a little above the shortest path of the same way round; this gets there.
+    Shortcuts and smoothing end a little above the shortest path of the same way round. Cutting corners gets
+    there, but each corner more makes the motion slower.
     """
-    work, block, a, b = _room(space, path)
-    n = len(path)
-    points = np.empty((max(n, MOST_WAYPOINTS), path.shape[1]), np.float32)
-    points[:n] = path
+    work, block, a, _ = _room(space, path)
+    points, n = path.copy(), len(path)
     for _ in range(tries):
         if n <= 2:
             break
         i = 1 + min(int(random(state) * np.float32(n - 2)), n - 3)
         change = random(state)
-        if change < CUT:
-            n = _cut(space, points, n, i, a, b, block, work, state)
-        elif change < LEAVE_OUT:
+        if change < LEAVE_OUT:
             if motion_free(space, points[i - 1], points[i + 1], block, work):
                 points[i : n - 1] = points[i + 1 : n].copy()
                 n -= 1
@@ -229,35 +224,6 @@ def _pull_in(space, points, n, trial, block, work, state):
             points[i] = trial
             return
         pull *= np.float32(0.4)
-
-
-@njit(cache=True)
-def _cut(space, points, n, i, a, b, block, work, state):
-    """Puts two waypoints on the segments beside the i-th one in its place, if the way between them is free;
-    returns the number of waypoints."""
-    if n == len(points):
-        return n
-    share = random(state) ** 2
-    other = random(state) ** 2
-    before, at, after = points[i - 1], points[i], points[i + 1]
-    if random(state) < _HALF:  # as far from the corner on both
-        other = min(share * distance(before, at) / max(distance(at, after), np.float32(1e-9)), _ONE)
-    for j in range(points.shape[1]):
-        a[j] = at[j] + share * (before[j] - at[j])
-        b[j] = at[j] + other * (after[j] - at[j])
-    if min(distance(before, a), distance(a, b), distance(b, after)) < LEAST_MOVE:
-        return n
-    # the remnants of the segments are checked anew: their checks fall elsewhere than before
-    if (
-        not motion_free(space, a, b, block, work)
-        or not motion_free(space, before, a, block, work)
-        or not motion_free(space, b, after, block, work)
-    ):
-        return n
-    for m in range(n - 1, i, -1):
-        points[m + 1] = points[m]
-    points[i], points[i + 1] = a, b
-    return n + 1
 
 
 @njit(cache=True)

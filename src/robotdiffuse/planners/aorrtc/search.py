@@ -51,7 +51,7 @@ class SearchSettings(Settings):
     covers the rest, and after a path that it refuses the search looks twice as closely."""
     smoothings: Natural = 1
     """Rounds of smoothing of each path that is found."""
-    tightenings: Natural = 100
+    tightenings: Natural = 200
     """Attempts to shorten each path but the first a little, where it stands."""
     iterations: Count = 20_000
     """Most iterations of a round; its trees hold at most as many nodes."""
