@@ -48,3 +48,26 @@ def test_damaged_inputs(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPat
             faults.append(f"{kind} {seed}: {said}")
         shutil.rmtree(folder)
     assert not faults
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        ("weights", 50009884),
+        ("depth", 50020386),
+        ("settings", 50036692),
+        ("result", 50057525),
+        ("weights", 50164958),
+    ],
+    ids=[
+        "brackets in weights",
+        "a lens of 1e-300 pixels",
+        "1e25 levels",
+        "a long joint name",
+        "a long link name",
+    ],
+)
+def test_what_was_found(kind: str, seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    outcome, said = fuzz.one(kind, seed, tmp_path)
+    assert outcome == "error", said

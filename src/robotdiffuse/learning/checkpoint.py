@@ -60,7 +60,7 @@ def read_tensors(file: FilePath) -> tuple[dict[str, Tensor], dict[str, Any]]:
             return {name: opened.get_tensor(name) for name in opened.keys()}, notes  # noqa: SIM118
     except FileNotFoundError:
         raise InputError(f"{file} does not exist") from None
-    except (SafetensorError, OSError, ValueError, struct.error) as error:
+    except (SafetensorError, OSError, ValueError, RecursionError, struct.error) as error:
         raise InputError(f"{file} is damaged or no safetensors file: {str(error).splitlines()[0]}") from None
 
 
@@ -93,7 +93,7 @@ def _read(folder: FilePath, stem: str) -> tuple[dict[str, Tensor], dict[str, Any
         about = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(f"{folder} holds no trained model: {file.name} is missing") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{file} is damaged: {error}") from None
     if isinstance(about, dict) and about.get("format") == 1:
         about = _of_format_1(about)

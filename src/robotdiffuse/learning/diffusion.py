@@ -61,7 +61,7 @@ SCHEDULES: dict[str, Callable[["ScheduleSettings"], Levels]] = {
 
 @dataclass(frozen=True)
 class ScheduleSettings(Settings, name="schedule"):
-    steps: Annotated[int, Bound(least=2.0)] = 200
+    steps: Annotated[int, Bound(least=2.0, most=100_000.0)] = 200
     """T, the number of noise levels (paper: 200)."""
     offset: NotNegative = 0.008
     """s of the cosine schedule (Nichol and Dhariwal 2021, eq. 17): the first levels are not too small."""

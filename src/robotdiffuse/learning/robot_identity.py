@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotdiffuse.collision.arrays import robot_groups
-from robotdiffuse.errors import InputError
+from robotdiffuse.errors import InputError, shortened
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.settings import Settings
 
@@ -73,7 +73,8 @@ class RobotIdentity(Settings):
         if not np.allclose(its.frame_offsets, self.frame_offsets, atol=CLOSE):
             return "other dimensions"
         if its.links != self.links:
-            return f"spheres on the links {', '.join(its.links)}, not {', '.join(self.links)}"
+            here, there = (", ".join(map(shortened, links)) for links in (its.links, self.links))
+            return f"spheres on the links {here}, not {there}"
         return ""
 
     def check(self, robot: Robot, where: str) -> None:

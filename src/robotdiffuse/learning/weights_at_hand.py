@@ -40,7 +40,7 @@ def weights_for(name: str, robot: Robot) -> FilePath | None:
 def _identity(file: FilePath, _changed: int) -> RobotIdentity:
     try:
         about = json.loads(file.read_text(encoding="utf-8"))["robot"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{file} is damaged: {type(error).__name__}: {error}") from None
     return RobotIdentity.from_json(about, f"{file}: robot")
 

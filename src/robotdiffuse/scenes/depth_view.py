@@ -17,6 +17,8 @@ from robotdiffuse.scenes.shapes import PointCloud
 
 RIGID_SLACK = 1e-4
 """How far the rotation of a camera's pose may be from orthonormal, by entry."""
+LEAST_FOCAL = 1e-3
+"""Of a lens [pixels]: smaller ones are no numbers above 0 in float32, or say nothing."""
 CLOUD_WIDTH, CLOUD_HEIGHT = 320, 240
 """Most pixels of the image that a cloud becomes: coarser where its points are sparse."""
 
@@ -62,8 +64,9 @@ class DepthView:
             form = "not numbers" if depth is None else f"an array of {' x '.join(map(str, depth.shape))}"
             raise InputError(f"view.depth is {form}; it must be an image of height x width")
         intrinsics = vector("view", "intrinsics", self.intrinsics, 4, FASTEST)
-        if intrinsics[0] <= 0 or intrinsics[1] <= 0:
-            raise InputError(f"view.intrinsics is {shown(intrinsics)}; fx and fy must be positive [pixels]")
+        if min(intrinsics[:2]) < LEAST_FOCAL:
+            least = f"fx and fy must be at least {LEAST_FOCAL:g} [pixels]"
+            raise InputError(f"view.intrinsics is {shown(intrinsics)}; {least}")
         configuration = self.configuration
         if configuration is not None:
             array = numbers(configuration)
