@@ -328,7 +328,7 @@ def test_linear_schedule_is_ddpm_s():
     ("settings", "message"),
     [
         ({"kind": "sigmoid"}, "unknown schedule.kind 'sigmoid'; known: cosine, flow, linear"),
-        ({"steps": 1}, "schedule.steps is 1; it must be at least 2"),
+        ({"steps": 1}, "schedule.steps is 1; it must be between 2 and 100000"),
         ({"steps": 20, "kind": "linear"}, "schedule.steps is 20; the linear schedule needs more than 20"),
         ({"offset": -0.1}, "schedule.offset is -0.1"),
         ({"floor": 0.0}, "schedule.floor is 0.0; it must be above 0 and below 1"),
