@@ -173,3 +173,21 @@ def test_a_call_that_was_left_before_it_began_is_left() -> None:
     with pytest.raises(worker.Cancelled):
         worker.respond(7, worker.PLAN, b"{}")
     assert worker.respond(8, worker.PLAN, b"{}").code == 400
+
+
+def test_a_call_that_was_left_as_it_entered_compiled_code_is_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Python makes such an interrupt a SystemError, which the server's log told with its traceback."""
+    shared = worker.Shared()
+    worker.accept({}, 1.0, shared)
+
+    def left(*_: object) -> worker.Answer:
+        shared.cancelled = 7
+        raise SystemError("CPUDispatcher returned a result with an exception set")
+
+    monkeypatch.setattr(worker, "_plan", left)
+    with pytest.raises(worker.Cancelled):
+        worker.respond(7, worker.PLAN, b"{}")
+    assert worker.respond(8, worker.PLAN, b"{}").code == 500
+    assert capsys.readouterr().err.count("Traceback") == 1

@@ -122,6 +122,8 @@ def respond(number: int, what: str, body: bytes) -> Answer:
     except InputError as error:
         return failed(400, str(error))
     except Exception as error:
+        if _state.shared.cancelled == number:
+            raise Cancelled from error  # a SystemError, if the signal came as compiled code was entered
         traceback.print_exc(file=sys.stderr)
         return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
     finally:
