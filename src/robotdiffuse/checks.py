@@ -12,6 +12,9 @@ SMALLEST = 1e-9
 """Of all sizes [m]: what is smaller is nothing in float32."""
 FASTEST = 1e6
 """Of all rates, in their units."""
+RIGID_SLACK = 1e-4
+"""How far the rotation of a pose may be from orthonormal and its last row from 0 0 0 1, by entry."""
+LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
 def numbers(value: object) -> ndarray | None:
@@ -72,6 +75,19 @@ def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
     if norm < 1e-6:
         raise InputError(f"{owner}.{name} is {shown(value)}; a quaternion must not be zero")
     return wxyz if abs(norm - 1) < 1e-15 else wxyz / norm
+
+
+def rigid_transform(what: str, value: object) -> ndarray:
+    """A pose as a 4 x 4 array, or an InputError that names `what`."""
+    T = numbers(value)
+    if T is None or T.shape != (4, 4) or not within(T):
+        raise InputError(f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{LARGEST:g}")
+    rotation = T[:3, :3]
+    off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
+    if off > RIGID_SLACK or np.linalg.det(rotation) < 0:
+        raise InputError(f"{what} is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1")
+    T[3] = LAST_ROW
+    return T
 
 
 def form(array: ndarray | None) -> str:

@@ -158,7 +158,7 @@ def test_bad_input() -> None:
         inverse_kinematics(robot, "panda_hand", T, 0, rng=rng)
     with pytest.raises(InputError, match="finite"):
         inverse_kinematics(robot, "panda_hand", np.full((4, 4), np.nan), rng=rng)
-    with pytest.raises(InputError, match="no rigid transform"):
+    with pytest.raises(InputError, match="must be a rotation and a translation"):
         inverse_kinematics(robot, "panda_hand", 2 * T, rng=rng)
     with pytest.raises(InputError, match="max_rounds is 0"):
         InverseKinematicsSettings(max_rounds=0)

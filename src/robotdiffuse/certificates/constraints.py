@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.certificates.kinematics import Linkage, Postures
+from robotdiffuse.certificates.kinematics import Linkage, Postures, cross_matrix
 from robotdiffuse.errors import InputError
 from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
 from robotdiffuse.problems.goals import JointGoal, poses_of
@@ -167,8 +167,7 @@ def _turned(along: _Along, T_start: ndarray, T_goal: ndarray, chord: float) -> n
     whole = float(np.linalg.norm(turn))
     share = np.clip((along.p - T_start[:3, 3]) @ way / length**2, 0.0, 1.0)
     axis = turn / whole if whole > 0 else np.array([0.0, 0.0, 1.0])
-    x, y, z = axis
-    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    K = cross_matrix(axis)
     angles = (share * whole)[:, None, None]
     wanted = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
     # by the chord between rotations, which is exact near 0 too

@@ -60,7 +60,7 @@ class Linkage:
             if j is not None:
                 origins[:, j], axes[:, j] = p, R @ (turn @ along)
             if j is not None and not self.slides[j]:
-                K = _cross(along)  # of Rodrigues' formula
+                K = cross_matrix(along)  # of Rodrigues' formula
                 R = _times(R, turn) + sines[j] * _times(R, turn @ K) + rests[j] * _times(R, turn @ K @ K)
             else:
                 R = _times(R, turn)
@@ -150,13 +150,13 @@ def _times(R: Float[ndarray, "n 3 3"], right: Float[ndarray, "3 m"]) -> Float[nd
     return (R.reshape(-1, 3) @ right).reshape(len(R), 3, right.shape[1])
 
 
-def _cross(axis: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+def cross_matrix(axis: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
     x, y, z = axis
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def _motion(kind: str, axis: Float[ndarray, "3"], q: float) -> Float[ndarray, "4 4"]:
-    T, K = np.eye(4), _cross(axis)
+    T, K = np.eye(4), cross_matrix(axis)
     if kind == "prismatic":
         T[:3, 3] = q * axis
     else:

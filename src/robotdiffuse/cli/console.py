@@ -52,15 +52,12 @@ def print_result(result: "PlanResult") -> None:
 def print_next_view(problem: "Problem", result: "PlanResult") -> None:
     """Where a camera is to look next, as problem files say it."""
     from robotdiffuse.planners.next_view import next_view
-    from robotdiffuse.transforms import quaternion_from_rotation
+    from robotdiffuse.transforms import pose_entry
 
     proposed = next_view(problem, result)
-    xyz, wxyz = (
-        ", ".join(f"{number:.4g}" for number in numbers)
-        for numbers in (
-            proposed.T_base_camera[:3, 3],
-            quaternion_from_rotation(proposed.T_base_camera[:3, :3]),
-        )
+    camera = ", ".join(
+        f"{name}: [{', '.join(f'{number:.4g}' for number in numbers)}]"
+        for name, numbers in pose_entry(proposed.T_base_camera).items()
     )
     print(f"next view, which sees {100 * proposed.seen:.0f} % of what the motion may run into:")
-    print(f"  camera: {{xyz: [{xyz}], wxyz: [{wxyz}]}}")
+    print(f"  camera: {{{camera}}}")

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.checks import rigid_transform
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners.rungs import FINE, fine, voxels_in
 from robotdiffuse.planners.sight_kernel import seen_weights
@@ -14,7 +15,6 @@ from robotdiffuse.planners.unseen_space import UnseenSpace
 from robotdiffuse.problems.problem import IMAGINED, Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.scenes.depth_view import camera_pose
 from robotdiffuse.scenes.observed_volume import LOW, observe
 from robotdiffuse.scenes.ray_caster import looking_at
 
@@ -62,7 +62,7 @@ def next_view(
     if result.path is None:
         raise InputError(f"next_view: the result has no motion ({result.status.value})")
     candidates = (
-        poses_around() if poses is None else [camera_pose("next_view: T_base_camera", T) for T in poses]
+        poses_around() if poses is None else [rigid_transform("next_view: T_base_camera", T) for T in poses]
     )
     if not candidates:
         raise InputError("next_view: poses is empty; at least one camera pose is needed")

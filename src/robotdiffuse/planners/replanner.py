@@ -21,7 +21,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import numbers, within
+from robotdiffuse.checks import numbers, rigid_transform, within
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motion import search_space
@@ -31,7 +31,6 @@ from robotdiffuse.planners.aorrtc.search import AnytimeSearch, SearchSettings
 from robotdiffuse.planners.call import Call, Request
 from robotdiffuse.planners.course import Course, Speeds
 from robotdiffuse.planners.ends import Ends, usable_ends
-from robotdiffuse.problems.goals import check_pose
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
@@ -318,7 +317,7 @@ class _Seen:
         if xyz is not None and xyz.shape == (3,) and within(xyz):
             T = transform(xyz, T_before[:3, :3])
         else:
-            T = check_pose(f"observation[{name!r}]", value)
+            T = rigid_transform(f"observation[{name!r}]", value)
         most = self.obstacle.greatest_speed
         velocity = self.obstacle.velocity
         if np.isfinite(self.time):

@@ -13,9 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import LARGEST, numbers, vector
+from robotdiffuse.checks import LARGEST, numbers, rigid_transform, vector
 from robotdiffuse.errors import InputError, shown
-from robotdiffuse.problems.goals import check_pose
 
 LEAST_TOLERANCE, LEAST_ANGLE = 1e-4, 1e-3
 """The tightest constraints [m], [rad]."""
@@ -79,7 +78,7 @@ class PositionBox:
                 f"{self.kind}.low is {shown(self.low)} and its high {shown(self.high)}; each high must be "
                 f"above its low by at least {2 * LEAST_TOLERANCE:g} m"
             )
-        T = AROUND if self.T_base_box is None else check_pose(f"{self.kind}.T_base_box", self.T_base_box)
+        T = AROUND if self.T_base_box is None else rigid_transform(f"{self.kind}.T_base_box", self.T_base_box)
         object.__setattr__(self, "T_base_box", T)
 
     if TYPE_CHECKING:

@@ -13,12 +13,10 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import LARGEST, numbers, within
+from robotdiffuse.checks import numbers, rigid_transform
 from robotdiffuse.errors import InputError, shown
 from robotdiffuse.transforms import rotation_from_rpy, transform
 
-RIGID_SLACK = 1e-4
-"""How far the rotation part of a pose may be from orthonormal, by entry."""
 INWARDS = 1e-3
 """Poses are drawn within tolerances less this share: inverse kinematics has an error of its own."""
 
@@ -64,7 +62,7 @@ class PoseGoal:
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):
             raise InputError(f"goal.frame is {shown(self.frame)}; it must be the name of a link")
-        object.__setattr__(self, "T_base_frame", check_pose("goal.T_base_frame", self.T_base_frame))
+        object.__setattr__(self, "T_base_frame", rigid_transform("goal.T_base_frame", self.T_base_frame))
         for name, unit in (("xyz_tolerance", "m"), ("rpy_tolerance", "rad")):
             value = getattr(self, name)
             if value is not None:
@@ -164,15 +162,3 @@ def moved_goal(goal: Any, T: Float[ndarray, "4 4"]) -> Any:
     if isinstance(goal, list | tuple):
         return [moved_goal(one, T) for one in goal]
     return replace(goal, T_base_frame=T @ goal.T_base_frame) if isinstance(goal, PoseGoal) else goal
-
-
-def check_pose(field: str, value: object) -> Float[ndarray, "4 4"]:
-    """The value as a rigid transform; InputError for anything else."""
-    T = numbers(value)
-    if T is None or T.shape != (4, 4) or not within(T):
-        raise InputError(f"{field} is {shown(value)}; it must be 4 x 4 finite numbers within ±{LARGEST:g}")
-    rotation = T[:3, :3]
-    orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
-    if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():
-        raise InputError(f"{field} is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1")
-    return T

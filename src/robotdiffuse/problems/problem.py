@@ -13,11 +13,11 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import LARGEST, numbers
+from robotdiffuse.checks import LARGEST, numbers, rigid_transform
 from robotdiffuse.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
-from robotdiffuse.problems.goals import Goal, OneGoal, check_pose, moved_goal
+from robotdiffuse.problems.goals import Goal, OneGoal, moved_goal
 from robotdiffuse.problems.goals import JointGoal as JointGoal
 from robotdiffuse.problems.goals import PoseGoal as PoseGoal
 from robotdiffuse.problems.goals import PosesGoal as PosesGoal
@@ -127,7 +127,7 @@ class Problem:
         check_unseen("unseen", self.unseen)
         T_world_base = self.T_world_base
         if T_world_base is not None:
-            T_world_base = check_pose("T_world_base", T_world_base)
+            T_world_base = rigid_transform("T_world_base", T_world_base)
         scene = self.scene
         if views:
             from robotdiffuse.problems.seen import seen_shapes  # compiled code, which only views need
@@ -195,7 +195,7 @@ class Problem:
 
         They are moved into the base's frame, where planning is. Raises InputError as the constructor does.
         """
-        T = check_pose("T_world_base", T_world_base)
+        T = rigid_transform("T_world_base", T_world_base)
         T_base_world = inverse(T)
         goal = moved_goal(goal, T_base_world)
         waypoints = [moved_goal(waypoint, T_base_world) for waypoint in waypoints]

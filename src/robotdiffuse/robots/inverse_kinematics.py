@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from robotdiffuse.checks import rigid_transform
 from robotdiffuse.errors import InputError, shown
 from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, solve_seeds
 from robotdiffuse.robots.robot import Robot
@@ -84,7 +85,7 @@ def inverse_kinematics(
         raise InputError(f"inverse kinematics: no planned joint moves the link {shown(frame)}")
     if count < 1:
         raise InputError(f"inverse kinematics: count is {count}; it must be at least 1")
-    _check_pose(T_base_frame)
+    T_base_frame = rigid_transform("inverse kinematics: T_base_frame", T_base_frame)
     lower, upper = robot.lower + settings.limit_margin, robot.upper - settings.limit_margin
     tool = np.ascontiguousarray(robot.T_frame_link(frame))
     accepted = np.zeros((0, robot.dof))
@@ -149,14 +150,3 @@ def _longest_reach(robot: Robot, chain: list[int], tool: Float[ndarray, "4 4"]) 
     slides = np.array(robot.prismatic, float)[chain]
     travel = np.maximum(abs(robot.lower), abs(robot.upper))[chain] @ slides
     return float(lengths + travel) + 1e-6
-
-
-def _check_pose(T: Float[ndarray, "4 4"]) -> None:
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        raise InputError("inverse kinematics: the pose is not a 4 x 4 matrix of finite numbers")
-    rotation = T[:3, :3]
-    rigid = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
-    if not rigid or not np.allclose(T[3], [0, 0, 0, 1]):
-        raise InputError(
-            "inverse kinematics: the pose is no rigid transform (rotation, translation, 0 0 0 1)"
-        )

@@ -11,28 +11,14 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import FASTEST, LARGEST, numbers, vector, within
+from robotdiffuse.checks import FASTEST, numbers, rigid_transform, vector
 from robotdiffuse.errors import InputError, shown
 from robotdiffuse.scenes.shapes import PointCloud
 
-RIGID_SLACK = 1e-4
-"""How far the rotation of a camera's pose may be from orthonormal, by entry."""
 LEAST_FOCAL = 1e-3
 """Of a lens [pixels]: smaller ones are no numbers above 0 in float32, or say nothing."""
 CLOUD_WIDTH, CLOUD_HEIGHT = 320, 240
 """Most pixels of the image that a cloud becomes: coarser where its points are sparse."""
-
-
-def camera_pose(what: str, value: object) -> Float[ndarray, "4 4"]:
-    """A pose as an array; InputError, which names `what`, for anything that is none."""
-    T = numbers(value)
-    if T is None or T.shape != (4, 4) or not within(T):
-        raise InputError(f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{LARGEST:g}")
-    rotation = T[:3, :3]
-    orthonormal = np.abs(rotation @ rotation.T - np.eye(3)).max() <= RIGID_SLACK
-    if not orthonormal or np.linalg.det(rotation) < 0 or (T[3] != [0, 0, 0, 1]).any():
-        raise InputError(f"{what} is {shown(T)}; it must be a rotation and a translation over a row 0 0 0 1")
-    return T
 
 
 @no_type_check
@@ -74,7 +60,7 @@ class DepthView:
         for key, value in {
             "depth": np.ascontiguousarray(depth, np.float32),
             "intrinsics": tuple(intrinsics.tolist()),
-            "T_base_camera": camera_pose("view.T_base_camera", self.T_base_camera),
+            "T_base_camera": rigid_transform("view.T_base_camera", self.T_base_camera),
             "configuration": configuration,
         }.items():
             object.__setattr__(self, key, value)
