@@ -82,6 +82,7 @@ def test_json_and_back() -> None:
         ({"inner": {"cells": 0}}, "cells is 0; it must be at least 1"),
         ({"inner": {"cells": 1.5}}, "file.inner.cells is 1.5; it must be of type int"),
         ({"grid": "fine", "grid_settings": {"cells": 2}}, "file.grid_settings.cells is not a setting"),
+        ({"s" * 1000: 1}, f"file.{'s' * 57}... is not a setting"),
         ([], "must be a table of settings"),
     ],
 )

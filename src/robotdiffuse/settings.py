@@ -22,7 +22,7 @@ from itertools import pairwise
 from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.reading import parse_yaml
 from robotdiffuse.registry import Registry
 
@@ -152,7 +152,9 @@ class Settings:
         hints, fields = _hints(cls), {f.name: f for f in dataclasses.fields(cls)}  # type: ignore[arg-type]
         for name in values:
             if name not in fields:
-                raise InputError(f"{where}.{name} is not a setting; known: {', '.join(fields)}")
+                raise InputError(
+                    f"{where}.{shortened(str(name))} is not a setting; known: {', '.join(fields)}"
+                )
         found: dict[str, Any] = {}
         for name, field in fields.items():
             if name in values:
