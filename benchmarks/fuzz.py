@@ -5,6 +5,7 @@
 Prints the report that is kept in benchmarks/results/fuzz.txt. An input is a kind and a seed; `one(kind, seed,
 folder)` does it again. Texts are changed value by value, line by line or byte by byte, all others by bytes.
 Inputs run in a process of their own, which is started anew when one does not end or kills it.
+Run it a minute before where no compiled code is kept yet: compiling counts as slow, and as memory that grows.
 """
 
 import argparse

@@ -166,6 +166,29 @@ def test_nothing_is_written_after_a_refusal(monkeypatch: pytest.MonkeyPatch) -> 
     assert asyncio.run(talk()).conn.our_state in (h11.MUST_CLOSE, h11.CLOSED, h11.DONE)
 
 
+@pytest.mark.parametrize("head", [b"HTTP/1.0\r\n", b"HTTP/1.1\r\nHost: a\r\nConnection: close\r\n"])
+def test_bytes_after_the_last_request_do_not_cut_its_answer_off(head: bytes) -> None:
+    """They were taken for what is no HTTP, and the connection closed before the body was written."""
+
+    async def slow(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await asyncio.sleep(0.01)
+        await send({"type": "http.response.body", "body": b"late"})
+
+    async def talk() -> Transport:
+        made = connected(slow)
+        transport = Transport(made)
+        made.connection_made(transport)
+        made.data_received(b"POST / " + head + b"Content-Length: 2\r\n\r\n{}]]")
+        await asyncio.sleep(0.005)
+        made.data_received(b"]]]]")
+        await asyncio.sleep(0.05)
+        return transport
+
+    ended = asyncio.run(talk())
+    assert ended.written.startswith(b"HTTP/1.1 200") and b"late" in ended.written and ended.closed
+
+
 def test_a_call_that_was_left_before_it_began_is_left() -> None:
     """The signal came while the worker still took the request: it planned on, and was killed for it."""
     shared = worker.Shared(cancelled=7)

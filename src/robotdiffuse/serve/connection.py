@@ -23,6 +23,8 @@ class Connection(H11Protocol):
         self._watch()
 
     def data_received(self, data: bytes) -> None:
+        if self.conn.their_state is h11.MUST_CLOSE:
+            return  # after a client's last request it has nothing to say, and still gets its answer
         super().data_received(data)
         self._watch()
 
