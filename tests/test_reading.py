@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.errors import InputError, joined, shown, unknown_name
 from robotdiffuse.reading import (
     LONGEST_NAME,
     input_file,
@@ -178,4 +178,6 @@ def test_messages_quote_sixty_characters() -> None:
     assert shown(inside) == "a very long list"
     error = unknown_name("joint", "j" * 10**4, [f"joint_{i}" for i in range(10**4)])
     assert "and 9900 more" in str(error)
+    spaced = "{a: " * 1000  # no word of it is long
+    assert joined([spaced, "b"]) == f"{spaced[:57]}..., b"
     assert len(str(InputError("x" * 10**4))) == 60

@@ -44,11 +44,16 @@ def shortened(text: str) -> str:
     return text if len(text) <= LONGEST_QUOTE else text[: LONGEST_QUOTE - 3] + "..."
 
 
+def joined(names: Iterable[object], most: int = MOST_NAMES) -> str:
+    """Names that others wrote, as one line of short ones."""
+    short = [shortened(str(name)) for name in names]
+    more = f" and {len(short) - most} more" if len(short) > most else ""
+    return ", ".join(short[:most]) + more
+
+
 def unknown_name(what: str, name: object, known: Iterable[object]) -> InputError:
     """An error for a name that is not in a table; lists the known ones."""
-    names = sorted(map(str, known))
-    more = [f"and {len(names) - MOST_NAMES} more"] if len(names) > MOST_NAMES else []
-    return InputError(f"unknown {what} {shown(name)}; known: {', '.join([*names[:MOST_NAMES], *more])}")
+    return InputError(f"unknown {what} {shown(name)}; known: {joined(sorted(map(str, known)))}")
 
 
 def _printable(text: str) -> str:

@@ -16,7 +16,7 @@ from robotdiffuse.checks import LARGEST, within
 from robotdiffuse.collision.hulls import describe_contact
 from robotdiffuse.collision.motion import Contact, ContinuousCollision
 from robotdiffuse.collision.moving import MovingCollision, TimedContact
-from robotdiffuse.errors import InputError, shortened
+from robotdiffuse.errors import InputError, joined
 from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.rates import RateTolerances, between_rows, wrong_rates
@@ -149,7 +149,7 @@ class Verifier:
 
     def _check_shape(self, joint_names: tuple[str, ...], positions: ndarray) -> None:
         if tuple(joint_names) != self.robot.joint_names:
-            given, right = ", ".join(map(shortened, joint_names)), ", ".join(self.robot.joint_names)
+            given, right = joined(joint_names), joined(self.robot.joint_names)
             raise InputError(f"path.joint_names is {given}; the robot's planned joints are {right}")
         if positions.ndim != 2 or positions.shape[1] != self.robot.dof or len(positions) == 0:
             raise InputError(

@@ -10,6 +10,7 @@ from robotdiffuse.certificates.certificate import AGREEMENT, Certificate, Tolera
 from robotdiffuse.certificates.constraints import kept, too_fast
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.certificates.torques import most_torques
+from robotdiffuse.errors import joined
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
@@ -57,7 +58,7 @@ def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
     for name in not_covered(problem, motion):
         yield f"problem: certificates do not prove anything about {name}"
     if tuple(motion.joint_names) != robot.joint_names:
-        yield f"motion: its joints are {', '.join(motion.joint_names)}, not {', '.join(robot.joint_names)}"
+        yield f"motion: its joints are {joined(motion.joint_names)}, not {joined(robot.joint_names)}"
         return
     q = configurations(motion, certificate.between)
     beyond = np.maximum(robot.lower - q, q - robot.upper)

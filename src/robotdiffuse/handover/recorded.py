@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.checks import FASTEST, LARGEST, numbers, within
-from robotdiffuse.errors import InputError, shown
+from robotdiffuse.errors import InputError, joined, shown
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
@@ -135,17 +135,16 @@ def fitted(motion: Recorded, robot: Robot) -> Fitted:
     unknown = [name for name in given if name not in known]
     absent = [name for name in robot.joint_names if name not in given]
     if absent or unknown:
-        parts = [f"lacks {_some(absent)}"] if absent else []
-        parts += [f"has {_some(unknown)}, which {robot.name} has not"] if unknown else []
-        raise InputError(
-            f"the motion {' and '.join(parts)}; the robot's joints are {_some(robot.joint_names)}"
-        )
+        parts = [f"lacks {joined(absent, MOST_NAMED)}"] if absent else []
+        parts += [f"has {joined(unknown, MOST_NAMED)}, which {robot.name} has not"] if unknown else []
+        right = joined(robot.joint_names, MOST_NAMED)
+        raise InputError(f"the motion {' and '.join(parts)}; the robot's joints are {right}")
     for name in given:
         if name not in robot.joint_names:
             _check_held(motion.positions[:, given[name]], name, robot)
     extra = [name for name in given if name not in robot.joint_names]
     if extra:
-        notes.append(f"{_some(extra)} stand still where the robot holds them")
+        notes.append(f"{joined(extra, MOST_NAMED)} stand still where the robot holds them")
     order = [given[name] for name in robot.joint_names]
     if order != sorted(order):
         notes.append("joints were put into the robot's order by their names")
@@ -175,11 +174,6 @@ def _check_held(values: Float[ndarray, "n"], name: str, robot: Robot) -> None:
             f"the motion has {name} at {low:.6g}, the problem holds it at {held:.6g}: "
             f"write `locked: {{{name}: {low:.6g}}}` in the problem if that is right"
         )
-
-
-def _some(names: list[str] | tuple[str, ...]) -> str:
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return ", ".join(names[:MOST_NAMED]) + more
 
 
 def _smoothest(times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotdiffuse.collision.arrays import robot_groups
-from robotdiffuse.errors import InputError, shortened
+from robotdiffuse.errors import InputError, joined, shortened
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.settings import Settings
 
@@ -69,12 +69,11 @@ class RobotIdentity(Settings):
         """What the robot has that this one has not, "" if it is the same."""
         its = RobotIdentity.of(robot)
         if its.joint_names != self.joint_names:
-            return f"joints {', '.join(its.joint_names)}"
+            return f"joints {joined(its.joint_names)}"
         if not np.allclose(its.frame_offsets, self.frame_offsets, atol=CLOSE):
             return "other dimensions"
         if its.links != self.links:
-            here, there = (", ".join(map(shortened, links)) for links in (its.links, self.links))
-            return f"spheres on the links {here}, not {there}"
+            return f"spheres on the links {joined(its.links)}, not {joined(self.links)}"
         return ""
 
     def check(self, robot: Robot, where: str) -> None:
@@ -82,6 +81,6 @@ class RobotIdentity(Settings):
         other = self.difference(robot)
         if other:
             raise InputError(
-                f"{where} was trained for {self.source} with joints {', '.join(self.joint_names)}; "
+                f"{where} was trained for {shortened(self.source)} with joints {joined(self.joint_names)}; "
                 f"the robot {robot.name} has {other}"
             )
