@@ -32,7 +32,7 @@ def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
         third = worker.call(os.getpid)
         assert len({first, second, third, os.getpid()}) == 4
         sent = worker.submit(time.sleep, HELD)
-        worker.send(signal.SIGTERM)
+        os.kill(third, signal.SIGTERM)
         with pytest.raises(BrokenProcessPool):
             sent.result(HELD)
     finally:

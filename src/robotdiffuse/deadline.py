@@ -1,4 +1,5 @@
-"""The time that a call has left, for steps far below it that may take longer: the preparation of a scene."""
+"""The time that a call has left, for steps far below it that may take longer: the preparation of a scene.
+And whether anybody still waits for it."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -7,6 +8,7 @@ from contextvars import ContextVar
 LONG = 0.2
 """Steps that are shorter are begun with any time that is left [s]."""
 _left: ContextVar[Callable[[], float] | None] = ContextVar("left", default=None)
+_leave: ContextVar[Callable[[], None] | None] = ContextVar("leave", default=None)
 
 
 class OutOfTimeError(Exception):
@@ -23,9 +25,31 @@ def deadline(left: Callable[[], float]) -> Iterator[None]:
         _left.reset(before)
 
 
+@contextmanager
+def left_by(leave: Callable[[], None]) -> Iterator[None]:
+    """`leave` is called when a call within this looks at its clock, and may raise something to end it.
+
+    A signal's handler may not: compiled code that hands its results over runs Python, where an exception
+    that it does not expect ends the process.
+    """
+    before = _leave.set(leave)
+    try:
+        yield
+    finally:
+        _leave.reset(before)
+
+
+def check_left() -> None:
+    """Raises what `left_by` has, if the call is to be left."""
+    leave = _leave.get()
+    if leave is not None:
+        leave()
+
+
 def check_time(step: str, seconds: float = 0.0) -> None:
     """Raises OutOfTimeError where the time of a deadline has run out before a step, or will before the end of
     one that is long: it takes about so many seconds."""
+    check_left()
     left = _left.get()
     remaining = float("inf") if left is None else left()
     if remaining <= 0:

@@ -108,12 +108,6 @@ class LoneWorker:
             self._pool = ProcessPoolExecutor(1, context, _prepare_lone, given)
             return self._pool.submit(call, *arguments)
 
-    def send(self, by: signal.Signals) -> None:
-        """A signal to the process, if there is one."""
-        for process in self._processes():
-            with suppress(ProcessLookupError):
-                os.kill(process.pid or 0, by)
-
     def end(self, by: signal.Signals = signal.SIGTERM) -> None:
         """End the process, whatever anybody waits for; the next call has a new one."""
         pool, processes = self._pool, self._processes()

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from helpers.faulty_planner import DIES, HANGS, RAISES
+from helpers.faulty_planner import DIES, HANGS, RAISES, SEARCHES
 from helpers.serving import serving
 from robotdiffuse.cli.serve import served_robots
 from robotdiffuse.problems.files import problem_from_record
@@ -193,7 +193,7 @@ def test_requests_are_cancelled_by_their_names_and_the_worker_lives_on(server: h
     lost = gauge(server, "workers_lost_total")
     with ThreadPoolExecutor(1) as threads:
         named = {"X-Request-ID": "mine"}
-        hangs = threads.submit(server.post, "/plan", json=asked(HANGS, "faulty"), headers=named)
+        hangs = threads.submit(server.post, "/plan", json=asked(SEARCHES, "faulty"), headers=named)
         until(lambda: gauge(server, "workers_busy") == 1)
         time.sleep(0.2)
         assert server.post("/plan", json=asked(), headers=named).status_code == 409
@@ -205,9 +205,9 @@ def test_requests_are_cancelled_by_their_names_and_the_worker_lives_on(server: h
 
 def test_a_client_that_goes_frees_its_worker(server: httpx.Client) -> None:
     lost = gauge(server, "workers_lost_total")
-    lines = "\n".join([json.dumps(asked(HANGS, "faulty"))] * 3)
+    lines = "\n".join([json.dumps(asked(SEARCHES, "faulty"))] * 3)
     with pytest.raises(httpx.ReadTimeout):
-        server.post("/plan", json=asked(HANGS, "faulty"), timeout=0.5)
+        server.post("/plan", json=asked(SEARCHES, "faulty"), timeout=0.5)
     with pytest.raises(httpx.ReadTimeout):
         server.post("/batch", content=lines, headers=LINES, timeout=0.5)
     until(lambda: gauge(server, "workers_busy") == 0 and gauge(server, "requests_waiting") == 0)
@@ -215,12 +215,20 @@ def test_a_client_that_goes_frees_its_worker(server: httpx.Client) -> None:
     assert gauge(server, "workers_lost_total") == lost
 
 
+def test_a_planner_that_never_looks_at_its_clock_costs_its_worker(server: httpx.Client) -> None:
+    lost = gauge(server, "workers_lost_total")
+    with pytest.raises(httpx.ReadTimeout):
+        server.post("/plan", json=asked(HANGS, "faulty"), timeout=0.5)
+    assert server.post("/plan", json=asked(3)).json()["status"] == "solved"
+    assert gauge(server, "workers_lost_total") == lost + 1
+
+
 def test_a_full_queue_says_when_to_come_again(server: httpx.Client) -> None:
     with ThreadPoolExecutor(3) as threads:
         jobs = []
         for i in range(3):
             named = {"X-Request-ID": f"{i}"}
-            jobs.append(threads.submit(server.post, "/plan", json=asked(HANGS, "faulty"), headers=named))
+            jobs.append(threads.submit(server.post, "/plan", json=asked(SEARCHES, "faulty"), headers=named))
         until(lambda: gauge(server, "workers_busy") + gauge(server, "requests_waiting") == 3)
         full = server.post("/plan", json=asked())
         batch = server.post("/batch", content=json.dumps(asked()), headers=LINES)

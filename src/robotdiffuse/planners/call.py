@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from robotdiffuse.checks import LARGEST
 from robotdiffuse.collision.kernels.compiled import compile_seconds
-from robotdiffuse.deadline import OutOfTimeError
+from robotdiffuse.deadline import OutOfTimeError, check_left
 from robotdiffuse.errors import InputError
 from robotdiffuse.paths.speeds import DEFAULT, NOTHING, Beside, Pace, TimingSettings
 from robotdiffuse.paths.timing import time_parameterize
@@ -90,6 +90,7 @@ class Call:
     @property
     def elapsed(self) -> float:
         """Wall time since the call began, less what compiling took, once on a machine [s]."""
+        check_left()
         return time.perf_counter() - self.started - self._compiling
 
     @property

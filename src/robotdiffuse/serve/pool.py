@@ -122,7 +122,6 @@ class Pool:
             return failed(500, "the worker process died of this request, or was killed")
         except asyncio.CancelledError:
             seat.shared.cancelled = number
-            seat.process.send(worker.CANCEL)
             self._later(self._left(seat, current))
             raise
         finally:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import orjson
 
 from robotdiffuse.collision.kernels.compiled import compile_seconds
+from robotdiffuse.deadline import check_left, left_by
 from robotdiffuse.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, load_planner
 from robotdiffuse.planners.base import Planner
@@ -30,12 +31,10 @@ from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.serve.motions import MOTIONS, read_motion, report_record
 from robotdiffuse.serve.settings import GRACE
 from robotdiffuse.types import UNTIL
-from robotdiffuse.verify import Verifier
+from robotdiffuse.verify import Report, Verifier
 
 PLAN, VERIFY = "plan", "verify"
 SEED, TIME_LIMIT = 0, 1.0
-CANCEL = signal.SIGUSR1
-"""Makes a worker leave the call whose number stands in the memory that it shares."""
 LARGEST_SEED = 2**32 - 1
 """That all random generators take."""
 
@@ -75,8 +74,6 @@ class _State:
     longest: float
     """Time limit of a request at most [s]."""
     shared: Shared
-    call: int = 0
-    """The number of the call under way, 0 for none."""
 
 
 _state: _State | None = None
@@ -87,18 +84,12 @@ def prepare(robots: dict[str, Robot], longest: float, shared: Shared) -> None:
     """What is done once in a process."""
     accept(robots, longest, shared)
     signal.signal(signal.SIGTERM, signal.SIG_IGN)  # the server says when to end: services signal all
-    signal.signal(CANCEL, _leave)
 
 
 def accept(robots: dict[str, Robot], longest: float, shared: Shared) -> None:
     """Take requests from now on; see `_State`."""
     global _state
     _state = _State(robots, longest, shared)
-
-
-def _leave(*_: object) -> None:
-    if _state is not None and _state.call != 0 and _state.call == _state.shared.cancelled:
-        raise Cancelled
 
 
 def warm_up() -> bool:
@@ -112,22 +103,24 @@ def warm_up() -> bool:
 
 
 def respond(number: int, what: str, body: bytes) -> Answer:
-    """The answer to a request, unless its call is cancelled by its number."""
-    assert _state is not None
+    """The answer to a request; raises Cancelled if its call is cancelled by its number."""
+    state = _state
+    assert state is not None
+
+    def leave() -> None:
+        if state.shared.cancelled == number:
+            raise Cancelled
+
     try:
-        _state.call = number
-        _leave()  # told so before it began
-        answer = (_plan if what == PLAN else _judge)(_state, body)
+        with left_by(leave):
+            leave()  # told so before it began
+            answer = (_plan if what == PLAN else _judge)(state, body)
         return answer._replace(memory=_memory())
     except InputError as error:
         return failed(400, str(error))
     except Exception as error:
-        if _state.shared.cancelled == number:
-            raise Cancelled from error  # a SystemError, if the signal came as compiled code was entered
         traceback.print_exc(file=sys.stderr)
         return failed(500, f"{type(error).__name__}: {shortened(str(error))}")
-    finally:
-        _state.call = 0
 
 
 def _memory() -> int:
@@ -216,7 +209,10 @@ def _judge(state: _State, body: bytes) -> Answer:
         raise InputError("the request has neither path nor trajectory")
     state.shared.due = time.monotonic() + state.longest + GRACE
     judge = Verifier(problem)
-    reports = {name: getattr(judge, name)(motion) for name, motion in motions.items()}
+    reports: dict[str, Report] = {}
+    for name, motion in motions.items():
+        check_left()
+        reports[name] = getattr(judge, name)(motion)
     valid = all(report.valid for report in reports.values())
     record = {"valid": valid} | {name: report_record(report) for name, report in reports.items()}
     return _answer(record, "valid" if valid else "invalid")
