@@ -3,7 +3,9 @@
 The arrays of a scene have the same types whatever the scene holds, so that no obstacle causes a compilation.
 """
 
+from collections.abc import Sequence
 from functools import lru_cache
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -143,14 +145,17 @@ class _Group(NamedTuple):
 def _placed_groups(robot: Robot) -> dict[str, _Group]:
     """By link; of a robot that holds something, the arm's own are those of the arm."""
     placed = {} if robot.bare is None else dict(_placed_groups(robot.bare))
-    for link in robot_groups(robot):
-        if link not in placed:
-            T, local = robot.T_frame_link(link), np.asarray(robot.spheres[link], np.float64)
-            centres = local[:, :3] @ T[:3, :3].T + T[:3, 3]
-            spheres = np.column_stack([centres, local[:, 3]])
-            rows = _clusters(spheres)
-            bounds = [_bounding_sphere(row) for row in rows]
-            placed[link] = _Group(spheres, rows, _bounding_sphere(spheres), bounds)
+    links = [link for link in robot_groups(robot) if link not in placed]
+    whole, parts = [], []
+    for link in links:
+        T, local = robot.T_frame_link(link), np.asarray(robot.spheres[link], np.float64)
+        centres = local[:, :3] @ T[:3, :3].T + T[:3, 3]
+        whole.append(np.column_stack([centres, local[:, 3]]))
+        parts.append(_clusters(whole[-1]))
+    bounds = _bounding_spheres([*whole, *(part for of_link in parts for part in of_link)])
+    of_parts = iter(bounds[len(whole) :])
+    for link, spheres, rows, around in zip(links, whole, parts, bounds, strict=False):
+        placed[link] = _Group(spheres, rows, around, list(islice(of_parts, len(rows))))
     return placed
 
 
@@ -175,15 +180,21 @@ def _clusters(spheres: ndarray) -> list[ndarray]:
     return _clusters(spheres[order[:half]]) + _clusters(spheres[order[half:]])
 
 
-def _bounding_sphere(spheres: ndarray) -> ndarray:
-    """A small sphere around spheres: the centre moves towards the farthest one (Badoiu and Clarkson)."""
-    centre = spheres[:, :3].mean(axis=0)
+def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
+    """A small sphere around each set of spheres: its centre moves towards the farthest one (Badoiu and
+    Clarkson)."""
+    if not sets:
+        return []
+    most, each = max(map(len, sets)), np.arange(len(sets))
+    spheres = np.full((len(sets), most, 4), -np.inf)
+    for padded, real in zip(spheres, sets, strict=True):
+        padded[: len(real)], padded[len(real) :, :3] = real, 0.0
+    centres = np.array([real[:, :3].mean(axis=0) for real in sets])
     for i in range(1, 200):
-        reach = np.linalg.norm(spheres[:, :3] - centre, axis=1) + spheres[:, 3]
-        farthest = spheres[reach.argmax()]
-        centre = centre + (farthest[:3] - centre) / (i + 1)
-    reach = np.linalg.norm(spheres[:, :3] - centre, axis=1) + spheres[:, 3]
-    return np.append(centre, reach.max() + 1e-6)
+        reach = np.linalg.norm(spheres[..., :3] - centres[:, None], axis=-1) + spheres[..., 3]
+        centres = centres + (spheres[each, reach.argmax(axis=1), :3] - centres) / (i + 1)
+    reach = np.linalg.norm(spheres[..., :3] - centres[:, None], axis=-1) + spheres[..., 3]
+    return list(np.column_stack([centres, reach.max(axis=1) + 1e-6]))
 
 
 GRID_SECONDS = 7e-7

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.robots.lever_kernel import carried, turned
 from robotdiffuse.robots.robot import Robot, once_per_robot
 
 COLUMNS = 180
@@ -40,14 +41,16 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
     frames = np.array([robot.link_frame(link) for link in links], dtype=int)
     radii = np.zeros((len(links), robot.dof))
     directions = _directions()
+    by_row = np.ascontiguousarray(directions.transpose(0, 2, 1))
     support = np.full((len(links), ROWS, COLUMNS), -np.inf)
     farthest = np.zeros(len(links))
+    carry_over = lru_cache(_carry)  # joints often turn their frames alike
     for j in reversed(range(robot.dof)):
         for i in np.flatnonzero(frames == j + 1):
             spheres = robot.spheres[links[i]]
             T = robot.T_frame_link(links[i])
             centers = spheres[:, :3] @ T[:3, :3].T + T[:3, 3]
-            support[i] = (directions @ centers.T + spheres[:, 3]).max(-1)
+            support[i] = (centers @ by_row + spheres[:, 3, None]).max(axis=1)
             farthest[i] = (np.linalg.norm(centers, axis=1) + spheres[:, 3]).max()
         moved = np.flatnonzero(robot.moved_by[frames, j])
         if not len(moved):
@@ -64,9 +67,9 @@ def motion_radii(robot: Robot) -> Float[ndarray, "links dof"]:
             sagitta = ARC_SAGITTA * np.linalg.norm(directions[..., :2], axis=-1)
             h = _turned(h, lower, upper) + sagitta * r[:, None, None]
         offset = robot.frame_offsets[j]
-        corners, weights, residual = _carried(robot.arm)[j] if robot.attached else _carry(robot, j)
-        values = h.reshape(len(moved), -1)
-        h = (values[:, corners] * weights).sum(1) + residual * r[:, None]
+        rotation = offset[:3, :3].tobytes()
+        carry = _kept_carry(rotation) if robot.attached else carry_over(rotation)
+        h = carried(h.reshape(len(moved), -1), *carry, r)
         support[moved] = h.reshape(-1, ROWS, COLUMNS) + directions @ offset[:3, 3]
         farthest[moved] = r + np.linalg.norm(offset[:3, 3])
     radii = np.concatenate([known, radii])
@@ -91,20 +94,14 @@ def _directions() -> Float[ndarray, "rows columns 3"]:
 _Carry = tuple[Int[ndarray, "4 n"], Float[ndarray, "4 n"], Float[ndarray, "n"]]
 
 
-def _carry(robot: Robot, j: int) -> _Carry:
-    """How support functions are carried inwards over the offset of joint j."""
-    return _interpolation(_directions() @ robot.frame_offsets[j][:3, :3])
-
-
-def _carried(robot: Robot) -> tuple[_Carry, ...]:
-    """Of all joints; kept only of arms that hold something, for each new object asks for them."""
-    return tuple(_kept_carry(robot.frame_offsets[j][:3, :3].tobytes()) for j in range(robot.dof))
-
-
-@lru_cache(maxsize=64)
-def _kept_carry(rotation: bytes) -> _Carry:
-    """1 MB; the same for an arm however its fingers are locked."""
+def _carry(rotation: bytes) -> _Carry:
+    """How support functions are carried inwards over an offset that turns so."""
     return _interpolation(_directions() @ np.frombuffer(rotation).reshape(3, 3))
+
+
+_kept_carry = lru_cache(maxsize=64)(_carry)
+"""1 MB each; kept only of arms that hold something, for each new object asks for them: the same for an arm
+however its fingers are locked."""
 
 
 def _turned(
@@ -115,11 +112,7 @@ def _turned(
     width = -int(np.floor(lower / STEP)) - first + 1
     if width >= COLUMNS:
         return np.broadcast_to(support.max(-1, keepdims=True), support.shape)
-    out, done = np.roll(support, -first, axis=-1), 1
-    while done < width:  # the maximum over 2 n neighbours from those over n
-        shift = min(done, width - done)
-        out, done = np.maximum(out, np.roll(out, -shift, axis=-1)), done + shift
-    return out
+    return turned(support, first, width)
 
 
 def _interpolation(directions: Float[ndarray, "rows columns 3"]) -> _Carry:
