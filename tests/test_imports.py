@@ -132,6 +132,25 @@ def test_searches_the_hybrid_the_judge_the_bench_and_the_data_factory_load_no_py
     assert run(code) == "False"
 
 
+def test_a_plan_by_search_loads_what_it_needs_and_no_more(tmp_path: Path) -> None:
+    """What it does not need takes longer to load than planning; SciPy is Numba's, for functions with BLAS."""
+    problem = tmp_path / "problem.yaml"
+    problem.write_text(
+        "robot: panda\nscene: []\nstart: [0, -0.785, 0, -2.356, 0, 1.571, 0.785]\n"
+        "goal: {joints: [0.5, -0.6, 0.1, -2.2, 0, 1.6, 0.8]}\n"
+    )
+    code = (
+        "import sys\nfrom robotdiffuse import cli\nfrom robotdiffuse.cli import console\n"
+        "console.PATIENCE = 600.0\n"
+        f"assert cli.main(['plan', {str(problem)!r}, '--planner', 'aorrtc', '--time-limit', '20']) == 0\n"
+        "unwanted = ('torch', 'toppra', 'trimesh', 'rich', 'scipy.spatial', 'scipy.optimize')\n"
+        "own = 'planners.constrained.kernel', 'planners.poses', 'problems.path_constraints'\n"
+        "unwanted += tuple(f'robotdiffuse.{name}' for name in own)\n"
+        "print([name for name in unwanted if name in sys.modules])"
+    )
+    assert run(code).splitlines()[-1] == "[]"
+
+
 def test_public_names_resolve_and_verify_is_the_function() -> None:
     code = (
         "import robotdiffuse as rd, robotdiffuse.verify\n"

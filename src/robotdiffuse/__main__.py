@@ -1,10 +1,15 @@
 """The command line from its first import on: `python -m robotdiffuse`, and the script of that name."""
 
+import gc
 import sys
+
+YOUNG = 10_000
+"""Objects between two looks for garbage, of which imports, half a million objects, make none."""
 
 
 def main() -> int:
     """As `cli.main`; Ctrl-C is one line while that is still imported, too."""
+    gc.set_threshold(YOUNG)
     try:
         from robotdiffuse.processes import interrupts_at_once
 
@@ -13,7 +18,9 @@ def main() -> int:
     except KeyboardInterrupt:
         print("robotdiffuse: stopped", file=sys.stderr)
         return 130
-    return cli.main()
+    status = cli.main()
+    gc.freeze()  # the process ends: what it holds need not be looked through for garbage once more
+    return status
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ knows nothing of planners.
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
@@ -15,15 +16,17 @@ from numpy import ndarray
 from robotdiffuse.checks import LARGEST, within
 from robotdiffuse.collision.hulls import describe_contact
 from robotdiffuse.collision.motion import Contact, ContinuousCollision
-from robotdiffuse.collision.moving import MovingCollision, TimedContact
 from robotdiffuse.errors import InputError, joined
-from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.tolerances import DEFAULT, VerifySettings, goal_error, passes
 from robotdiffuse.torques import Pieces, first_beyond, pieces_held, pieces_of
 from robotdiffuse.types import Path, Trajectory
+
+if TYPE_CHECKING:  # what most problems do not need is imported where one does
+    from robotdiffuse.collision.moving import MovingCollision, TimedContact
+    from robotdiffuse.problems.path_constraints import PathConstraints
 
 LONGEST = 1e5
 """Motion that is judged [s], about a day."""
@@ -308,9 +311,13 @@ class Verifier:
         return None
 
     @cached_property
-    def constraints(self) -> PathConstraints | None:
+    def constraints(self) -> "PathConstraints | None":
         """The problem's path constraints made ready; None if it has none."""
-        return PathConstraints(self.problem) if self.problem.constraints else None
+        if not self.problem.constraints:
+            return None
+        from robotdiffuse.problems.path_constraints import PathConstraints
+
+        return PathConstraints(self.problem)
 
     @cached_property
     def dynamics(self) -> Dynamics | None:
@@ -331,7 +338,9 @@ class Verifier:
         return ContinuousCollision(self.robot, self.problem.scene, settings.contact, settings.tightness)
 
     @cached_property
-    def _moving(self) -> MovingCollision:
+    def _moving(self) -> "MovingCollision":
+        from robotdiffuse.collision.moving import MovingCollision
+
         settings = self.settings
         return MovingCollision(self.robot, self.problem.moving, settings.contact, settings.tightness)
 
@@ -356,7 +365,7 @@ def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
     return Verifier(problem, settings)
 
 
-def _hit(contact: TimedContact) -> Violation:
+def _hit(contact: "TimedContact") -> Violation:
     link, other, time = contact.link, contact.obstacle, contact.time
     message = f"{describe_contact(link, other, contact.depth, False)} at {time:.3f} s"
     return Violation("scene_collision", time, message, link, other, contact.depth)

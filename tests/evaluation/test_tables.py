@@ -61,6 +61,17 @@ def test_html() -> None:
     assert "<p>note_1 &lt; 2</p>" in text
 
 
+def test_pairs_are_printed_without_rich_in_lines_that_fit() -> None:
+    table = Table.pairs("panda: solved", [("reason", "solved by [b]aorrtc[/b] more"), ("seed", "0")])
+    assert tables.pair_lines(table, 31) == [
+        "panda: solved",
+        "reason  solved by [b]aorrtc[/b]",
+        "        more",
+        "seed    0",
+    ]
+    assert max(map(len, tables.pair_lines(table, 1))) <= len("reason  ") + tables.LEAST_WIDTH
+
+
 def test_terminal() -> None:
     out = StringIO()
     Console(file=out, width=80).print(tables.terminal(TABLE))

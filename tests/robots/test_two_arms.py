@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numba import njit
-from rich.console import Console
 
 import robotdiffuse as rd
 from helpers.example_robots import example_robot
 from helpers.made_arms import chain, row, written
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.constraints import kept
-from robotdiffuse.cli import main
+from robotdiffuse.cli import main, plan
+from robotdiffuse.cli.console import Waiting
 from robotdiffuse.cli.plan import solve
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.arrays import reach_bound
@@ -236,8 +236,8 @@ def test_the_first_robot_of_several_arms_compiles_which_is_said_and_takes_no_tim
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Code for trees of joints is compiled at their first plan: who waits need not have a new machine."""
-    robot, shown, status = two_arms(), [], Console.status
-    monkeypatch.setattr(Console, "status", lambda on, text: (shown.append(text), status(on, text))[1])
+    robot, shown = two_arms(), []
+    monkeypatch.setattr(plan, "Waiting", lambda text: (shown.append(text), Waiting(text))[1])
     q = np.zeros(robot.dof)
     problem = rd.Problem(robot=robot, scene=rd.Scene(), start=q, goal=q)
     solve(problem, "rrt_connect", time_limit=20.0)

@@ -1,15 +1,51 @@
-"""Tables on the terminal."""
+"""Tables on the terminal, and what keeps a person waiting."""
 
+from threading import Timer
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rich.status import Status
+
     from robotdiffuse.problems.problem import Problem
     from robotdiffuse.results import PlanResult
     from robotdiffuse.verify import Report
 
 
+PATIENCE = 2.0
+"""After which a person is told what they wait for [s]."""
 KEEPS_CLEAR = {"as seen": "what was seen", "unseen is occupied": "all that was not seen free"}
 """Of some rungs."""
+
+
+class Waiting:
+    """A spinner on standard error beside what keeps a person waiting, while the block runs: from PATIENCE on,
+    so that a short wait does not pay for importing rich."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self._status: Status | None = None
+        self._timer = Timer(PATIENCE, self._show)
+        self._timer.daemon = True
+
+    def __enter__(self) -> "Waiting":
+        self._timer.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._timer.cancel()
+        self._timer.join()
+        self.stop()
+
+    def stop(self) -> None:
+        """Take the spinner away, if it has come."""
+        if self._status is not None:
+            self._status.stop()
+
+    def _show(self) -> None:
+        from rich.console import Console
+
+        self._status = Console(stderr=True).status(self.text)
+        self._status.start()
 
 
 def clearances(motion: "PlanResult | Report") -> str:

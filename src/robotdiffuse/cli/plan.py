@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from robotdiffuse.cli.arguments import natural, not_negative, positive, share
-from robotdiffuse.cli.console import print_next_view, print_result
+from robotdiffuse.cli.console import Waiting, print_next_view, print_result
 from robotdiffuse.cli.draw import ENDINGS, draw, show
 from robotdiffuse.handover import WRITERS
 from robotdiffuse.types import SHORT, UNTIL
@@ -270,16 +270,13 @@ def solve(
 
     The compiled code is loaded before, or compiled on a new machine, which would otherwise use up the limit.
     """
-    from rich.console import Console
-
     from robotdiffuse.planners import load_planner
     from robotdiffuse.planners.base import compiles_first
     from robotdiffuse.processes import interrupts_at_once
 
-    console = Console(stderr=True)
-    loading = console.status(f"loading compiled code ({compiles_first(problem.robot)})")
+    loading = Waiting(f"loading compiled code ({compiles_first(problem.robot)})")
     with interrupts_at_once(loading.stop), loading:
         loaded = load_planner(planner, settings, weights)
         loaded.warm_up(problem)
-    with console.status(f"planning with {planner}"):
+    with Waiting(f"planning with {planner}"):
         return loaded.plan(problem, **request)

@@ -2,9 +2,12 @@
 
 import html as markup
 import re
+import shutil
 import sys
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
 if TYPE_CHECKING:
@@ -14,6 +17,8 @@ NONE = "–"
 """Where there is no value."""
 WIDTH = 150
 """Of tables where there is no terminal."""
+LEAST_WIDTH = 20
+"""Of the texts of pairs, however narrow the terminal is."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,11 @@ class Table:
     @property
     def headed(self) -> bool:
         return any(column.title for column in self.columns)
+
+    @property
+    def paired(self) -> bool:
+        """Whether it is one of `pairs`."""
+        return len(self.columns) == 2 and not self.headed
 
     @property
     def texts(self) -> list[list[str]]:
@@ -147,11 +157,31 @@ def terminal(table: Table) -> "RichTable":
 
 def show(*tables: Table, width: int | None = None) -> None:
     """Print tables; as wide as the terminal, or as WIDTH where there is none."""
+    if all(table.paired for table in tables):  # without rich, which takes longer to import than a plan takes
+        wide = width or (shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH)
+        print("\n\n".join("\n".join(pair_lines(table, wide)) for table in tables))
+        return
     from rich.console import Console
 
     console = Console(width=width or (None if sys.stdout.isatty() else WIDTH))
     for i, table in enumerate(tables):
         console.print(*([""] if i else []), terminal(table), sep="\n")
+
+
+def pair_lines(table: Table, width: int) -> list[str]:
+    """A table of pairs with its title, in lines of at most so many characters."""
+    margin = max((len(name) for name, _ in table.texts), default=0) + 2
+    lines = [table.title] if table.title else []
+    for name, text in table.texts:
+        parts = [
+            part
+            for line in text.splitlines() or [""]
+            for part in textwrap.wrap(line, max(width - margin, LEAST_WIDTH), break_on_hyphens=False) or [""]
+        ]
+        lines += [
+            f"{start:<{margin}}{part}".rstrip() for start, part in zip_longest([name], parts, fillvalue="")
+        ]
+    return [*lines, *table.notes]
 
 
 def markdown(table: Table) -> list[str]:

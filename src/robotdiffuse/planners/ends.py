@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -11,13 +12,14 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.planners.call import Call
-from robotdiffuse.planners.poses import reaching
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
-from robotdiffuse.problems.path_constraints import PathConstraints
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.types import Status
+
+if TYPE_CHECKING:
+    from robotdiffuse.problems.path_constraints import PathConstraints
 
 ROUNDS, LOOKING = 100, 0.5
 """How often others are tried, by the exact meshes, as long as none is free; the share of the time left."""
@@ -42,7 +44,7 @@ class Ends:
         checker: CollisionChecker,
         start: ndarray,
         goals: ndarray,
-        constraints: PathConstraints | None = None,
+        constraints: "PathConstraints | None" = None,
     ) -> None:
         robot = self._robot = checker.robot
         self.checker = checker
@@ -140,7 +142,7 @@ def usable_ends(call: Call) -> Ends | PlanResult:
 
 
 def retreat(
-    checker: CollisionChecker, q: Float[ndarray, "dof"], constraints: PathConstraints | None = None
+    checker: CollisionChecker, q: Float[ndarray, "dof"], constraints: "PathConstraints | None" = None
 ) -> Float[ndarray, "dof"] | None:
     """A configuration nearby that the covering spheres call free, down the gradient of the collision cost.
 
@@ -246,6 +248,8 @@ def _free_goals(
 def _pose_goals(
     call: Call, goal: PoseGoal | PosesGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
+    from robotdiffuse.planners.poses import reaching  # and inverse kinematics, which most calls do not need
+
     problem, robot, scene = call.problem, call.problem.robot, call.problem.scene
     constraints, rng = call.judge.constraints, call.rng
     found = reaching(problem, goal, constraints, rng, checker.free)

@@ -29,7 +29,6 @@ from robotdiffuse.planners.aorrtc.planner import AORRTC, STEP, AORRTCSettings
 from robotdiffuse.planners.aorrtc.search import AnytimeSearch, anytime
 from robotdiffuse.planners.base import CLEARANCE, CONSTRAINTS
 from robotdiffuse.planners.call import Call
-from robotdiffuse.planners.constrained.search import plan_constrained
 from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, encode
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.learned import nearest_goals
@@ -90,6 +89,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         """See `planners.base.Planner`."""
         settings, robot = self.settings, call.problem.robot
         if call.problem.constraints:
+            from robotdiffuse.planners.constrained.search import plan_constrained
+
             return plan_constrained(call, ends, settings.search)
         search = AnytimeSearch(call, ends, settings.search, AORRTC.name)
         if settings.weights is not None or weights_for(self.network_name, robot) is not None:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from robotdiffuse.planners.aorrtc.search import SLICE, AnytimeSearch, SearchSettings, anytime
 from robotdiffuse.planners.base import CLEARANCE, CONSTRAINTS, Planner
 from robotdiffuse.planners.call import Call
-from robotdiffuse.planners.constrained.search import plan_constrained
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Count, NotNegative
@@ -32,6 +31,8 @@ class RRTConnect(Planner[RRTConnectSettings]):
         """See `planners.base.Planner`."""
         settings = self.settings
         if call.problem.constraints:
+            from robotdiffuse.planners.constrained.search import plan_constrained
+
             return plan_constrained(call, ends, settings)
         search = AnytimeSearch(call, ends, settings, self.name, bounded=False)
 

@@ -10,7 +10,6 @@ from typing import Annotated
 from robotdiffuse.planners.aorrtc.search import AnytimeSearch, SearchSettings, anytime
 from robotdiffuse.planners.base import CLEARANCE, CONSTRAINTS, Planner
 from robotdiffuse.planners.call import Call
-from robotdiffuse.planners.constrained.search import plan_constrained
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.results import PlanResult
 from robotdiffuse.settings import Bound, Natural
@@ -38,6 +37,8 @@ class AORRTC(Planner[AORRTCSettings]):
         """See `planners.base.Planner`."""
         settings = self.settings
         if call.problem.constraints:
+            from robotdiffuse.planners.constrained.search import plan_constrained
+
             return plan_constrained(call, ends, settings)
         search = AnytimeSearch(call, ends, settings, self.name)
         return anytime(
