@@ -62,9 +62,10 @@ def wrong_rates(
         begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
         checks = list(_checks(robot, trajectory, tolerances, begins))
     for check in checks:
-        wrong = ~(check.off <= check.allowed)
-        if not wrong.any():
+        right = check.off <= check.allowed
+        if right.all():
             continue
+        wrong = ~right
         i = int(np.flatnonzero(wrong.any(axis=1))[0])
         beyond = np.where(wrong, np.nan_to_num(check.off - check.allowed, nan=np.inf), 0.0)
         j, time = int(beyond[i].argmax()), float(trajectory.times[i])
@@ -80,7 +81,7 @@ def between_rows(trajectory: Trajectory, chord: float) -> tuple[Float[ndarray, "
     velocities, so that straight lines between rows leave those by no more than `chord` [rad] or [m]."""
     times, q, v = trajectory.times, trajectory.positions, trajectory.velocities
     step = np.diff(times)[:, None]
-    mean = np.diff(q, axis=0) / step
+    mean = (q[1:] - q[:-1]) / step
     first, last = v[:-1] - mean, v[1:] - mean
     # A cubic's second derivative is greatest at an end, and its chord is off by an eighth of it.
     bend = step * np.maximum(np.abs(4 * first + 2 * last), np.abs(2 * first + 4 * last)) / 8
@@ -115,14 +116,14 @@ def _checks(
 ) -> Iterator[_Check]:
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
     step = np.diff(trajectory.times)[:, None]
-    mean, change = np.diff(q, axis=0) / step, np.diff(v, axis=0) / step
+    mean, change = (q[1:] - q[:-1]) / step, (v[1:] - v[:-1]) / step
     blur = 2 * tolerances.resolution / step
     """Of the mean velocities, as positions are not known better."""
     share = 1 + tolerances.slack
     nothing = tolerances.slack * _known(robot.velocity, v, mean)
 
     def limited(kind: str, what: str, rates: ndarray, limit: ndarray, allowed: ndarray) -> _Check:
-        known = np.where(limit > 0, allowed, np.inf)
+        known = allowed if (limit > 0).all() else np.where(limit > 0, allowed, np.inf)
         return _Check(kind, what, rates, np.abs(rates), known, lambda _, j: f"its limit {limit[j]:.6g}")
 
     at_ends = np.zeros_like(v)
@@ -140,7 +141,7 @@ def _checks(
     around, length = _padded(2 * begins - mean[:1], mean, -mean[-1:]), _padded(step[:1], step, step[-1:])
     unsure = _padded(blur[:1], blur, blur[-1:])
     apart = (length[1:] + length[:-1]) / 2
-    second, unsure = np.diff(around, axis=0) / apart, (unsure[1:] + unsure[:-1]) / apart
+    second, unsure = (around[1:] - around[:-1]) / apart, (unsure[1:] + unsure[:-1]) / apart
     most = robot.acceleration
     yield limited("acceleration", "mean acceleration by its positions", second, most, share * most + unsure)
     yield limited("acceleration", "mean acceleration by its velocities", change, most, share * most)

@@ -1,12 +1,18 @@
 """Rigid transforms as 4 x 4 matrices and quaternions in wxyz order (NumPy, float64)."""
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+IDENTITY = np.eye(4)
+
 
 def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b 3 3"]:
     """Rotation matrix of a quaternion, normalised first."""
+    if wxyz.ndim == 1:  # plain numbers: NumPy would take several times as long for four
+        return np.array(_rotation(*wxyz.tolist()))
     unit = wxyz / np.linalg.norm(wxyz, axis=-1, keepdims=True)
     w, x, y, z = unit[..., 0], unit[..., 1], unit[..., 2], unit[..., 3]
     out = np.empty((*unit.shape[:-1], 3, 3))
@@ -26,6 +32,17 @@ def rotation_from_quaternion(wxyz: Float[ndarray, "*b 4"]) -> Float[ndarray, "*b
         1 - 2 * (x * x + y * y),
     )
     return out
+
+
+def _rotation(w: float, x: float, y: float, z: float) -> list[list[float]]:
+    """`rotation_from_quaternion` of one."""
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w / norm, x / norm, y / norm, z / norm
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
 
 
 def quaternion_from_rotation(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "4"]:
@@ -86,7 +103,7 @@ def transform(
     xyz: Float[ndarray, "3"], rotation: Float[ndarray, "3 3"] | None = None
 ) -> Float[ndarray, "4 4"]:
     """The 4 x 4 matrix of a rotation (default none) followed by a translation [m]."""
-    T = np.eye(4)
+    T = IDENTITY.copy()
     T[:3, 3] = xyz
     if rotation is not None:
         T[:3, :3] = rotation

@@ -18,7 +18,7 @@ from robotdiffuse.deadline import check_time
 from robotdiffuse.robots.lever_arms import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated, pose
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated
 
 ROUNDING = 4e-7
 """Obstacles grow by this share of their coordinates: more than float32 rounds off."""
@@ -218,22 +218,22 @@ def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> S
     for shape in scene.shapes:
         match shape:
             case Sphere():
-                spheres.append(_grown([*shape.center, shape.radius], slice(3, 4)))
+                spheres.append(shape)
             case Box():
-                boxes.append(_oriented(shape, shape.size / 2, (0, 1, 2), reach))
+                boxes.append(shape)
             case Cylinder():
-                half = np.array([shape.radius, shape.radius, shape.height / 2])
-                cylinders.append(_oriented(shape, half, (2,), reach)[[*range(13), 14, 11]])
+                cylinders.append(shape)
             case Capsule():
-                half = np.array([shape.radius, shape.radius, shape.height / 2])
-                capsules.append(_oriented(shape, half, (2,), reach)[[*range(13), 14, 11]])
+                capsules.append(shape)
             case PointCloud() | Triangulated():
                 points.append(shape)
+    balls = np.array([[*shape.center, shape.radius] for shape in spheres]).reshape(-1, 4)
+    edges = np.array([shape.size for shape in boxes]).reshape(-1, 3)
     by_type = (
-        np.array(spheres, np.float32).reshape(-1, 4),
-        np.array(boxes, np.float32).reshape(-1, 15),
-        np.array(cylinders, np.float32).reshape(-1, 15),
-        np.array(capsules, np.float32).reshape(-1, 15),
+        _grown(balls, slice(3, 4)).astype(np.float32),
+        _oriented(boxes, edges / 2, (0, 1, 2), reach),
+        _round(cylinders, reach),
+        _round(capsules, reach),
     )
     return SceneArrays(*by_type, *_solids(*by_type), *_grid_around(tuple(points), reach, radius))
 
@@ -243,11 +243,16 @@ def _solids(
 ) -> tuple[ndarray, ndarray]:
     """Fields of SceneArrays."""
     rows = np.zeros((len(spheres) + len(boxes) + len(cylinders) + len(capsules), 17), np.float32)
-    parts = np.split(rows, np.cumsum([len(spheres), len(boxes), len(cylinders)]))
-    parts[0][:, :3], parts[0][:, [3, 7, 11]], parts[0][:, 15] = spheres[:, :3], 1, spheres[:, 3]
-    parts[1][:, :15] = boxes
-    parts[2][:, :15], parts[2][:, 16] = cylinders[:, [*range(13), 12, 13]], 1
-    parts[3][:, :12], parts[3][:, [15, 14]] = capsules[:, :12], capsules[:, 12:14]
+    a, b, c = np.cumsum([len(spheres), len(boxes), len(cylinders)]).tolist()
+    rows[:a, :3], rows[:a, 3:12:4], rows[:a, 15] = spheres[:, :3], 1, spheres[:, 3]
+    rows[a:b, :15] = boxes
+    rows[b:c, :13], rows[b:c, 13], rows[b:c, 14], rows[b:c, 16] = (
+        cylinders[:, :13],
+        cylinders[:, 12],
+        cylinders[:, 13],
+        1,
+    )
+    rows[c:, :12], rows[c:, 15], rows[c:, 14] = capsules[:, :12], capsules[:, 12], capsules[:, 13]
     middle, rotation, half = rows[:, :3], np.abs(rows[:, 3:12].reshape(-1, 3, 3)), rows[:, 12:15]
     extent = np.einsum("nij,ni->nj", rotation, half) + rows[:, 15:16]
     extent += BOX_SLACK * (1 + np.abs(middle) + extent)
@@ -270,24 +275,43 @@ def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, ra
     return build_grid(cloud, radius)
 
 
-def _oriented(shape: Box | Cylinder | Capsule, half: ndarray, axes: tuple[int, ...], reach: float) -> ndarray:
+def _round(shapes: Sequence[Cylinder | Capsule], reach: float) -> ndarray:
+    """The rows of shapes about their z axes."""
+    half = np.array([[shape.radius, shape.radius, shape.height / 2] for shape in shapes]).reshape(-1, 3)
+    return _oriented(shapes, half, (2,), reach)[:, [*range(13), 14, 11]]
+
+
+def _oriented(
+    shapes: Sequence[Box | Cylinder | Capsule], half: ndarray, axes: tuple[int, ...], reach: float
+) -> ndarray:
     """Centre, world-to-shape rotation and half extents, cropped along some axes to what the robot gets near.
 
     A point within reach is as far from the rest of the shape as from all of it, and a floor of 1 km keeps its
     precision in float32.
     """
-    T, half, far = pose(shape), half.copy(), 2 * reach + 1
-    middle = -T[:3, :3].T @ T[:3, 3]
-    centre = np.zeros(3)
+    if not shapes:
+        return np.zeros((0, 15), np.float32)
+    origin = np.array([shape.center for shape in shapes])
+    R_base_shape = np.array([shape.rotation for shape in shapes])
+    R_shape_base = R_base_shape.transpose(0, 2, 1)
+    middle, far = (-R_shape_base @ origin[:, :, None])[:, :, 0], 2 * reach + 1
+    centre = np.zeros_like(origin)
     for axis in axes:
-        low, high = max(-half[axis], middle[axis] - far), min(half[axis], middle[axis] + far)
-        if low < high:
-            centre[axis], half[axis] = (low + high) / 2, (high - low) / 2
-    return _grown([*(T[:3, :3] @ centre + T[:3, 3]), *T[:3, :3].T.ravel(), *half], slice(12, 15))
+        low, high = (
+            np.maximum(-half[:, axis], middle[:, axis] - far),
+            np.minimum(half[:, axis], middle[:, axis] + far),
+        )
+        kept = low < high
+        centre[kept, axis] = ((low + high) / 2)[kept]
+        half[kept, axis] = ((high - low) / 2)[kept]
+    centre = (R_base_shape @ centre[:, :, None])[:, :, 0] + origin
+    rows = np.concatenate([centre, R_shape_base.reshape(-1, 9), half], axis=1)
+    return _grown(rows, slice(12, 15)).astype(np.float32)
 
 
-def _grown(row: list[float], sizes: slice) -> ndarray:
-    """The row with its sizes larger by what rounding to float32 may take away."""
-    out = np.array(row)
-    out[sizes] += ROUNDING * (np.abs(out[:3]).max() + np.abs(out[sizes]).max())
-    return out
+def _grown(rows: ndarray, sizes: slice) -> ndarray:
+    """The rows with their sizes larger by what rounding to float32 may take away."""
+    rows[:, sizes] += (
+        ROUNDING * (np.abs(rows[:, :3]).max(axis=1) + np.abs(rows[:, sizes]).max(axis=1))[:, None]
+    )
+    return rows

@@ -25,7 +25,7 @@ class BlendedPolyline:
         Half widths must not exceed half of the shorter neighbouring segment.
         """
         self.waypoints = waypoints
-        steps = np.diff(waypoints, axis=0)
+        steps = waypoints[1:] - waypoints[:-1]
         lengths = np.linalg.norm(steps, axis=1)
         self.knots: Float[ndarray, "n"] = np.concatenate([[0.0], np.cumsum(lengths)])
         self.directions: Float[ndarray, "segments dof"] = steps / lengths[:, None]
@@ -50,9 +50,10 @@ def half_widths(
     waypoints: Float[ndarray, "n dof"], deviations: Float[ndarray, "corners"]
 ) -> Float[ndarray, "corners"]:
     """The widest blends that leave the polyline by no more than the deviations and do not overlap."""
-    steps = np.diff(waypoints, axis=0)
+    steps = waypoints[1:] - waypoints[:-1]
     lengths = np.linalg.norm(steps, axis=1)
-    turn = np.linalg.norm(np.diff(steps / lengths[:, None], axis=0), axis=1)
+    directions = steps / lengths[:, None]
+    turn = np.linalg.norm(directions[1:] - directions[:-1], axis=1)
     room = 0.5 * np.minimum(lengths[:-1], lengths[1:])
     return np.minimum(room, deviations / np.maximum(DEVIATION * turn, 1e-12))
 

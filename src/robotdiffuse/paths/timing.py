@@ -104,10 +104,11 @@ def _rounded(
 ) -> tuple[Float[ndarray, "corners"], Trajectory]:
     """How far each corner is rounded, at most by the deviations, and the motion then; see
     `time_parameterize`."""
+    bad = deviations > 0
     for shrink in SHRINKS:
-        corners = zip(deviations, _corners(waypoints, deviations), strict=True)
-        bad = [deviation > 0 and not keeps(corner) for deviation, corner in corners]
-        if not any(bad):
+        corners = zip(bad, _corners(waypoints, deviations), strict=True)
+        bad = np.array([asked and not keeps(corner) for asked, corner in corners], dtype=bool)
+        if not bad.any():
             break
         deviations = np.where(bad, shrink * deviations, deviations)
     for shrink in SHRINKS:
@@ -156,11 +157,10 @@ def _corners(
 ) -> list[Float[ndarray, "k dof"]]:
     """Configurations along each rounded corner; of those that are not rounded, the corner."""
     widths = half_widths(waypoints, deviations)
-    line, u = BlendedPolyline(waypoints, widths), np.linspace(-1, 1, CORNER_PLACES)
-    return [
-        line(line.knots[i + 1] + d * u, 0) if d > 0 else waypoints[i + 1 : i + 2]
-        for i, d in enumerate(widths)
-    ]
+    line = BlendedPolyline(waypoints, widths)
+    along = line.knots[1:-1, None] + widths[:, None] * np.linspace(-1, 1, CORNER_PLACES)
+    rounded = line(along.ravel(), 0).reshape(-1, CORNER_PLACES, waypoints.shape[1])
+    return [rounded[i] if d > 0 else waypoints[i + 1 : i + 2] for i, d in enumerate(widths)]
 
 
 def _bad_corners(

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Annotated
 
 import numpy as np
@@ -46,6 +47,17 @@ class Request(Settings):
     jerk: Positive | None = None
 
 
+@lru_cache
+def _timing(request: Request, constrained: bool) -> TimingSettings:
+    """Checked once for equal requests: it takes longer than to use them."""
+    return TimingSettings(
+        sample_time=CLOSE_ROWS if constrained else DEFAULT.sample_time,
+        velocity_scale=request.velocity_scaling,
+        acceleration_scale=request.acceleration_scaling,
+        jerk=request.jerk,
+    )
+
+
 class Call:
     """One call of plan(); see the head of this file."""
 
@@ -68,19 +80,18 @@ class Call:
         wanted = (request.clearance, problem.clearance, CLEARANCE)
         self.clearance = next(value for value in wanted if value is not None)
         """Distance to obstacles that is to be kept where it can be [m]."""
-        self.timing = TimingSettings(
-            sample_time=CLOSE_ROWS if problem.constraints else DEFAULT.sample_time,
-            velocity_scale=request.velocity_scaling,
-            acceleration_scale=request.acceleration_scaling,
-            jerk=request.jerk,
-        )
+        self.timing = _timing(request, constrained=bool(problem.constraints))
         self._reserved = min(_finishing.get(problem.robot.name, 0.0), MOST_RESERVED * time_limit)
-        self.rng = np.random.default_rng(seed)
         self.judge = verifier(problem)
         self.notes = list(problem.notes)
         """What the result will say was changed or ignored; planners may add to it."""
         self._progress: list[tuple[float, float]] = []
         self._refused = self._no_time_for = ""
+
+    @cached_property
+    def rng(self) -> np.random.Generator:
+        """Random numbers of what is not compiled."""
+        return np.random.default_rng(self.seed)
 
     def improved(self, length: float) -> None:
         """Note that a path of this joint-space length [rad] was just found; longer ones are passed over."""

@@ -50,11 +50,15 @@ class Ends:
         self.checker = checker
         self._turns = robot.turns(start)
         self.start = start - self._turns
-        self.start_lead = retreat(checker, self.start, constraints)
         ways = [image for goal in goals for image in images(robot, self.start, goal)]
-        leads = [(retreat(checker, image, constraints), image) for image in ways]
-        self.goals = [goal for lead, goal in leads if lead is not None]
-        self.goal_leads = [lead for lead, _ in leads if lead is not None]
+        every = [self.start, *ways]
+        free = checker.free(np.stack(every))  # all at once: most are
+        self.start_lead, *leads = (
+            q.copy() if at_once and constraints is None else retreat(checker, q, constraints)
+            for q, at_once in zip(every, free, strict=True)
+        )
+        self.goals = [goal for goal, lead in zip(ways, leads, strict=True) if lead is not None]
+        self.goal_leads = [lead for lead in leads if lead is not None]
 
     def rows(self) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
         """Where a search begins and where it may end, in float32."""

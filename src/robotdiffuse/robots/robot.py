@@ -204,7 +204,13 @@ class Robot:
     def turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
         """The whole turns of continuous joints in configurations [rad]: less these, they are within half a
         turn."""
+        if not self._turning:
+            return np.zeros_like(q)
         return np.where(self.continuous, TURN * np.round(q / TURN), 0.0)
+
+    @cached_property
+    def _turning(self) -> bool:
+        return bool(self.continuous.any())
 
     def least_turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
         """Configurations with the joints that can turn more than once within half a turn of the middle of
