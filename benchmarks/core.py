@@ -37,6 +37,7 @@ from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.trial import Clock, tried
 from robotdiffuse.paths.timing import TimingSettings, time_parameterize
 from robotdiffuse.planners import load_planner
+from robotdiffuse.planners.base import Planner
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.sampling import sample_surface
@@ -83,6 +84,13 @@ def best_known(cases: Sequence[Case], lengths: dict, found: Sequence[Record]) ->
     return best
 
 
+def warm(name: str, cases: Sequence[Case]) -> Planner:
+    """A planner whose compiled code is loaded, and its network."""
+    planner = load_planner(name)
+    planner.warm_up(cases[0].problem, "short")
+    return planner
+
+
 def by_family(cases: Sequence[Case]) -> Iterator[tuple[str, list[Case]]]:
     for family in dict.fromkeys(case.family for case in cases):
         yield family, [case for case in cases if case.family == family]
@@ -111,7 +119,7 @@ def lengths(cases: Sequence[Case], known: dict) -> None:
     names = ("aorrtc", "robotdiffuse", "rrt_connect")
     found: dict[tuple[str, float], list[Record]] = {}
     for limit in LIMITS:
-        methods = {name: planned(load_planner(name), until="limit", clearance=0.0) for name in names}
+        methods = {name: planned(warm(name, cases), until="limit", clearance=0.0) for name in names}
         for name, records in tried(cases, methods, limit=limit, title=f"{limit:g} s").items():
             found[name, limit] = records
     best = best_known(cases, known, [record for records in found.values() for record in records])
@@ -192,7 +200,7 @@ def kernel(cases: Sequence[Case], _lengths: dict) -> None:
 def limits(cases: Sequence[Case], _lengths: dict) -> None:
     rows = []
     for name in ("aorrtc", "robotdiffuse"):
-        planner = load_planner(name)
+        planner = warm(name, cases)
         for limit in TIGHT:
             over = []
             for case in progress(cases, f"{name} {limit:g} s"):
@@ -305,7 +313,7 @@ def main() -> None:
     print(header("numpy", "numba", "coal", "toppra"))
     cases = cases_of(arguments.problems, arguments.each)
     for name in ("aorrtc", "robotdiffuse", "rrt_connect"):
-        load_planner(name).plan(cases[0].problem, 30.0)  # compiles
+        load_planner(name).warm_up(cases[0].problem)  # compiles
     for part in arguments.parts.split(","):
         more = (arguments.motions,) if part == "collisions" else ()
         PARTS[part](cases, known, *more)

@@ -84,7 +84,7 @@ def tried(name: str, problems: int) -> Tally:
     if not drawn:
         return tally
     for planner in (hybrid, search):
-        planner.warm_up(drawn[0][1])
+        planner.warm_up(drawn[0][1], "short")
     with PyBulletOracle(robot, drawn[0][1].scene) as oracle:
         for i, (what, problem) in enumerate(progress(drawn, name)):
             tally.problems += 1

@@ -137,6 +137,27 @@ def test_the_first_path_comes_before_the_network_is_asked(monkeypatch):
     assert first < began[0] and result.path.length == pytest.approx(shortest) and shortest <= longest
 
 
+def test_a_call_loads_the_network_in_its_own_time_or_not_at_all(monkeypatch):
+    """The second call of a process was late once by what loading took: it came before the clock."""
+    loaded, model = [], RobotDiffuse.model
+    monkeypatch.setattr(RobotDiffuse, "model", lambda self, robot: loaded.append(robot) or model(self, robot))
+    planner = RobotDiffuse(RobotDiffuseSettings(network_share=0.9))  # which is due soon after the path
+    for _ in range(2):
+        assert planner.plan(PROBLEM, time_limit=0.5, until="limit").stage == "aorrtc"
+    assert not loaded
+    planner.load_wanted(PANDA)
+    assert loaded == [PANDA]
+    planner.plan(PROBLEM, time_limit=0.5, until="limit")
+    assert len(loaded) > 1, "at hand, it is used"
+    loaded.clear()
+    fresh = RobotDiffuse()
+    fresh.load_wanted(PANDA)
+    fresh.warm_up(PROBLEM)
+    assert not loaded, "nothing wanted it"
+    fresh.warm_up(PROBLEM, "short")
+    assert loaded
+
+
 def test_batches_have_their_share_of_the_work(monkeypatch):
     drawn = []
     draw = RobotDiffuse.draw

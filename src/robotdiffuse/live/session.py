@@ -306,6 +306,7 @@ class Session:
                 planner = load_planner(choice.planner, settings)
                 planner.warm_up(problem)
                 self._planners[choice.planner] = planner
+            planner.load_wanted(problem.robot)
             began = time.perf_counter()
             result = planner.plan(problem, choice.time_limit)
             whole = time.perf_counter() - began

@@ -123,7 +123,8 @@ class Planner(ABC, Generic[Own]):
 
     def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
         """Load the compiled code that calls on such a problem need, or compile it on a new machine, which
-        takes about a minute; else the first call's time limit would have to do.
+        takes about a minute; else the first call's time limit would have to do. `until` is what these calls
+        will ask for: the hybrid loads its network for those that go on after their first path.
 
         The results are of calls with nothing in the way, and with balls where the straight line is, and of
         a moment's with one small obstacle of each of the problem's kinds: its own scene is prepared within
@@ -143,6 +144,10 @@ class Planner(ABC, Generic[Own]):
     def prepare(self, robot: Robot) -> None:
         """What is done before the clock starts: a learned planner loads its weights for the robot, and raises
         InputError where there are none."""
+
+    def load_wanted(self, robot: Robot) -> None:
+        """What calls would have used and had no time to load: for programs that make many, to call between
+        them."""
 
     @abstractmethod
     def solve(self, call: Call, ends: Ends) -> PlanResult:

@@ -119,4 +119,5 @@ def _plan(robot: int, asked: tuple) -> PlanResult:
     if problem.robot not in _state.warm:
         _state.planner.warm_up(problem)
         _state.warm.add(problem.robot)
+    _state.planner.load_wanted(problem.robot)
     return replace(_state.planner.plan(problem, **_state.request), problem=None)  # not sent back

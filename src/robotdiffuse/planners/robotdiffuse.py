@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
+from pathlib import Path as FilePath
 from typing import Annotated
 
 import numpy as np
@@ -33,9 +34,11 @@ from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, enco
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.learned import nearest_goals
 from robotdiffuse.planners.smooth_noise import smooth_noise
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Bound, Count, Natural
+from robotdiffuse.types import FIRST
 
 BATCH_WORK = 12_000
 """Iterations of search that take about as long as a batch of 16 samples in two steps, or its refinement."""
@@ -46,7 +49,7 @@ BATCH_SECONDS = 0.1
 LONGER = 2.0
 """A batch may take so many times what those before it took: scenes differ."""
 LOAD_SECONDS = 3.0
-"""A call that has so much time left may load PyTorch and the network [s]."""
+"""A call that has so much time left loads PyTorch and the network, if it would use it [s]."""
 
 
 @dataclass(frozen=True)
@@ -74,16 +77,40 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
     def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
         """Raises InputError if the folder that the settings name holds no weights."""
         super().__init__(settings)
-        self.wanted = self.settings.weights is not None
-        """Whether the network is to be loaded before the next call's clock starts: given weights are, those
-        of the package once a call would have used them."""
+        self.wanted: set[FilePath] = set()
+        """Weights that a call would have used, had there been time to load them."""
+        self.at_hand: set[FilePath] = set()
+        """Those that are loaded."""
         self.seconds = {"batch": BATCH_SECONDS, "refinement": BATCH_SECONDS}
         """What they took of late [s]: the last one, or more if those before did."""
 
     def prepare(self, robot: Robot) -> None:
+        """See `planners.base.Planner`: given weights. Those of the package are loaded in a call's own time,
+        if it has LOAD_SECONDS left for that, else by `warm_up` and `load_wanted`."""
+        if self.settings.weights is not None:
+            self._load(robot)
+
+    def load_wanted(self, robot: Robot) -> None:
         """See `planners.base.Planner`."""
-        if self.wanted:
+        if self.weights(robot) in self.wanted:
+            self._load(robot)
+
+    def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
+        """See `planners.base.Planner`. For calls that go on after their first path, the network too."""
+        if until != FIRST:
+            self._load(problem.robot)
+        return super().warm_up(problem, until)
+
+    def weights(self, robot: Robot) -> FilePath | None:
+        """The folder of those that are used for a robot; None if there are none."""
+        given = self.settings.weights
+        return weights_for(self.network_name, robot) if given is None else FilePath(given)
+
+    def _load(self, robot: Robot) -> None:
+        weights = self.weights(robot)
+        if weights is not None:
             self.model(robot)
+            self.at_hand.add(weights)
 
     def solve(self, call: Call, ends: Ends) -> PlanResult:
         """See `planners.base.Planner`."""
@@ -93,8 +120,9 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
             return plan_constrained(call, ends, settings.search)
         search = AnytimeSearch(call, ends, settings.search, AORRTC.name)
-        if settings.weights is not None or weights_for(self.network_name, robot) is not None:
-            batches = _NetworkBatches(self, call, ends, search)
+        weights = self.weights(robot)
+        if weights is not None:
+            batches = _NetworkBatches(self, call, ends, search, weights)
         else:
             batches = _Batches(self, call, ends, search)
             note = f"there are no weights for {robot.name}; planned by search and smooth noise"
@@ -178,22 +206,24 @@ class _Batches:
 class _NetworkBatches(_Batches):
     """Batches of the network in its place, refined where none is free."""
 
-    def __init__(self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch) -> None:
+    def __init__(
+        self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch, weights: FilePath
+    ) -> None:
         super().__init__(planner, call, ends, search)
         self._code: Float[ndarray, "code"] | None = None
-        self._at_hand = planner.wanted
+        self._weights = weights
 
     def _can(self) -> bool:
-        """Whether there is time for a batch, and for loading the network, which takes seconds once in a
-        process: without time for that, the next call begins with it."""
-        self._at_hand |= self.call.remaining > LOAD_SECONDS
-        self.planner.wanted = True
-        return self._at_hand and super()._can()
+        """Whether there is time for a batch, and for loading the network, which takes seconds once."""
+        self.planner.wanted.add(self._weights)
+        at_hand = self._weights in self.planner.at_hand or self.call.remaining > LOAD_SECONDS
+        return at_hand and super()._can()
 
     def _draw(self) -> None:
         planner, checker, call = self.planner, self.ends.checker, self.call
         model = planner.model(call.problem.robot)
         assert model is not None  # there are weights, or these were no batches of a network
+        planner.at_hand.add(self._weights)
         start, goals = self.ends.rows()
         with self._timed("batch"):
             if self._code is None:

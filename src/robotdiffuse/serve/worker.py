@@ -160,6 +160,7 @@ def _plan(state: _State, body: bytes) -> Answer:
         raise InputError(f"seed is {shown(seed)}; it must be a whole number from 0 to {LARGEST_SEED}")
     planner = _planner(asked.get("planner", DEFAULT_PLANNER))
     planner.prepare(problem.robot)
+    planner.load_wanted(problem.robot)
     Call(planner.name, problem, request=_request(given), time_limit=time_limit, seed=seed)
     _warmed(planner, problem, asked["problem"]["robot"])
     state.shared.due = time.monotonic() + time_limit + GRACE
