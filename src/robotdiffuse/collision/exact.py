@@ -327,6 +327,12 @@ class ExactCollision:
         return hit
 
 
+@once_per_robot
+def make_ready(robot: Robot) -> None:
+    """Make what Coal needs of a robot, and load it, so that no call with a short limit has to."""
+    explain_collision(robot, Scene([Sphere([0.0, 0.0, 100.0], 1.0)]), (robot.lower + robot.upper) / 2)
+
+
 def explain_collision(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:
     """The deepest collision at a configuration in words, e.g. 'panda_link5 is 3.2 cm inside sphere_2'.
 

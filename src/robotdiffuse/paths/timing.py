@@ -137,6 +137,8 @@ def _check_limits(robot: Robot) -> None:
 
 def _distinct(positions: Float[ndarray, "n dof"]) -> Int[ndarray, "m"]:
     """Rows that differ from those before them; the first and the last survive."""
+    if (np.linalg.norm(positions[1:] - positions[:-1], axis=1) > SAME).all():
+        return np.arange(len(positions))
     kept = [0]
     for i in range(1, len(positions)):
         if np.linalg.norm(positions[i] - positions[kept[-1]]) > SAME:

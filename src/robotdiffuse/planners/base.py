@@ -124,7 +124,8 @@ class Planner(ABC, Generic[Own]):
     def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
         """Load the compiled code that calls on such a problem need, or compile it on a new machine, which
         takes about a minute; else the first call's time limit would have to do. `until` is what these calls
-        will ask for: the hybrid loads its network for those that go on after their first path.
+        will ask for: for those that go on after their first path, what only some of them need is loaded too,
+        which takes a process seconds once: Coal, and the network of the hybrid.
 
         The results are of calls with nothing in the way, and with balls where the straight line is, and of
         a moment's with one small obstacle of each of the problem's kinds: its own scene is prepared within
@@ -139,6 +140,8 @@ class Planner(ABC, Generic[Own]):
             kinds = replace(kinds, scene=one_of_each(problem.scene))
         easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]
         calls = [*((easier, WARM_UP) for easier in easy), (kinds, SLIGHT)]
+        if until != FIRST:
+            self._load_rarer(robot)
         return [self.plan(task, seconds, until=until) for task, seconds in calls]
 
     def prepare(self, robot: Robot) -> None:
@@ -146,8 +149,15 @@ class Planner(ABC, Generic[Own]):
         InputError where there are none."""
 
     def load_wanted(self, robot: Robot) -> None:
-        """What calls would have used and had no time to load: for programs that make many, to call between
-        them."""
+        """What calls would have used and had no time to load, and Coal: for programs that make many calls, to
+        make between them."""
+        from robotdiffuse.collision.exact import make_ready  # which imports Coal
+
+        make_ready(robot)
+
+    def _load_rarer(self, robot: Robot) -> None:
+        """What only some calls need."""
+        self.load_wanted(robot)
 
     @abstractmethod
     def solve(self, call: Call, ends: Ends) -> PlanResult:

@@ -220,9 +220,10 @@ class Call:
         scene = _least(report.scene_clearance, timed.scene_clearance)
         itself = _least(report.self_clearance, timed.self_clearance)
         # found when the search had it, if it noted that; what it had shorter was refused
-        same = path.length * 1e-3
-        longer = [(at, length) for at, length in self._progress if length > path.length + same]
-        found = [at for at, length in self._progress if abs(length - path.length) <= same]
+        whole = path.length
+        same = whole * 1e-3
+        longer = [(at, length) for at, length in self._progress if length > whole + same]
+        found = [at for at, length in self._progress if abs(length - whole) <= same]
         return PlanResult(
             status=Status.SOLVED,
             reason=reason or f"solved by {stage}",
@@ -237,7 +238,7 @@ class Call:
             scene_clearance=scene,
             self_clearance=itself,
             notes=(*self._all_notes, *notes),
-            progress=(*longer, (found[0] if found else planning_time, path.length)),
+            progress=(*longer, (found[0] if found else planning_time, whole)),
             refused=self._refused,
         )
 

@@ -34,11 +34,9 @@ from robotdiffuse.planners.diffusion import ModelSampler, SamplingSettings, enco
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.learned import nearest_goals
 from robotdiffuse.planners.smooth_noise import smooth_noise
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Bound, Count, Natural
-from robotdiffuse.types import FIRST
 
 BATCH_WORK = 12_000
 """Iterations of search that take about as long as a batch of 16 samples in two steps, or its refinement."""
@@ -92,14 +90,13 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
     def load_wanted(self, robot: Robot) -> None:
         """See `planners.base.Planner`."""
+        super().load_wanted(robot)
         if self.weights(robot) in self.wanted:
             self._load(robot)
 
-    def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
-        """See `planners.base.Planner`. For calls that go on after their first path, the network too."""
-        if until != FIRST:
-            self._load(problem.robot)
-        return super().warm_up(problem, until)
+    def _load_rarer(self, robot: Robot) -> None:
+        super()._load_rarer(robot)
+        self._load(robot)
 
     def weights(self, robot: Robot) -> FilePath | None:
         """The folder of those that are used for a robot; None if there are none."""
