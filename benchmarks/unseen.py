@@ -1,6 +1,7 @@
 """What the camera does not see: motions planned on depth views, judged in the true scene.
 
     python benchmarks/unseen.py [--problems 300] [--views 1] [--noise] [--records unseen.jsonl]
+    python benchmarks/unseen.py --weights FOLDER ... --families shelf clutter
     python benchmarks/unseen.py --report [--odd] --records unseen.jsonl
     python benchmarks/unseen.py --fit --records unseen.jsonl
 
@@ -10,7 +11,9 @@ the floor is known, all else is seen. Every method plans with AORRTC and the sam
 if the judge finds path and timed motion valid in the true scene. What was tried is kept in a file of records
 and not tried again; `--report` prints the tables that are kept in benchmarks/results/unseen.txt, and `--fit`
 the constants of planners/confidence.py, from the calibration half: problems with even numbers. Settings were
-chosen on them, too; `--odd` leaves them out of the report.
+chosen on them, too; `--odd` leaves them out of the report. `--weights` adds the chain 'imagined' with other
+weights of the completing network, folders of `train completion`, as methods that are named by the folder:
+those of a training that left families out are tried on these families.
 """
 
 import argparse
@@ -27,6 +30,9 @@ from report import header, print_table, progress
 
 from robotdiffuse.evaluation.statistics import compare, wilson_interval
 from robotdiffuse.files import JsonLines
+from robotdiffuse.learning.checkpoint import load_completion
+from robotdiffuse.learning.completion import imagine
+from robotdiffuse.learning.completion.network import CompletionNetwork
 from robotdiffuse.learning.completion.samples import CameraPlaces, true_voxels
 from robotdiffuse.planners import call, load_planner
 from robotdiffuse.planners.call import Request
@@ -37,6 +43,7 @@ from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
 from robotdiffuse.problems.problem import IMAGINED, Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.scenes.depth_view import DepthView
+from robotdiffuse.scenes.observed_volume import observe
 from robotdiffuse.scenes.ray_caster import DepthNoise, ray_cast
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.verify import verify, verify_trajectory
@@ -50,6 +57,8 @@ SIZE = (640, 480)
 METHODS = {"as seen": "optimistic", "occupied": "occupied", "padded": "padded", "imagined": IMAGINED}
 TRUE = "true voxels"
 """As imagined, with the voxels of 2 cm that obstacles fill in truth."""
+BY = "imagined by "
+"""As imagined, by the weights of the folder of this name."""
 PLANNER = load_planner("aorrtc")
 Row = dict[str, Any]
 
@@ -89,12 +98,18 @@ def views(problem: Problem, family: str, number: int, count: int, noisy: bool) -
     return taken
 
 
-def tried(problem: Problem, partial: Problem, method: str) -> Row:
-    """What a method makes of what was seen, judged in the true scene."""
+def tried(problem: Problem, partial: Problem, method: str, network: CompletionNetwork | None = None) -> Row:
+    """What a method makes of what was seen, judged in the true scene.
+
+    `network`: that imagines in place of the bundled one.
+    """
     voxels = true_voxels(Scene(problem.scene.shapes[1:])).astype(np.float32) if method == TRUE else None
     began = time.process_time()
+    if network is not None:
+        voxels = imagine(observe(partial.views, partial.robot, partial.start), network)
     asked = replace(partial, unseen=METHODS.get(method, IMAGINED))
-    result = plan_beside_unseen(PLANNER, asked, LIMIT, 0, Request(), voxels)
+    left = LIMIT if network is None else LIMIT - (time.process_time() - began)
+    result = plan_beside_unseen(PLANNER, asked, left, 0, Request(), voxels)
     spent = time.process_time() - began
     return {
         "method": method,
@@ -115,8 +130,10 @@ def is_free(problem: Problem, result: PlanResult) -> bool:
     return verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
 
 
-def run(arguments: argparse.Namespace, methods: list[str]) -> None:
+def run(arguments: argparse.Namespace) -> None:
     """Try what is not in the records yet."""
+    networks = {BY + Path(folder).name: load_completion(folder) for folder in arguments.weights}
+    methods = [*arguments.methods, *networks]
     call.time = CpuClock  # type: ignore[attr-defined]
     kept = JsonLines(Path(arguments.records))
     place = {"views": arguments.views, "noise": arguments.noise}
@@ -138,7 +155,7 @@ def run(arguments: argparse.Namespace, methods: list[str]) -> None:
                 tried(problem, partial, IMAGINED if IMAGINED in missing else "padded")
                 warm = False
             for method in missing:
-                row = tried(problem, partial, method)
+                row = tried(problem, partial, method, networks.get(method))
                 kept.append({"family": family, "number": number, **place, "view_time": spent, **row})
 
 
@@ -146,13 +163,14 @@ def table(rows: list[Row], title: str) -> None:
     """Methods on the same problems: free in truth, plans, the first rung, times; and each family."""
     families = list(dict.fromkeys(row["family"] for row in rows))
     lines = []
-    for method in [*METHODS, TRUE]:
+    others = dict.fromkeys(row["method"] for row in rows if row["method"].startswith(BY))
+    for method in [*METHODS, *others, TRUE]:
         mine = [row for row in rows if row["method"] == method]
         if not mine:
             continue
         free, solved = sum(row["free"] for row in mine), sum(row["solved"] for row in mine)
         low, high = wilson_interval(free, len(mine))
-        first = [row for row in mine if row["rung"] == FIRST_RUNGS.get(method)]
+        first = [row for row in mine if row["rung"] == FIRST_RUNGS.get(method, FIRST_IMAGINED)]
         shares = [np.mean([row["free"] for row in mine if row["family"] == family]) for family in families]
         lines.append(
             (
@@ -170,8 +188,10 @@ def table(rows: list[Row], title: str) -> None:
     columns = ["%", "problems", "free in truth", "plans", "of them free"]
     columns += ["first rung", "of it free", "ms", *families]
     print_table(title, columns, lines)
-    base = {name: _free(rows, name) for name in [*METHODS, TRUE]}
-    for a, b in (("padded", "as seen"), ("imagined", "as seen"), ("imagined", "padded"), (TRUE, "imagined")):
+    base = {name: _free(rows, name) for name in [*METHODS, *others, TRUE]}
+    pairs = [("padded", "as seen"), ("imagined", "as seen"), ("imagined", "padded"), (TRUE, "imagined")]
+    pairs += [(other, of) for other in others for of in ("as seen", "padded", "imagined")]
+    for a, b in pairs:
         both = base[a].keys() & base[b].keys()
         if both:
             pair = compare(*(np.array([1.0 if base[m][k] else np.nan for k in sorted(both)]) for m in (a, b)))
@@ -180,11 +200,9 @@ def table(rows: list[Row], title: str) -> None:
     print()
 
 
-FIRST_RUNGS = {
-    "padded": "points padded by 9 cm",
-    "imagined": "imagined, p > 0.1",
-    TRUE: "imagined, p > 0.1",
-}
+FIRST_IMAGINED = "imagined, p > 0.1"
+FIRST_RUNGS = {"as seen": None, "occupied": None, "padded": "points padded by 9 cm"}
+"""Of methods that imagine it is FIRST_IMAGINED."""
 
 
 def _free(rows: list[Row], method: str) -> dict[tuple[str, int], bool]:
@@ -227,6 +245,9 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", default=[*METHODS, TRUE], help="(all)")
     parser.add_argument("--views", type=int, default=1, help="(1)")
     parser.add_argument("--noise", action="store_true")
+    parser.add_argument(
+        "--weights", nargs="*", default=[], metavar="FOLDER", help="of the completing network"
+    )
     parser.add_argument("--records", default="unseen.jsonl", help="(unseen.jsonl)")
     parser.add_argument("--report", action="store_true")
     parser.add_argument("--odd", action="store_true", help="report problems with odd numbers alone")
@@ -239,7 +260,7 @@ def main() -> None:
         rows = JsonLines(Path(arguments.records)).rows
         report([row for row in rows if row["number"] % 2 or not arguments.odd])
     else:
-        run(arguments, arguments.methods)
+        run(arguments)
 
 
 def report(rows: list[Row]) -> None:
