@@ -51,7 +51,7 @@ TINY = CompletionTraining(samples=8, batch=2, workers=0, network=SMALL, families
 
 @pytest.fixture(autouse=True)
 def few_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("VALIDATION", "CALIBRATION", "CHECKED"):
+    for name in ("VALIDATION", "CALIBRATION", "CHECKED", "FITTED"):
         monkeypatch.setattr(training, name, 1)
 
 

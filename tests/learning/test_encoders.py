@@ -16,9 +16,11 @@ from robotdiffuse.data.manifest import write_manifest
 from robotdiffuse.data.shards import write_shard
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
+from robotdiffuse.learning.completion.network import CompletionSettings
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Autoencoder
+from robotdiffuse.learning.encoders.completing_autoencoder import CompletingAutoencoderSettings
 from robotdiffuse.learning.encoders.compression_autoencoder import (
     CompressionAutoencoder,
     CompressionAutoencoderSettings,
@@ -46,10 +48,14 @@ SMALL = {
         code=8, cloud=32, first=(8, 12), second=(12, 24), transform=(8, 8), transform_head=(8,), head=(16,)
     ),
     "dgcnn": DGCNNSettings(code=8, cloud=32, neighbours=4, edges=(8, 12), embedding=16, head=(16,)),
+    "completing_autoencoder": CompletingAutoencoderSettings(
+        code=8, cloud=400, kept=4, network=CompletionSettings(channels=(8, 8, 8), blocks=(1, 1, 1))
+    ),
 }
 ALONE = [name for name, entry in ENCODERS.items() if entry.kind == "alone"]
-JOINTLY = [name for name in ENCODERS if name not in ALONE]
+JOINTLY = [name for name, entry in ENCODERS.items() if entry.kind == "jointly"]
 every_encoder = pytest.mark.parametrize("name", ENCODERS)
+every_trained_along = pytest.mark.parametrize("name", [*ALONE, *JOINTLY])
 
 
 def small(name, seed=0):
@@ -122,7 +128,7 @@ def test_points_out_of_the_region_do_not_count(name):
     assert not torch.allclose(encoder(points), encoder(out))
 
 
-@every_encoder
+@every_trained_along
 def test_gradients_reach_every_parameter(name):
     """Some clouds are empty, and one has fewer points than neighbours: no gradient may be NaN there."""
     encoder = small(name)
@@ -182,6 +188,8 @@ def test_sizes_of_the_papers(name):
         (PointNetSettings, {"second": (8, 0)}, "encoder.second is"),
         (DGCNNSettings, {"neighbours": 0}, "encoder.neighbours is 0"),
         (CompressionAutoencoderSettings, {"code": 0}, "encoder.code is 0"),
+        (CompletingAutoencoderSettings, {"kept": 129}, "kept is 129; the bottleneck has 128 features"),
+        (CompletingAutoencoderSettings, {"kept": 1, "code": 197}, "code is 197; it must be at most 196"),
     ],
 )
 def test_bad_settings(kind, changes, message):
@@ -299,7 +307,7 @@ def test_training_from_the_command_line(tmp_path, capsys, monkeypatch):
     assert "reconstruction: " in capsys.readouterr().out
     assert load_encoder(out).settings == CompressionAutoencoderSettings()
     assert main([*command, "pointnett"]) == 2
-    assert "known: compression_autoencoder, dgcnn" in capsys.readouterr().err
+    assert "known: completing_autoencoder, compression_autoencoder, dgcnn" in capsys.readouterr().err
 
 
 def test_readout_of_codes_that_tell_nothing(monkeypatch):
@@ -333,7 +341,7 @@ def planner(data, encoder, **changes) -> PlannerTraining:
     return replace(planned, **changes)
 
 
-@every_encoder
+@every_trained_along
 def test_joint_training_changes_the_encoder(name, data, tmp_path):
     """And the planner's file holds it."""
     planned = planner(data, name, encoder_settings=SMALL[name], learning_rate=1e-2)

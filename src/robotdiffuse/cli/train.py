@@ -69,8 +69,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     planner.add_argument(
         "--encoder",
         metavar="FOLDER",
-        help="folder with a trained encoder, or the name of one to train along: pointnet, dgcnn; needed "
-        "for --data unless the config names one (default: the one that comes with the package)",
+        help="folder with a trained encoder, or the name of one to train along, pointnet or dgcnn, or "
+        "completing_autoencoder, which comes trained; needed for --data unless the config names one "
+        "(default: the one that comes with the package)",
     )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (panda)")
     planner.add_argument(

@@ -21,8 +21,12 @@ from torch import Tensor, nn
 from robotdiffuse.errors import InputError, shortened
 from robotdiffuse.files import write_atomically
 from robotdiffuse.learning.completion.network import CompletionNetwork, CompletionSettings
-from robotdiffuse.learning.encoders import ENCODERS, encoder_name, make_encoder
+from robotdiffuse.learning.encoders import COMPLETES, ENCODERS, encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Encoder
+from robotdiffuse.learning.encoders.completing_autoencoder import (
+    CompletingAutoencoder,
+    CompletingAutoencoderSettings,
+)
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.network import Network
 from robotdiffuse.learning.networks import NETWORKS
@@ -68,7 +72,8 @@ def fingerprint(module: nn.Module) -> str:
     """SHA-256 of the weights and buffers, the first 16 digits."""
     digest = hashlib.sha256()
     for name, tensor in sorted(module.state_dict().items()):
-        digest.update(name.encode() + tensor.detach().cpu().contiguous().view(torch.uint8).numpy().tobytes())
+        data = tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8)
+        digest.update(name.encode() + data.numpy().tobytes())
     return digest.hexdigest()[:16]
 
 
@@ -165,12 +170,42 @@ def save_encoder(encoder: Encoder, folder: str | FilePath, training: dict[str, A
 
 
 def load_encoder(folder: str | FilePath) -> Encoder:
-    """The trained encoder of a folder, frozen. Raises InputError if it is missing or damaged."""
+    """The trained encoder of a folder, frozen; also that of a folder of `train completion`, and
+    "completing_autoencoder" for the one that comes with the package. Raises InputError if it is missing or
+    damaged.
+    """
+    if folder in ENCODERS and ENCODERS.entry(folder).kind == COMPLETES:
+        return _load_code(BUNDLED / "completion")
+    if (FilePath(folder) / "code.json").is_file():
+        return _load_code(FilePath(folder))
     tensors, about = _read(FilePath(folder), "encoder")
     where = str(FilePath(folder) / "encoder.json")
     kind: Any = ENCODERS.settings(about.get("network", ""))
     encoder = make_encoder(about["network"], kind.from_json(about.get("settings"), f"{where}: settings"))
     _fill(encoder, tensors, FilePath(folder) / "encoder.safetensors")
+    return encoder.requires_grad_(False).eval()
+
+
+def save_code(encoder: CompletingAutoencoder, folder: str | FilePath) -> None:
+    """Write code.safetensors and code.json: what makes an encoder of the completing network in the folder."""
+    completion = _read(FilePath(folder), "completion")[1]["weights_sha256"]
+    about = {
+        "network": encoder_name(encoder),
+        "settings": encoder.settings.to_json(),
+        "completion": completion,
+    }
+    _save(encoder.components, FilePath(folder), "code", about)
+
+
+def _load_code(folder: FilePath) -> Encoder:
+    network, (tensors, about) = load_completion(folder), _read(folder, "code")
+    file = folder / "code.json"
+    if about.get("completion") != _read(folder, "completion")[1]["weights_sha256"]:
+        raise InputError(f"{file} was made for other weights of the completing network than those beside it")
+    kind = CompletingAutoencoderSettings
+    encoder = CompletingAutoencoder(kind.from_json(about.get("settings"), f"{file}: settings"))
+    encoder.network = network
+    _fill(encoder.components, tensors, folder / "code.safetensors")
     return encoder.requires_grad_(False).eval()
 
 

@@ -8,6 +8,8 @@ if TYPE_CHECKING:
     from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings
 
 _ROOM = "robotdiffuse.learning.encoders."
+COMPLETES = "completion"
+"""The kind that `train completion` trains."""
 ENCODERS = Registry(
     "encoder",
     {
@@ -25,10 +27,16 @@ ENCODERS = Registry(
         ),
         "pointnet": Entry(_ROOM + "pointnet:PointNet", "PointNet", "PointNetSettings", "jointly"),
         "dgcnn": Entry(_ROOM + "dgcnn:DGCNN", "DGCNN", "DGCNNSettings", "jointly"),
+        "completing_autoencoder": Entry(
+            _ROOM + "completing_autoencoder:CompletingAutoencoder",
+            "the bottleneck of the network that completes what cameras see, as it comes with the package",
+            "CompletingAutoencoderSettings",
+            COMPLETES,
+        ),
     },
 )
-"""By the name in settings and checkpoints. Of two kinds: trained alone, with a loss of its own, and frozen
-then, or jointly with the planner, by the planner's loss."""
+"""By the name in settings and checkpoints. Of three kinds: trained alone, with a loss of its own, and frozen
+then; jointly with the planner, by the planner's loss; or a part of the completing network, frozen."""
 
 
 def make_encoder(name: str, settings: "EncoderSettings | None" = None) -> "Encoder":

@@ -11,7 +11,7 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from robotdiffuse.learning.checkpoint import save_completion
+from robotdiffuse.learning.checkpoint import save_code, save_completion
 from robotdiffuse.learning.completion.ahead import MOST, SamplesAhead
 from robotdiffuse.learning.completion.network import (
     CompletionNetwork,
@@ -21,12 +21,18 @@ from robotdiffuse.learning.completion.network import (
     voxel_centers,
 )
 from robotdiffuse.learning.completion.samples import FREE, OCCUPIED, Samples, draw_samples, unpack_fine
-from robotdiffuse.learning.training.config import ShareBelowOne, TrainingSettings
+from robotdiffuse.learning.encoders.completing_autoencoder import (
+    CompletingAutoencoder,
+    CompletingAutoencoderSettings,
+)
+from robotdiffuse.learning.training.batches import fast_bf16, random_scenes, scene_clouds
+from robotdiffuse.learning.training.config import EncoderTraining, ShareBelowOne, TrainingSettings
 from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.run import Validation
 from robotdiffuse.learning.training.trainee import Trainee, train
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.observed_volume import VOXEL
 from robotdiffuse.settings import Count, Filled, Natural, OneOf, Positive
 
@@ -42,6 +48,8 @@ THRESHOLD = 0.1
 """Probability above which a voxel counts as occupied in figures."""
 EACH = 17
 """One voxel of so many is what the temperature is fitted to."""
+FITTED = 600
+"""Scenes of either kind that the components of the code are fitted to."""
 BINS = 20
 """Of probabilities, for the expected calibration error."""
 
@@ -66,7 +74,8 @@ class CompletionTraining(TrainingSettings):
 
 
 def train_completion(settings: CompletionTraining, out: str) -> dict[str, float]:
-    """Train the network; write completion.safetensors and completion.json into the folder `out`.
+    """Train the network; write completion.safetensors and completion.json into the folder `out`, and the
+    encoder that its bottleneck is: code.safetensors and code.json.
 
     The same call continues a run that was interrupted. Returns the cross-entropy per voxel on scenes that are
     held out, precision and recall by family, the expected calibration error, and `samples`. Raises as
@@ -129,6 +138,7 @@ class _CompletionTrainee(Trainee):
         p, truth = np.concatenate(all_p), np.concatenate(all_truth)
         report["calibration error"] = calibration_error(p, truth)
         self._figures = {"reliability": reliability(p, truth)}
+        self._code = fitted_code(network, families, self.robot)
         return report
 
     def about(self) -> dict[str, Any]:
@@ -136,6 +146,7 @@ class _CompletionTrainee(Trainee):
 
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
         save_completion(self._trained, folder, training)
+        save_code(self._code, folder)
 
     def _held_out(self, families: tuple[str, ...], first: int, count: int) -> Samples:
         """So many samples of each family, from this number on."""
@@ -179,6 +190,25 @@ class _CompletionTrainee(Trainee):
             found.append((logits.cpu().numpy().ravel(), truth.cpu().numpy().ravel(), unknown))
         logits, truth, unknown = (np.concatenate(parts) for parts in zip(*found, strict=True))
         return logits, truth, unknown
+
+
+def fitted_code(network: CompletionNetwork, families: tuple[str, ...], robot: Robot) -> CompletingAutoencoder:
+    """The encoder that the bottleneck of a trained network is, its components fitted to FITTED scenes that
+    views saw a part of, and to as many that are known as clouds."""
+    kept = min(CompletingAutoencoderSettings.kept, network.settings.channels[-1])
+    encoder = CompletingAutoencoder(CompletingAutoencoderSettings(kept=kept, network=network.settings)).eval()
+    encoder.network = network
+    rng = np.random.default_rng([HELD_OUT, len(FAMILIES)])
+    views = draw_samples(families, robot, rng.integers(MOST, size=FITTED).tolist())
+    scenes = random_scenes(FITTED, EncoderTraining.max_obstacles, rng)
+    clouds = encoder.volume(scene_clouds(encoder, scenes, rng))
+    volumes = torch.cat([torch.from_numpy(views.seen), clouds])
+    behind = torch.cat([torch.from_numpy(views.behind), torch.zeros_like(clouds)])
+    with torch.no_grad():
+        with torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+            features = encoder.bottleneck(volumes, behind)
+        encoder.fit(features.float())
+    return encoder
 
 
 def _split(samples: Samples, size: int = 4) -> list[Samples]:

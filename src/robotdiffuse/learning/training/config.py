@@ -6,7 +6,7 @@ from typing import Annotated
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import DenoiserSettings
-from robotdiffuse.learning.encoders import ENCODERS
+from robotdiffuse.learning.encoders import COMPLETES, ENCODERS
 from robotdiffuse.learning.encoders.base import EncoderSettings
 from robotdiffuse.learning.motion_model import MOST_WAYPOINTS, ModelParts
 from robotdiffuse.learning.networks import NETWORKS
@@ -89,9 +89,10 @@ class EncoderTraining(TrainingSettings):
         super().__post_init__()
         alone = [name for name, entry in ENCODERS.items() if entry.kind == "alone"]
         if self.name not in alone:
+            completes = ENCODERS[self.name].kind == COMPLETES
+            how = "by train completion" if completes else "jointly with the planner"
             raise InputError(
-                f"name is {self.name}, an encoder that is trained jointly with the planner, not alone; "
-                f"alone: {', '.join(alone)}"
+                f"name is {self.name}, an encoder that is trained {how}, not alone; alone: {', '.join(alone)}"
             )
 
 
@@ -114,8 +115,9 @@ class PlannerTraining(MotionTraining, ModelParts):
     """Training of the diffusion model."""
 
     encoder: str | None
-    """Folder with a trained encoder, which stays as it is; or the name of an encoder, pointnet or dgcnn, say,
-    that starts untrained and is trained along, by the planner's loss, on clouds drawn anew each time; None
+    """Folder with a trained encoder, or with a completing network, or completing_autoencoder for the one that
+    comes with the package: they stay as they are. Or the name of another encoder, pointnet or dgcnn, say,
+    that starts untrained and is trained along, by the planner's loss, on clouds drawn anew each time. None
     for a prior, which sees no scene."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
@@ -143,13 +145,13 @@ class PlannerTraining(MotionTraining, ModelParts):
         super().__post_init__()
         if self.target == "limits" and self.smooth_noise:
             raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
-        if self.encoder_settings is not None:
-            ENCODERS.entry(self.encoder)
+        if self.encoder_settings is not None and ENCODERS.entry(self.encoder).kind == COMPLETES:
+            raise InputError(f"encoder_settings are given; {self.encoder} comes trained, with its own")
 
     @property
     def jointly(self) -> bool:
         """Whether the encoder is trained along."""
-        return self.encoder in ENCODERS
+        return self.encoder in ENCODERS and ENCODERS.entry(self.encoder).kind != COMPLETES
 
 
 @dataclass(frozen=True, kw_only=True)
