@@ -4,6 +4,7 @@
     python benchmarks/unseen.py --weights FOLDER ... --families shelf clutter
     python benchmarks/unseen.py --report [--odd] --records unseen.jsonl
     python benchmarks/unseen.py --fit --records unseen.jsonl
+    python benchmarks/unseen.py --times
 
 Problems are held-out ones of the families that the straight line does not solve and a search in the true
 scene does. Cameras stand where a person would place them, 1.4 to 1.8 m away, in front more often than behind;
@@ -13,7 +14,8 @@ and not tried again; `--report` prints the tables that are kept in benchmarks/re
 the constants of planners/confidence.py, from the calibration half: problems with even numbers. Settings were
 chosen on them, too; `--odd` leaves them out of the report. `--weights` adds the chain 'imagined' with other
 weights of the completing network, folders of `train completion`, as methods that are named by the folder:
-those of a training that left families out are tried on these families.
+those of a training that left families out are tried on these families. `--times` prints what the network
+takes of a core.
 """
 
 import argparse
@@ -24,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from numpy import ndarray
 from report import header, print_table, progress
@@ -31,9 +34,9 @@ from report import header, print_table, progress
 from robotdiffuse.evaluation.statistics import compare, wilson_interval
 from robotdiffuse.files import JsonLines
 from robotdiffuse.learning.checkpoint import load_completion
-from robotdiffuse.learning.completion import imagine
+from robotdiffuse.learning.completion import bundled, imagine
 from robotdiffuse.learning.completion.network import CompletionNetwork
-from robotdiffuse.learning.completion.samples import CameraPlaces, true_voxels
+from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
 from robotdiffuse.planners import call, load_planner
 from robotdiffuse.planners.call import Request
 from robotdiffuse.planners.confidence import LEAST_RISK, confidence
@@ -59,6 +62,8 @@ TRUE = "true voxels"
 """As imagined, with the voxels of 2 cm that obstacles fill in truth."""
 BY = "imagined by "
 """As imagined, by the weights of the folder of this name."""
+CALLS, WARM = 140, 7
+"""That the network is timed by, and further ones before."""
 PLANNER = load_planner("aorrtc")
 Row = dict[str, Any]
 
@@ -252,8 +257,12 @@ def main() -> None:
     parser.add_argument("--report", action="store_true")
     parser.add_argument("--odd", action="store_true", help="report problems with odd numbers alone")
     parser.add_argument("--fit", action="store_true")
+    parser.add_argument("--times", action="store_true")
     arguments = parser.parse_args()
-    if arguments.fit:
+    if arguments.times:
+        print(header("torch"))
+        times(arguments.families)
+    elif arguments.fit:
         fit(JsonLines(Path(arguments.records)).rows)
     elif arguments.report:
         print(header("numba", "numpy", "torch"))
@@ -272,6 +281,28 @@ def report(rows: list[Row]) -> None:
             calibration(some)
     spent = [row["view_time"] for row in rows]
     print(f"From views to the problem's scene: {1e3 * np.median(spent):.0f} ms of CPU time (median)")
+
+
+def times(families: list[str]) -> None:
+    """CPU time of the completing network, from a packed volume to probabilities, on one thread."""
+    volumes = []
+    for family in families:
+        problem = held_out_problem(family, 0)
+        seen = observe(views(problem, family, 0, 1, False), problem.robot, problem.start)
+        volumes.append([torch.from_numpy(array)[None] for array in pack(seen)])
+    torch.set_num_threads(1)
+    spent = {"fp32": list[float](), "bf16": list[float]()}
+    for i in range(CALLS + WARM):
+        for name, taken in spent.items():
+            with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=name == "bf16"):
+                began = time.process_time()
+                bundled().probabilities(*volumes[i % len(volumes)])
+                taken.append(time.process_time() - began)
+    for name, taken in spent.items():
+        least, median = 1e3 * min(taken[WARM:]), 1e3 * np.median(taken[WARM:])
+        print(
+            f"network in {name}: {median:.1f} ms of CPU time in the median, {least:.1f} at least, of {CALLS}"
+        )
 
 
 def fit(rows: list[Row]) -> None:
