@@ -37,7 +37,9 @@ from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraini
 from robotdiffuse.learning.training.encoder import linear_readout, train_encoder
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.learning.training.run import TrainingRun
+from robotdiffuse.scenes.depth_view import DepthView
 from robotdiffuse.scenes.packed import SPHERE
+from robotdiffuse.scenes.ray_caster import looking_at
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 
 SMALL_CAE = CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16))
@@ -384,6 +386,45 @@ def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
     encoder = load_model(tmp_path / "out").encoder
     assert encoder is not None and fingerprint(encoder) == before
     assert fingerprint(load_encoder(tmp_path / "encoder")) == before
+
+
+@every_encoder
+def test_training_on_what_one_camera_sees(name, data, tmp_path, monkeypatch):
+    """Frozen encoders by codes of views, kept apart from those of whole scenes; the others by clouds."""
+    arm, encoder = box_arm(), small(name)
+    frozen = name not in JOINTLY
+    read = partial(load_data, str(data), arm, encoder if frozen else None, 12, lambda text: None)
+    along = None if frozen else encoder
+    seen, again, whole = read(views=True, along=along), read(views=True, along=along), read()
+    if frozen:
+        assert np.array_equal(seen.codes, again.codes) and not np.array_equal(seen.codes, whole.codes)
+        assert seen.clouds is None and len(list((data / "codes").iterdir())) == 2
+    else:
+        assert seen.codes is None and whole.clouds is None
+        assert seen.clouds.shape == (len(seen), encoder.settings.cloud, 3)
+        assert np.array_equal(seen.clouds, again.clouds) and (seen.clouds != 0).any(-1).mean() > 0
+        assert seen.split(9)[1].clouds.shape[0] == seen.validation
+    save_encoder(encoder, tmp_path / "encoder", {})
+    told = str(tmp_path / "encoder") if frozen else name
+    settings = planner(data, told, views=True, encoder_settings=None if frozen else SMALL[name])
+    train_planner(settings, str(tmp_path / "out"))
+    assert load_model(tmp_path / "out", arm).encoder is not None
+    with pytest.raises(InputError, match="views is True and encoder is None"):
+        replace(settings, encoder=None, encoder_settings=None)
+
+
+@pytest.mark.parametrize("name", ["compression_autoencoder", "pointnet"])
+def test_of_views_is_the_code_of_the_points_that_are_told(name):
+    encoder, arm = small(name), box_arm()
+    points = cloud(300)[0].numpy()
+    view = DepthView.from_cloud(points, looking_at(np.array([-1.5, 0.0, 1.0]), np.array([0.0, 0.0, 0.4])))
+    start = np.zeros(arm.dof)
+    told = encoder.told_points([view], arm, start)
+    assert 0 < len(told) <= encoder.settings.cloud
+    apart = np.linalg.norm(told[:, None] - points, axis=-1).min(1)
+    assert apart.max() < 0.05
+    z = encoder.of_views([view], arm, start)
+    torch.testing.assert_close(z, encoder(torch.from_numpy(told)[None])[0])
 
 
 def test_batches_with_clouds_instead_of_codes(data):

@@ -12,7 +12,7 @@ from robotdiffuse.errors import InputError, shown
 SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
 PARTS = (
     *("denoiser", "objective", "sampler", "sampling_steps", "parametrization", "rows", "target"),
-    *("condition_drop", "waypoints"),
+    *("condition_drop", "waypoints", "views"),
 )
 """Of the planner's config."""
 
@@ -101,6 +101,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     parts.add_argument("--target", metavar="NAME", help="residual, to the straight line, or absolute")
     parts.add_argument(
         "--condition-drop", type=share, metavar="P", help="share without condition, for its guidance"
+    )
+    parts.add_argument(
+        "--views",
+        action="store_const",
+        const=True,
+        help="tell the encoder what one camera sees of each scene, not of all its surfaces",
     )
     parts.add_argument("--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion")
     planner.set_defaults(run=run_planner)

@@ -1,15 +1,20 @@
 """What every encoder of the scene has in common."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float32
+from numpy import ndarray
 from numpy.random import Generator
 from torch import Tensor, nn
 
+from robotdiffuse.problems.seen import seen_points
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.depth_view import DepthView
 from robotdiffuse.scenes.sampling import PANDA_REGION, VisibleRegion
 from robotdiffuse.settings import Count, Settings
 
@@ -50,6 +55,21 @@ class Encoder(nn.Module, ABC):
 
         Points outside the region do not count, so that clouds of different size may share a batch.
         """
+
+    def of_views(
+        self, views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"]
+    ) -> Float[Tensor, "code"]:
+        """z of what depth views saw, the arm at `start` where they do not say."""
+        return self(torch.from_numpy(self.told_points(views, robot, start))[None])[0]
+
+    def told_points(
+        self, views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"]
+    ) -> Float32[ndarray, "n 3"]:
+        """The points of depth views that count [m]: at most `settings.cloud` of those seen in the region."""
+        points = seen_points(views, robot, start)
+        points = points[self.settings.region.holds(points)]
+        most = min(len(points), self.settings.cloud)
+        return points[(np.arange(most) * 2 + 1) * len(points) // (2 * max(most, 1))]
 
     def near(self, cloud: Float[Tensor, "batch points 3"]) -> Bool[Tensor, "batch points"]:
         """Which points count: those in the region, and no zeros, which `surface_clouds` fills up with."""

@@ -78,7 +78,7 @@ class CompletingAutoencoder(Encoder):
     def of_views(
         self, views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"]
     ) -> Float[Tensor, "code"]:
-        """z of what depth views saw; as `scenes.observed_volume.observe`, and it raises the same."""
+        """z of the volume that depth views observed together, see `scenes.observed_volume.observe`."""
         seen, behind = (torch.from_numpy(a)[None] for a in pack(observe(views, robot, start)))
         return self.of_volumes(seen, behind)[0]
 

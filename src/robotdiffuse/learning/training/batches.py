@@ -9,7 +9,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float16, Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
@@ -22,6 +22,7 @@ from robotdiffuse.learning.checkpoint import fingerprint
 from robotdiffuse.learning.clearances import PackedClearanceFn
 from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.training.views import clouds_of_views, codes_of_views
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.packed import BOX, NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_clouds import surface_clouds
@@ -66,6 +67,9 @@ class TrajectoryData:
     """SHA-256 of the shards, the first 16 digits."""
     validation: int
     """So many rows, the last, are of the split for validation; the others are of that for training."""
+    clouds: Float16[ndarray, "n points 3"] | None = None
+    """What an encoder that is trained along is told of a view of each scene [m]; None where it is told of
+    whole scenes."""
 
     def __len__(self) -> int:
         return len(self.q)
@@ -97,7 +101,12 @@ class TrajectoryData:
             None if self.codes is None else self.codes[rows],
             self.digest,
             validation,
+            None if self.clouds is None else self.clouds[rows],
         )
+
+
+_Part = tuple[ndarray, PackedScenes, ndarray, ndarray, ndarray]
+"""Motions, scenes, whether trivial, codes and clouds."""
 
 
 def load_data(
@@ -107,12 +116,17 @@ def load_data(
     waypoints: int,
     report: Callable[[str], None],
     turns: int = 0,
+    views: bool = False,
+    along: Encoder | None = None,
 ) -> TrajectoryData:
     """The rows for training and validation of a data set, at `waypoints` waypoints, with the codes of their
     scenes.
 
     turns: copies of each row for training that are turned by random angles, see `turns.py`; none if the
         robot's first joint is not vertical.
+    views: whether an encoder is told what one camera sees of each scene, see `views.random_views`, and not of
+        all its surfaces.
+    along: with `views`, the encoder that is trained along: the rows have clouds for it, and no codes.
 
     Codes are kept beside the shards, in files named by shard and encoder; where the folder cannot be written
     they are made each time. Without an encoder there are none. `report` is told what is being done. Raises
@@ -121,21 +135,25 @@ def load_data(
     if turns and not turns_about_vertical(robot):
         report(f"data: no turned copies, for {robot.joint_names[0]} does not turn about the base's vertical")
         turns = 0
-    parts: dict[str, list[tuple[ndarray, PackedScenes, ndarray, ndarray]]] = {"train": [], "validation": []}
-    encoder_print = "" if encoder is None else fingerprint(encoder)
+    parts: dict[str, list[_Part]] = {"train": [], "validation": []}
+    encoder_print = "" if encoder is None else fingerprint(encoder) + "-views" * views
     prints: list[str] = []
     count, shards = 0, len(shard_indices(folder))
     for rows in read_rows(folder, robot, waypoints, turns):
         prints += [rows.shard.fingerprint] * (rows.turn == 0)
         key = f"{rows.shard.fingerprint}-{encoder_print}" + (f"-turn{rows.turn}" if rows.turn else "")
-        codes = _codes(FilePath(folder), rows.scenes, encoder, key)
+        starts = rows.q[:, 0] if views else None
+        codes = _codes(FilePath(folder), rows.scenes, encoder, key, robot, starts)
+        clouds = np.zeros((len(codes), 0, 3), np.float16)
+        if starts is not None and along is not None:
+            clouds = clouds_of_views(along, rows.scenes, robot, starts, _rng_of(key))
         for name, found in parts.items():
             of = rows.split == SPLITS.index(name)
-            found.append((rows.q[of], rows.scenes[of], rows.shard["line_free"][of], codes[of]))
+            found.append((rows.q[of], rows.scenes[of], rows.shard["line_free"][of], codes[of], clouds[of]))
             count += int(of.sum())
         if rows.turn == turns:
             report(f"data: {len(prints)} of {shards} shards, {count:,} trajectories")
-    q, scenes, trivial, codes = zip(*parts["train"], *parts["validation"], strict=True)
+    q, scenes, trivial, codes, clouds = zip(*parts["train"], *parts["validation"], strict=True)
     return TrajectoryData(
         np.concatenate(q),
         PackedScenes.joined(scenes),
@@ -143,13 +161,24 @@ def load_data(
         None if encoder is None else np.concatenate(codes),
         hashlib.sha256("".join(prints).encode()).hexdigest()[:16],
         sum(len(part[0]) for part in parts["validation"]),
+        np.concatenate(clouds) if views and along is not None else None,
     )
 
 
+def _rng_of(key: str) -> np.random.Generator:
+    return np.random.default_rng(int(key[:8], 16))
+
+
 def _codes(
-    folder: FilePath, scenes: PackedScenes, encoder: Encoder | None, key: str
+    folder: FilePath,
+    scenes: PackedScenes,
+    encoder: Encoder | None,
+    key: str,
+    robot: Robot,
+    starts: Float[ndarray, "n dof"] | None,
 ) -> Float[ndarray, "n code"]:
-    """Codes of scenes, kept in a file named by `key`; of no numbers where there is no encoder."""
+    """Codes of scenes, or with starts of views of them, kept in a file named by `key`; of no numbers where
+    there is no encoder."""
     if encoder is None:
         return np.zeros((len(scenes), 0), np.float16)
     cache = folder / "codes" / f"{key}.npy"
@@ -160,7 +189,11 @@ def _codes(
                 return codes
         except (OSError, ValueError, EOFError):
             pass  # damaged: made again below
-    codes = encode_scenes(encoder, scenes, np.random.default_rng(int(key[:8], 16)))
+    if starts is None:
+        codes = encode_scenes(encoder, scenes, _rng_of(key))
+    else:
+        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
+            codes = codes_of_views(encoder, scenes, robot, starts, _rng_of(key))
     try:
         buffer = BytesIO()
         np.save(buffer, codes)
@@ -251,6 +284,8 @@ class Batches:
         codes, clouds = np.zeros((len(rows), model.settings.code), np.float32), None
         if data.codes is not None:
             codes = data.codes[rows].astype(np.float32)
+        elif data.clouds is not None:
+            clouds = torch.from_numpy(data.clouds[rows].astype(np.float32))
         elif model.encoder is not None:
             clouds = scene_clouds(model.encoder, scenes, rng)
         q = data.q[rows]

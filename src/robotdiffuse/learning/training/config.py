@@ -119,6 +119,8 @@ class PlannerTraining(MotionTraining, ModelParts):
     comes with the package: they stay as they are. Or the name of another encoder, pointnet or dgcnn, say,
     that starts untrained and is trained along, by the planner's loss, on clouds drawn anew each time. None
     for a prior, which sees no scene."""
+    views: bool = False
+    """Whether the encoder is told what one camera sees of each scene, and not of all its surfaces."""
     minutes: Positive | None = 70.0
     learning_rate: Positive = 6e-4
     """Peak, for AdamW (paper: 3e-4)."""
@@ -145,6 +147,8 @@ class PlannerTraining(MotionTraining, ModelParts):
         super().__post_init__()
         if self.target == "limits" and self.smooth_noise:
             raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
+        if self.views and self.encoder is None:
+            raise InputError("views is True and encoder is None; without an encoder no scene is seen at all")
         if self.encoder_settings is not None and ENCODERS.entry(self.encoder).kind == COMPLETES:
             raise InputError(f"encoder_settings are given; {self.encoder} comes trained, with its own")
 

@@ -61,6 +61,9 @@ CONFIGS: dict[str, Config] = {
     ),
     "table2_pointnet": Config("encoder PointNet, trained along", {**_ROW, "encoder": "pointnet"}),
     "table2_dgcnn": Config("encoder DGCNN, trained along", {**_ROW, "encoder": "dgcnn"}),
+    "table2_completing": Config(
+        "encoder completing_autoencoder, frozen", {**_ROW, "encoder": "completing_autoencoder"}
+    ),
     "table2_unet": Config("temporal U-Net", {**_ROW, "denoiser": "unet"}),
     "table2_transformer": Config("encoder-decoder transformer", {**_ROW, "denoiser": "encoder_decoder"}),
     "table2_decoder_only": Config("decoder-only transformer", {**_ROW, "denoiser": "decoder_only"}),

@@ -56,7 +56,8 @@ class _PlannerTrainee(MotionTrainee):
         model = MotionModel(RobotIdentity.of(robot), _model_settings(settings, encoder))
         # codes are made on the CPU: the frozen one stays there
         model.encoder = copy.deepcopy(encoder)
-        super().__init__(settings, robot, frozen, processes)
+        along = model.encoder if settings.jointly else None
+        super().__init__(settings, robot, frozen, processes, settings.views, along)
         self.own, self.title = settings, model.settings.network
         hard = self.kept.q[~self.kept.trivial]
         model.fit_statistics((hard if len(hard) else self.kept.q)[:STATISTICS], settings.smooth_noise)

@@ -93,16 +93,24 @@ class MotionTrainee(Trainee):
     """
 
     def __init__(
-        self, settings: MotionTraining, robot: Robot, encoder: Encoder | None, processes: Processes
+        self,
+        settings: MotionTraining,
+        robot: Robot,
+        encoder: Encoder | None,
+        processes: Processes,
+        views: bool = False,
+        along: Encoder | None = None,
     ) -> None:
-        """encoder: the frozen one that makes codes of the scenes, if there is one.
+        """encoder: the frozen one that makes codes of the scenes, if there is one. views, along: see
+        `load_data`.
 
         Raises InputError if the data do not fit the robot, or there are none for training.
         """
         self.settings, self.robot, self.processes = settings, robot, processes
 
         def read(report: Callable[[str], None]) -> TrajectoryData:
-            return load_data(settings.data, robot, encoder, settings.waypoints, report, settings.turns)
+            asked = settings.data, robot, encoder, settings.waypoints, report, settings.turns
+            return load_data(*asked, views, along)
 
         self.data = GrowingData(settings.data, read, processes)
         self.kept, self.held_out = self.data.now.split(HELD_OUT)

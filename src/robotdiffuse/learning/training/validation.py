@@ -5,6 +5,7 @@ Covering spheres decide, not the judge: it is for curves of training, which comp
 """
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
@@ -53,6 +54,9 @@ def _sampled_free(
     code = np.zeros(0)
     if data.codes is not None:
         code = data.codes[row]
+    elif data.clouds is not None and model.encoder is not None:
+        with torch.inference_mode():
+            code = model.encoder(torch.from_numpy(data.clouds[row : row + 1].astype(np.float32)))[0].numpy()
     elif model.encoder is not None:
         code = encode_scenes(model.encoder, data.scenes[row : row + 1], rng)[0]
     guidance = CollisionGuidance(checker)

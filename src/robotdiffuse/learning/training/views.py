@@ -3,13 +3,11 @@
 from collections.abc import Iterator
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float16
 from numpy import ndarray
 
 from robotdiffuse.learning.completion.samples import camera_view
 from robotdiffuse.learning.encoders.base import Encoder
-from robotdiffuse.learning.training.processes import fast_bf16
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.depth_view import DepthView
 from robotdiffuse.scenes.packed import PackedScenes
@@ -32,9 +30,8 @@ def codes_of_views(
 ) -> Float16[ndarray, "n code"]:
     """z of a random view of each scene."""
     codes = np.zeros((len(scenes), encoder.settings.code), np.float16)
-    with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=fast_bf16()):
-        for code, view in zip(codes, random_views(scenes, robot, starts, rng), strict=True):
-            code[:] = encoder.of_views([view], robot, starts[0]).numpy()
+    for code, view in zip(codes, random_views(scenes, robot, starts, rng), strict=True):
+        code[:] = encoder.of_views([view], robot, starts[0]).float().numpy()
     return codes
 
 
