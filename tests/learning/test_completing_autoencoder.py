@@ -10,6 +10,7 @@ import torch
 
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.data.manifest import write_manifest
 from robotdiffuse.data.shards import write_shard
 from robotdiffuse.errors import InputError
@@ -28,12 +29,15 @@ from robotdiffuse.learning.encoders.completing_autoencoder import (
     CompletingAutoencoder,
     CompletingAutoencoderSettings,
 )
+from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training import completion as completion_training
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.planner import train_planner
+from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.observed_volume import LOW, VOXEL, observe
 from robotdiffuse.scenes.ray_caster import looking_at, ray_cast
@@ -141,6 +145,21 @@ def test_planner_training_by_its_name(tmp_path: Path, monkeypatch: pytest.Monkey
     assert model.encode(np.random.default_rng(0).random((100, 3))).shape == (96,)
     with pytest.raises(InputError, match="completing_autoencoder comes trained"):
         replace(settings, encoder_settings=CompletingAutoencoderSettings())
+
+
+def test_planners_tell_it_as_many_points_as_it_wants(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[int] = []
+
+    def z(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        told.append(len(points))
+        return np.zeros(8, np.float32)
+
+    settings = CompletingAutoencoderSettings(code=8, cloud=500, kept=4, network=SMALL)
+    model = MotionModel(RobotIdentity.of(PANDA), MotionModelSettings(encoder=NAME, encoder_settings=settings))
+    monkeypatch.setattr(model, "encode", z)
+    checker = CollisionChecker(PANDA, Scene([Box((0.5, 0.0, 0.3), (0.1, 0.6, 0.6))]))
+    encode(model, checker, 320, np.random.default_rng(0))
+    assert told == [500]
 
 
 def test_not_trained_alone() -> None:

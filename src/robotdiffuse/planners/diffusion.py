@@ -65,7 +65,7 @@ class SamplingSettings(LearnedSettings):
     """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further.
     Other than 1 needs weights that were trained with a condition_drop above 0."""
     points: Count = 320
-    """Points of the cloud that the encoder sees (paper: 1,400)."""
+    """Points of the cloud that the encoder sees (paper: 1,400), unless it wants clouds of its own size."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 
 
@@ -143,9 +143,12 @@ class ModelSampler(LearnedPlanner[Own]):
 def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
-    """z of a scene: its point cloud through the frozen encoder."""
+    """z of a scene: its point cloud through the frozen encoder; of so many points, unless the encoder wants
+    clouds of its own size."""
     assert model.encoder is not None  # a prior is no network of these planners
-    return model.encode(sample_surface(checker.scene, points, rng, model.encoder.settings.region), rng)
+    told = model.encoder.settings
+    count = points if model.encoder.any_size else told.cloud
+    return model.encode(sample_surface(checker.scene, count, rng, told.region), rng)
 
 
 def _projected(

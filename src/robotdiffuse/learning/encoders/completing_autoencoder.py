@@ -58,6 +58,7 @@ class CompletingAutoencoderSettings(EncoderSettings):
 class CompletingAutoencoder(Encoder):
     """z = principal components of the completing network's bottleneck, each of variance 1."""
 
+    any_size = False
     settings: CompletingAutoencoderSettings
 
     def __init__(self, settings: CompletingAutoencoderSettings) -> None:
