@@ -14,7 +14,8 @@ one camera sees it. Judged is what lies within the arm's reach and above the flo
   near: share of the decoded points within 4 cm of the true surfaces; found: share of the true ones within
   4 cm of a decoded one.
 - read from z: what a linear map makes of z alone, the same yardstick for all: fitted by least squares to the
-  occupancy of voxels of 4 cm in other scenes. IoU of voxels; the threshold is the best one.
+  occupancy of voxels of 4 cm in other scenes. IoU of voxels; the threshold is the best one. And the distances
+  of 48 places around the arm, as `train encoder` reports it (`linear_readout`).
 """
 
 import argparse
@@ -44,6 +45,8 @@ from robotdiffuse.learning.encoders.completing_autoencoder import CompletingAuto
 from robotdiffuse.learning.encoders.compression_autoencoder import CompressionAutoencoder
 from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoder
 from robotdiffuse.learning.training.batches import random_scenes
+from robotdiffuse.learning.training.config import EncoderTraining
+from robotdiffuse.learning.training.encoder import linear_readout
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.seen import seen_points
@@ -159,6 +162,14 @@ def codes(encode: Callable[[Told], torch.Tensor], scenes: list[Told]) -> Float[n
         return np.stack([encode(scene).numpy() for scene in scenes]).astype(np.float64)
 
 
+def distances(encoders: dict[str, Encoder]) -> None:
+    rows = []
+    for name, encoder in encoders.items():
+        found = linear_readout(encoder, EncoderTraining.max_obstacles, np.random.default_rng(SEED))
+        rows.append((name, f"{100 * found['readout']:.1f}", f"{100 * found['readout_of_constant']:.1f}"))
+    print_table("distances read from z: boxes and spheres", ["encoder", "error, cm", "of a constant"], rows)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="What encoders keep of a scene.")
     parser.add_argument("--cae", metavar="FOLDER", help="the paper's encoder, trained")
@@ -194,6 +205,7 @@ def main() -> None:
         ("completing, 96", "view"): lambda scene: completing.of_volumes(*told_view(scene))[0],
     }
     print(header("numpy", "torch"))
+    distances(points | {"completing, 96": completing})
     for kind in ("boxes and spheres", "families"):
         scenes = [*draw(kind, arguments.fitted, 1), *draw(kind, arguments.scenes, 2)]
         rows = []
