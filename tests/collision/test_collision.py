@@ -552,6 +552,9 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
     use(solids())
     use(Scene([*solids().shapes, PointCloud([[0.5, 0.5, 0.5]]), Mesh(vertices, faces)]))
     use(Scene([PointCloud(np.zeros((0, 3)))]))
+    use(
+        Scene([shape for shape in solids().shapes for _ in range(3)])
+    )  # rows of several, whatever is taken of them
     assert compiled() == before
 
 
