@@ -197,6 +197,14 @@ def report(out: str) -> None:
         ["encoder", "code", "single free, % (95 %)", "best, %", "collided, %", *FAMILIES],
         lines,
     )
+    for name in ROWS:
+        free = {
+            code: np.array([r["passed"] for r in rows if (r["row"], r["code"]) == (name, code)])
+            for code in ("own", "another")
+        }
+        apart = free["own"] - free["another"]
+        low, high = (100 * x for x in bootstrap_interval(apart))
+        print(f"{name}: own less another {100 * apart.mean():+.1f} points ({low:+.1f} to {high:+.1f})")
 
 
 def main() -> None:
