@@ -2,6 +2,7 @@
 
     python benchmarks/core.py [--problems FOLDER --lengths FILE] [--parts first,lengths,...] [--each 25]
                               [--motions 400] [--cpu]
+                              [--limits 0.01,0.05,0.1,1] [--seeds 1]
 
 Prints the report that is kept in benchmarks/results/core.txt. FOLDER holds MotionBenchMaker families (scene
 and request files), FILE reference lengths, {"length": {"family/number": {"best_known": ...}}}; of families
@@ -49,8 +50,6 @@ from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud
 from robotdiffuse.types import Path as JointPath
 
 SEED = 20261122
-LIMITS = (0.01, 0.05, 0.1, 1.0)
-"""[s]"""
 REPEATS = 50
 """Of each path, back and forth, in the timing of the kernel."""
 RESOLUTION, POINT_RADIUS = 0.05, 0.01
@@ -117,12 +116,12 @@ def first(cases: Sequence[Case], _lengths: dict) -> None:
     )
 
 
-def lengths(cases: Sequence[Case], known: dict) -> None:
+def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: int) -> None:
     names = ("aorrtc", "robotdiffuse", "rrt_connect")
     found: dict[tuple[str, float], list[Record]] = {}
-    for limit in LIMITS:
+    for limit in limits:
         methods = {name: planned(warm(name, cases), until="limit", clearance=0.0) for name in names}
-        for name, records in tried(cases, methods, limit=limit, title=f"{limit:g} s").items():
+        for name, records in tried(cases, methods, range(seeds), limit, title=f"{limit:g} s").items():
             found[name, limit] = records
     best = best_known(cases, known, [record for records in found.values() for record in records])
     rows = []
@@ -130,15 +129,15 @@ def lengths(cases: Sequence[Case], known: dict) -> None:
         inside = {case.name for case in of}
         for name in names:
             row = [f"{family} ({len(of)})", name]
-            for limit in LIMITS:
+            for limit in limits:
                 records = [r for r in found[name, limit] if r.name in inside]
                 ratios = [r.measures["joint_length"] / best[r.name] for r in records if r.solved]
                 missing = len(records) - len(ratios)
                 row.append(f"{np.mean(ratios):.4f}" + (f" ({missing} unsolved)" if missing else ""))
-            stages = [r.stage for r in found[name, LIMITS[-1]] if r.name in inside and r.solved]
+            stages = [r.stage for r in found[name, limits[-1]] if r.name in inside and r.solved]
             share = sum(stage in ("network", "refinement") for stage in stages) / max(len(stages), 1)
             rows.append([*row, f"{100 * share:.0f} %"])
-    columns = ["family", "planner", *(f"{limit:g} s" for limit in LIMITS), "network's at 1 s"]
+    columns = ["family", "planner", *(f"{limit:g} s" for limit in limits), "network's in the last"]
     notes = ("mean of lengths over the best known one of the solved; rrt_connect: restarts",)
     print_table("Length over best known at equal time", columns, rows, notes)
 
@@ -307,6 +306,8 @@ def main() -> None:
     parser.add_argument("--lengths", type=Path, help="reference lengths (JSON)")
     parser.add_argument("--each", type=int, default=25, help="problems of each family (25)")
     parser.add_argument("--parts", default=",".join(PARTS), help="of the report, parted by commas (all)")
+    parser.add_argument("--limits", default="0.01,0.05,0.1,1", help="for lengths, in s, parted by commas")
+    parser.add_argument("--seeds", type=int, default=1, help="of each problem, for lengths (1)")
     parser.add_argument("--motions", type=int, default=400, help="that are checked on meshes (400)")
     parser.add_argument("--cpu", action="store_true", help="limits of CPU time, where other work runs beside")
     arguments = parser.parse_args()
@@ -318,9 +319,10 @@ def main() -> None:
     cases = cases_of(arguments.problems, arguments.each)
     for name in ("aorrtc", "robotdiffuse", "rrt_connect"):
         load_planner(name).warm_up(cases[0].problem)  # compiles
+    asked = [float(limit) for limit in arguments.limits.split(",")]
+    more = {"collisions": (arguments.motions,), "lengths": (asked, arguments.seeds)}
     for part in arguments.parts.split(","):
-        more = (arguments.motions,) if part == "collisions" else ()
-        PARTS[part](cases, known, *more)
+        PARTS[part](cases, known, *more.get(part, ()))
 
 
 if __name__ == "__main__":
