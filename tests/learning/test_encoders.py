@@ -389,7 +389,7 @@ def test_a_frozen_encoder_stays_as_it_is(name, data, tmp_path):
 
 
 @every_encoder
-def test_training_on_what_one_camera_sees(name, data, tmp_path, monkeypatch):
+def test_training_on_what_one_camera_sees(name, data, tmp_path):
     """Frozen encoders by codes of views, kept apart from those of whole scenes; the others by clouds."""
     arm, encoder = box_arm(), small(name)
     frozen = name not in JOINTLY
@@ -397,13 +397,16 @@ def test_training_on_what_one_camera_sees(name, data, tmp_path, monkeypatch):
     along = None if frozen else encoder
     seen, again, whole = read(views=True, along=along), read(views=True, along=along), read()
     if frozen:
+        assert seen.codes is not None and again.codes is not None and whole.codes is not None
         assert np.array_equal(seen.codes, again.codes) and not np.array_equal(seen.codes, whole.codes)
         assert seen.clouds is None and len(list((data / "codes").iterdir())) == 2
     else:
         assert seen.codes is None and whole.clouds is None
+        assert seen.clouds is not None and again.clouds is not None
         assert seen.clouds.shape == (len(seen), encoder.settings.cloud, 3)
         assert np.array_equal(seen.clouds, again.clouds) and (seen.clouds != 0).any(-1).mean() > 0
-        assert seen.split(9)[1].clouds.shape[0] == seen.validation
+        held_out = seen.split(9)[1].clouds
+        assert held_out is not None and len(held_out) == seen.validation
     save_encoder(encoder, tmp_path / "encoder", {})
     told = str(tmp_path / "encoder") if frozen else name
     settings = planner(data, told, views=True, encoder_settings=None if frozen else SMALL[name])
