@@ -11,6 +11,7 @@ from robotdiffuse.errors import InputError
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.add import AddReport
 from robotdiffuse.robots.allowed_collisions import (
+    Links,
     PairReport,
     SamplingSettings,
     allowed_pairs,
@@ -18,7 +19,7 @@ from robotdiffuse.robots.allowed_collisions import (
 )
 from robotdiffuse.robots.refusals import Refusals
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
-from robotdiffuse.transforms import transform
+from robotdiffuse.transforms import inverse, transform
 
 QUICK = SamplingSettings(samples=1500)
 
@@ -140,6 +141,20 @@ def test_share_of_collisions_by_hand() -> None:
     )
     # the cubes overlap up to joint 2 = 0.05, of 0.02 to 1; the spheres, which do not count, up to 0.1234
     assert pair.colliding == pytest.approx(0.03 / 0.98, abs=0.015)
+
+
+def test_links_stand_to_each_other_as_seen_from_the_base() -> None:
+    """Poses of some links alone begin where the ways to them part."""
+    robot = load_robot("panda")
+    links = Links(robot)
+    q = links.random(3, np.random.default_rng(0))
+    poses = links.poses(q)
+    names = list(robot.meshes)
+    for a, b in zip(names, names[1:] + names[:1], strict=True):
+        some = links.poses(q, frozenset((a, b)))
+        for i in range(3):
+            expected = inverse(poses[a][i]) @ poses[b][i]
+            np.testing.assert_allclose(inverse(some[a][i]) @ some[b][i], expected, atol=1e-12)
 
 
 def test_same_seed_same_pairs() -> None:

@@ -78,6 +78,18 @@ def test_a_frame_stays_open() -> None:
     assert beyond(parts, np.array([[0.2, 0.05, 0.2]]))[0] > 0.1
 
 
+def test_parts_stick_out_little_about_tight_places() -> None:
+    """A wide hole is filled where that is allowed, but not beside the place where something passes."""
+    coarse = PartSettings(concavity=0.2)
+    tight = np.array([[0.06, 0.05, 0.06]])
+    whole = convex_parts((surface(FRAME),), coarse)
+    parts = convex_parts((surface(FRAME),), coarse, tight)
+    assert len(whole) == 1 < len(parts)
+    assert beyond(whole, tight)[0] < 0 < beyond(parts, tight + 0.01)[0]
+    points = trimesh.sample.sample_surface(FRAME, 5000, seed=1)[0]
+    assert beyond(parts, np.asarray(points)).max() < 1e-6
+
+
 def test_holes_that_are_closed_count_as_solid() -> None:
     ball = trimesh.creation.icosphere(3, 0.1)
     inner = trimesh.creation.icosphere(3, 0.08)

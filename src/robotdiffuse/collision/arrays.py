@@ -15,6 +15,7 @@ from robotdiffuse.collision.kernels.simd import W, by_sixteen
 from robotdiffuse.collision.near_pairs import no_tables, tabulate
 from robotdiffuse.collision.points import EMPTY, PointGrid, build_grid, cover, thin
 from robotdiffuse.deadline import check_time
+from robotdiffuse.robots.joint_tables import JointTable
 from robotdiffuse.robots.lever_arms import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
@@ -128,8 +129,20 @@ def compile_robot(robot: Robot) -> RobotArrays:
         return arrays
     rows = [link for link in robot.link_names if link in robot.spheres]
     levers = motion_radii(robot)[[rows.index(link) for link in groups]]
-    found, near = tabulate(arrays, robot.lower, robot.upper, levers)
+    found, near = tabulate(arrays, robot.lower, robot.upper, levers, _known_tables(robot, pairs, groups))
     return arrays._replace(pairs=found, near=near)
+
+
+def _known_tables(
+    robot: Robot, pairs: list[tuple[int, int]], groups: tuple[str, ...]
+) -> dict[int, JointTable]:
+    """The robot's tables by the number of their pair, of pairs that still have those joints between them."""
+    number = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}
+    return {
+        number[frozenset(table.links)]: table
+        for table in robot.tables
+        if frozenset(table.links) in number and {*table.joints} <= {*robot.joint_names}
+    }
 
 
 class _Group(NamedTuple):

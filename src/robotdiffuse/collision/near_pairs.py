@@ -2,9 +2,11 @@
 
 How two links stand to each other depends only on the joints between them. For pairs with one or two of those,
 whose bounding spheres overlap almost always (forearm and hand), a table over the two joints says where they
-may touch at all: one look-up in place of hundreds of distances.
+may touch at all: one look-up in place of hundreds of distances. By spheres, or by the convex parts where the
+robot brings such a table (`robots/close_pairs.py`).
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.lane_clearance import pair_clearances
 from robotdiffuse.collision.kernels.lanes import HEAD, SIDE
+from robotdiffuse.robots.joint_tables import JointTable
 
 CELLS = SIDE - 2
 """Cells along each joint's range; around them is a ring that stands for values beyond it."""
@@ -32,12 +35,14 @@ def tabulate(
     lower: Float[ndarray, "dof"],
     upper: Float[ndarray, "dof"],
     levers: Float[ndarray, "groups dof"],
+    known: Mapping[int, JointTable],
 ) -> tuple[Int32[ndarray, "pairs 4"], Float32[ndarray, "tables width"]]:
     """The robot's pairs with table and bit of those that depend on one or two joints, and the tables.
 
     A table holds the first joint, its low end and cells per unit, the same of the second joint, and the
     cells: sums of the bits of the pairs that may touch there. `arrays` are the RobotArrays without tables;
-    `levers` how far a point of each group moves at most per unit of each joint [m].
+    `levers` how far a point of each group moves at most per unit of each joint [m]; `known` are tables of
+    convex parts for some of the pairs, by number.
     """
     parents = np.arange(len(lower)) if arrays.parents is None else arrays.parents
     pairs_found, tables = arrays.pairs.copy(), [no_tables()]
@@ -62,9 +67,16 @@ def tabulate(
         q[:, joints[1]] = lower[joints[1]] + width[1] * (j + 0.5)
         limit = np.float32(2 * travel.max())
         clearance = pair_clearances(arrays._replace(pairs=arrays.pairs[pairs]), q, limit)
+        touch = (clearance < travel).reshape(CELLS, CELLS, -1)
+        for column, p in enumerate(pairs):
+            if p in known:
+                axes = joints[-len(known[p].joints) :]
+                low = lower[axes, None] + width[-len(axes) :, None] * np.arange(CELLS)
+                ends = zip(low, low + width[-len(axes) :, None], strict=True)
+                touch[..., column] &= ~known[p].throughout(*ends)
         bits = 1 << np.arange(len(pairs))
         table = np.full((SIDE, SIDE), bits.sum())
-        table[1:-1, 1:-1] = ((clearance < travel) @ bits).reshape(CELLS, CELLS)
+        table[1:-1, 1:-1] = touch @ bits
         pairs_found[pairs, 2:] = np.column_stack([np.full(len(pairs), len(tables) - 1), bits])
         head = np.column_stack([joints, lower[joints] - width, 1 / width]).ravel()
         tables.append(np.concatenate([head, table.ravel()])[None].astype(np.float32))

@@ -4,10 +4,11 @@
 # pyright: reportAttributeAccessIssue=false
 
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import coal
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.optimize import linprog
 
@@ -16,7 +17,6 @@ from robotdiffuse.robots.coal_bodies import coal_convex, coal_pose
 from robotdiffuse.robots.convex_parts import planes_of
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.robots.sphere_kernels import ball_distances, deepest_touches
-from robotdiffuse.transforms import rotation_about
 
 ADJACENT, ALWAYS, NEVER, CHECKED = "adjacent", "always", "never", "checked"
 DEFAULT, POSE, LIMITS = "default", "pose", "limits"
@@ -131,15 +131,13 @@ def allowed_pairs(reports: tuple[PairReport, ...]) -> frozenset[frozenset[str]]:
 def _descend(links: "Links", a: str, b: str, starts: Float[ndarray, "n d"], rng: np.random.Generator) -> bool:
     """Whether random descent on the distance between the meshes finds a collision of the links."""
 
-    def poses(q: Float[ndarray, "n d"]) -> dict[str, ndarray]:
-        return links.poses(q, {a, b})
-
+    wanted = frozenset((a, b))
     for start in starts:
         q, step = start, 0.1 * (links.upper - links.lower)
-        least = links.mesh_distance(poses(q[None]), a, b)
+        least = links.mesh_distance(links.poses(q[None], wanted), a, b)
         for _ in range(15):
             around = np.clip(q + step * rng.normal(size=(8, len(q))), links.lower, links.upper)
-            at = poses(around)
+            at = links.poses(around, wanted)
             distances = [links.mesh_distance(at, a, b, i) for i in range(len(around))]
             i = int(np.argmin(distances))
             if distances[i] <= 0:
@@ -200,18 +198,25 @@ class Links:
         self.joints = [j for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None]
         self.lower = np.array([joint.lower for joint in self.joints])
         self.upper = np.array([joint.upper for joint in self.joints])
-        self.hulls = {
-            link: [coal_convex(mesh.vertices, mesh.faces) for mesh in parts]
-            for link, parts in robot.meshes.items()
-        }
-        self.balls = {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in robot.meshes.items()}
-        self.inner = {
-            link: np.stack([_inner(mesh) for mesh in parts]) for link, parts in robot.meshes.items()
-        }
         self._hit: dict[tuple[str, str], tuple[int, int]] = {}
         self.distance_request, self.distance_result = coal.DistanceRequest(), coal.DistanceResult()
-        self._leading: dict[frozenset[str], list[Joint]] = {}
+        self._leading: dict[frozenset[str], tuple[str, list[Joint]]] = {}
         self.request, self.result = coal.CollisionRequest(), coal.CollisionResult()
+
+    @cached_property
+    def hulls(self) -> dict[str, list["coal.Convex"]]:
+        meshes = self.robot.meshes.items()
+        return {link: [coal_convex(mesh.vertices, mesh.faces) for mesh in parts] for link, parts in meshes}
+
+    @cached_property
+    def balls(self) -> dict[str, Float[ndarray, "parts 4"]]:
+        """Around each part."""
+        return {link: np.stack([_ball(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
+
+    @cached_property
+    def inner(self) -> dict[str, Float[ndarray, "parts 4"]]:
+        """Within each part."""
+        return {link: np.stack([_inner(mesh) for mesh in parts]) for link, parts in self.robot.meshes.items()}
 
     def random(self, count: int, rng: np.random.Generator) -> Float[ndarray, "n d"]:
         return rng.uniform(self.lower, self.upper, (count, len(self.joints)))
@@ -234,35 +239,67 @@ class Links:
         return bool(max(often[0], often[-1]) > 0.99 and left < UNCERTAIN * whole)
 
     def poses(
-        self, q: Float[ndarray, "n d"], wanted: set[str] | None = None
+        self, q: Float[ndarray, "n d"], wanted: frozenset[str] | None = None
     ) -> dict[str, Float[ndarray, "n 4 4"]]:
-        """T_base_link by link; of `wanted` links and those above them, if given."""
-        joints = self.robot.joints if wanted is None else self._above(frozenset(wanted))
-        values = {joint.name: q[:, i] for i, joint in enumerate(self.joints)}
-
-        def value(joint: Joint) -> Float[ndarray, "n"]:
-            if joint.mimic is None:
-                return values[joint.name]
-            return joint.mimic.multiplier * value(by_name[joint.mimic.joint]) + joint.mimic.offset
-
-        by_name = {joint.name: joint for joint in self.robot.joints}
-        poses = {self.robot.base: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
+        """T_base_link by link; of `wanted` links, if given, how they stand to each other: seen from any one
+        link."""
+        start, joints = (self.robot.base, self.robot.joints) if wanted is None else self._between(wanted)
+        poses = {start: np.broadcast_to(np.eye(4), (len(q), 4, 4))}
         for joint in joints:
-            T = poses[joint.parent] @ joint.T_parent_joint
-            if joint.kind in MOVING_KINDS:
-                T = T @ _motions(joint.axis, joint.kind == "prismatic", value(joint))
-            poses[joint.child] = T
+            poses[joint.child] = poses[joint.parent] @ self._motion(joint, q)
         return poses
 
-    def _above(self, links: frozenset[str]) -> list[Joint]:
-        """The joints that lead to some links."""
-        if links in self._leading:
-            return self._leading[links]
-        needed = set(links)
-        for joint in reversed(self.robot.joints):
-            if joint.child in needed:
-                needed.add(joint.parent)
-        self._leading[links] = [joint for joint in self.robot.joints if joint.child in needed]
+    def _motion(self, joint: Joint, q: Float[ndarray, "n d"]) -> Float[ndarray, "*n 4 4"]:
+        """T_parent_child for many values of all joints."""
+        if joint.kind not in MOVING_KINDS:
+            return joint.T_parent_joint
+        column, multiplier, offset, still, of_cosine, of_sine = self._moves[joint.name]
+        value = multiplier * q[:, column, None, None] + offset
+        if joint.kind == "prismatic":
+            return still + value * of_sine
+        return still + np.cos(value) * of_cosine + np.sin(value) * of_sine
+
+    @cached_property
+    def _moves(self) -> dict[str, tuple[int, float, float, ndarray, ndarray, ndarray]]:
+        """By movable joint: the column of its value or of the one that it follows, what that is multiplied by
+        and what is added; and T_parent_child at no value, and what its cosine and its sine, or a slide's
+        length, are multiplied by in it."""
+        by_name = {joint.name: joint for joint in self.robot.joints}
+        columns = {joint.name: i for i, joint in enumerate(self.joints)}
+        moves = {}
+        for joint in self.robot.joints:
+            if joint.kind not in MOVING_KINDS:
+                continue
+            leader, multiplier, offset = joint, 1.0, 0.0
+            while leader.mimic is not None:
+                offset += multiplier * leader.mimic.offset
+                multiplier *= leader.mimic.multiplier
+                leader = by_name[leader.mimic.joint]
+            still, of_cosine, of_sine = np.eye(4), np.zeros((4, 4)), np.zeros((4, 4))
+            if joint.kind == "prismatic":
+                of_sine[:3, 3] = joint.axis
+            else:
+                still[:3, :3] = np.outer(joint.axis, joint.axis)
+                of_cosine[:3, :3] = np.eye(3) - still[:3, :3]
+                of_sine[:3, :3] = np.cross(np.eye(3), joint.axis)
+            matrices = (joint.T_parent_joint @ matrix for matrix in (still, of_cosine, of_sine))
+            moves[joint.name] = (columns[leader.name], multiplier, offset, *matrices)
+        return moves
+
+    def _between(self, links: frozenset[str]) -> tuple[str, list[Joint]]:
+        """The last link that leads to all of some links, and the joints from there to them."""
+        if links not in self._leading:
+            by_child = {joint.child: joint for joint in self.robot.joints}
+            chains = []
+            for link in links:
+                chain = [link]
+                while chain[-1] in by_child:
+                    chain.append(by_child[chain[-1]].parent)
+                chains.append(chain[::-1])
+            common = [link for link, *others in zip(*chains, strict=False) if {*others} <= {link}]
+            needed = {link for chain in chains for link in chain[len(common) :]}
+            joints = [joint for joint in self.robot.joints if joint.child in needed]
+            self._leading[links] = common[-1], joints
         return self._leading[links]
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
@@ -286,6 +323,18 @@ class Links:
                 return True
         return False
 
+    def contacts(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> Float[ndarray, "n 3"]:
+        """Where convex parts of two links overlap in configuration i, a place for each two parts."""
+        T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
+        apart = ball_distances(poses[a][i], poses[b][i], self.balls[a], self.balls[b])
+        found = []
+        for m, n in zip(*np.nonzero(apart <= 0), strict=True):
+            result = coal.CollisionResult()
+            request = coal.CollisionRequest(coal.CONTACT, 1)
+            if coal.collide(self.hulls[a][m], T_a, self.hulls[b][n], T_b, request, result):
+                found.append(result.getContact(0).pos)
+        return np.reshape(found, (-1, 3))
+
     def mesh_distance(self, poses: dict[str, ndarray], a: str, b: str, i: int = 0) -> float:
         """Distance between the meshes of two links in configuration i [m]; zero or less if they collide."""
         T_a, T_b = coal_pose(poses[a][i]), coal_pose(poses[b][i])
@@ -302,16 +351,37 @@ class Links:
             least = min(least, distance)
         return float(least)
 
-
-def _motions(axis: Float[ndarray, "3"], prismatic: bool, q: Float[ndarray, "n"]) -> Float[ndarray, "n 4 4"]:
-    """T_joint_child for many values of one joint."""
-    T = np.tile(np.eye(4), (len(q), 1, 1))
-    if prismatic:
-        T[:, :3, 3] = q[:, None] * axis
-        return T
-    cross = rotation_about(axis, np.pi / 2) - np.outer(axis, axis)  # Rodrigues: [axis]x
-    T[:, :3, :3] += np.sin(q)[:, None, None] * cross + (1 - np.cos(q))[:, None, None] * (cross @ cross)
-    return T
+    def part_distances(
+        self,
+        poses: dict[str, ndarray],
+        a: str,
+        b: str,
+        rows: Int[ndarray, "n"],
+        parts: Int[ndarray, "2 n"],
+        limit: float,
+    ) -> Float[ndarray, "n"]:
+        """Distances between a part of one link and one of another, each in one of the configurations [m]; at
+        least `limit` where it is more."""
+        balls = [self.balls[link][parts[k]] for k, link in enumerate((a, b))]
+        middles = [
+            np.einsum("nij,nj->ni", poses[link][rows, :3, :3], ball[:, :3]) + poses[link][rows, :3, 3]
+            for link, ball in zip((a, b), balls, strict=True)
+        ]
+        found = np.linalg.norm(middles[0] - middles[1], axis=1) - balls[0][:, 3] - balls[1][:, 3]
+        near = np.flatnonzero(found <= limit)
+        places = {int(row): (coal_pose(poses[a][row]), coal_pose(poses[b][row])) for row in set(rows[near])}
+        for k in near:
+            T_a, T_b = places[int(rows[k])]
+            self.distance_result.clear()
+            found[k] = coal.distance(
+                self.hulls[a][parts[0, k]],
+                T_a,
+                self.hulls[b][parts[1, k]],
+                T_b,
+                self.distance_request,
+                self.distance_result,
+            )
+        return found
 
 
 def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
@@ -320,6 +390,7 @@ def _ball(mesh: ConvexMesh) -> Float[ndarray, "4"]:
     return np.append(center, np.linalg.norm(mesh.vertices - center, axis=1).max() + ROUNDING)
 
 
+@lru_cache(maxsize=1024)
 def _inner(mesh: ConvexMesh) -> Float[ndarray, "4"]:
     """Centre and radius of a largest ball within a convex mesh."""
     normals, offsets = planes_of(mesh)

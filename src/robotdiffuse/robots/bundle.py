@@ -14,6 +14,7 @@ from robotdiffuse.checks import LARGEST, unit_quaternion, within
 from robotdiffuse.errors import InputError, shortened, shown
 from robotdiffuse.reading import read_arrays, read_json
 from robotdiffuse.robots.inertias import inertia_of
+from robotdiffuse.robots.joint_tables import JointTable
 from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
 from robotdiffuse.transforms import pose_entry, rotation_from_quaternion, transform
 
@@ -118,8 +119,34 @@ def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
         "spheres": {link: np.round(spheres, 6).tolist() for link, spheres in robot.spheres.items()},
         "inertias": {link: inertia.values for link, inertia in robot.inertias.items()},
         "allowed_collisions": sorted(sorted(pair) for pair in robot.allowed_collisions),
+        **({"tables": [_table_to_json(table) for table in robot.tables]} if robot.tables else {}),
         "notes": list(robot.notes),
     }
+
+
+def _table_to_json(table: JointTable) -> dict:
+    """Cells by eight, each a bit, along the last joint."""
+    rows = np.packbits(np.atleast_2d(table.apart), axis=1)
+    return {
+        "links": list(table.links),
+        "joints": list(table.joints),
+        "lower": list(table.lower),
+        "upper": list(table.upper),
+        "apart": [row.tobytes().hex() for row in rows],
+    }
+
+
+def _table_from_json(data: dict) -> JointTable:
+    joints = tuple(map(str, data["joints"]))
+    apart = np.array([np.frombuffer(bytes.fromhex(row), np.uint8) for row in data["apart"]])
+    apart = np.unpackbits(apart, axis=1).astype(bool)
+    lower, upper = (tuple(map(float, data[end])) for end in ("lower", "upper"))
+    ends = (len(lower), len(upper), 1 if len(apart) == 1 else 2)
+    spans = [0 < high - low <= LARGEST for low, high in zip(lower, upper, strict=False)]
+    if ends != (len(joints),) * 3 or not all(spans):
+        raise ValueError("a table over one or two joints expected, lower below upper")
+    a, b = map(str, data["links"])
+    return JointTable((a, b), joints, lower, upper, apart[0] if len(joints) == 1 else apart)
 
 
 def _joint_to_json(joint: Joint) -> dict:
@@ -183,6 +210,7 @@ def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
         spheres={str(link): _array(rows, 4, f"spheres of {link}") for link, rows in data["spheres"].items()},
         meshes=meshes,
         allowed_collisions=frozenset(frozenset(map(str, pair)) for pair in data["allowed_collisions"]),
+        tables=tuple(_table_from_json(table) for table in data.get("tables", ())),
         locked={str(name): float(value) for name, value in data["locked"].items()},
         notes=tuple(map(str, data["notes"])),
         root=str(data["root"]),

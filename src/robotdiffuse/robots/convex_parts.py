@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from numba import njit
 from numpy import ndarray
 from scipy import ndimage
-from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
+from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.robots.robot import ConvexMesh
@@ -36,6 +36,11 @@ MOST_NORMALS = 1000
 """Faces of a hull whose planes are all looked at when it is simplified."""
 DEEPEST = 60
 """Times that a triangle is halved, at most."""
+TIGHT, SLOPE = 0.125, 0.3
+"""About a tight place parts may stick out by such a share of what they may elsewhere, and by so much more per
+distance from there."""
+MORE = 4
+"""About tight places a link is cut into so many times as many parts, at most."""
 GROWTH = 1e-7
 """Simplified hulls are larger by this [m]: more than rounding takes away."""
 
@@ -69,6 +74,10 @@ class PartSettings:
         lengths = ("concavity", "finest", "rounding")
         return replace(self, **{name: size * getattr(self, name) for name in lengths})
 
+    def finer(self) -> "PartSettings":
+        """With voxels of half the size."""
+        return replace(self, voxels=8 * self.voxels, finest=self.finest / 2)
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
@@ -79,20 +88,33 @@ class Surface:
 
 
 def convex_parts(
-    surfaces: tuple[Surface, ...], settings: PartSettings | None = None
+    surfaces: tuple[Surface, ...],
+    settings: PartSettings | None = None,
+    tight: Float[ndarray, "n 3"] | None = None,
 ) -> tuple[ConvexMesh, ...]:
-    """Convex meshes whose union holds the surfaces of a link and what they enclose."""
+    """Convex meshes whose union holds the surfaces of a link and what they enclose; about `tight` places they
+    stick out as little as they can."""
     settings = settings or PartSettings()
     soups = [surface.vertices[surface.faces] for surface in surfaces]
-    space = _Space.around(soups, settings)
+    space = _Space.around(soups, settings if tight is None else settings.finer())
     parts = [_Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
-    most = max(settings.most, 2 * len(parts))
+    parts = _cut(parts, space, settings, max(settings.most, 2 * len(parts)))
+    if tight is not None:
+        about, space = space.about(tight, settings.concavity)
+        parts = [replace(part, concavity=about.concavity(part.hull)) for part in parts]
+        parts = _cut(parts, about, settings, MORE * settings.most)
+    return tuple(_without_contained(_joined([part.hull for part in parts], space, settings)))
+
+
+def _cut(parts: list["_Part"], space: "_Space", settings: PartSettings, most: int) -> list["_Part"]:
+    """Parts cut in two, those that stick out furthest first."""
+    parts = list(parts)
     while len(parts) < most:
         worst = max(range(len(parts)), key=lambda i: parts[i].concavity)
         if parts[worst].concavity <= settings.concavity:
             break
         parts[worst : worst + 1] = parts[worst].halves(space, settings)
-    return tuple(_without_contained(_joined([part.hull for part in parts], space, settings)))
+    return parts
 
 
 def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
@@ -220,6 +242,17 @@ class _Space:
         found: Any = ndimage.label(~occupied)
         free = found[0] == found[0][0, 0, 0]
         return _Space(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
+
+    def about(self, tight: Float[ndarray, "n 3"], concavity: float) -> tuple["_Space", "_Space"]:
+        """With greater distances about some places, so that what sticks out there counts for more: only these
+        distances, and all."""
+        near = np.argwhere((self.distance > 0) & (self.distance < 3 * concavity))
+        far = KDTree(tight).query(self.origin + (near + 0.5) * self.pitch)[0]
+        allowed = TIGHT * concavity + SLOPE * np.maximum(far - 2 * concavity, 0.0)
+        near, allowed = near[allowed < concavity], allowed[allowed < concavity]
+        alone = np.zeros_like(self.distance)
+        alone[tuple(near.T)] = self.distance[tuple(near.T)] * concavity / allowed
+        return replace(self, distance=alone), replace(self, distance=np.maximum(alone, self.distance))
 
     def concavity(self, hull: ConvexMesh) -> float:
         """How far a hull sticks out of the solid [m], about."""

@@ -2,7 +2,8 @@
 
 It measures itself: configurations in which the true meshes are free, but parts or spheres are not, are what
 the planner will never see. Where a pair of links refuses too many of them, parts and spheres are made again,
-finer in the places where the two touch in vain.
+finer in the places where the two touch in vain; where no spheres are fine enough, a table over the joints
+between the two says where they are apart.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,6 +22,7 @@ from robotdiffuse.robots.allowed_collisions import (
     allowed_pairs,
     find_allowed_collisions,
 )
+from robotdiffuse.robots.close_pairs import joint_table, joints_between
 from robotdiffuse.robots.convex_parts import PartSettings, Surface, convex_parts
 from robotdiffuse.robots.interfaces import hidden_by_neighbours
 from robotdiffuse.robots.refusals import PairRefusals, Refusals, measure_refusals
@@ -108,12 +110,14 @@ class _Link:
     name: str
     surfaces: tuple[Surface, ...]
     parts: PartSettings
+    tight: Float[ndarray, "n 3"] | None = None
+    """Where parts may hardly stick out."""
     bounds: Bounds = field(default_factory=lambda: Bounds(0.0))
     solid: Solid | None = None
 
     def decompose(self, robot: Robot) -> Robot:
         """The robot with this link's convex parts."""
-        meshes = convex_parts(self.surfaces, self.parts)
+        meshes = convex_parts(self.surfaces, self.parts, self.tight)
         self.solid = None
         return replace(robot, meshes=robot.meshes | {self.name: meshes})
 
@@ -197,19 +201,46 @@ def _refined(
 ) -> Robot:
     """The robot with finer parts and spheres where pairs of links refuse much."""
     worst = _worst(refusals, settings.refused)
-    coarse = {name for pair in worst if pair.by_parts > settings.refused / 5 for name in pair.links}
+    close = {pair.links for pair in worst if _beyond_spheres(robot, pair, settings)}
+    coarse = {
+        name
+        for pair in worst
+        if pair.by_parts > settings.refused / 5
+        for name in pair.links
+        if pair.links not in close or len(pair.coarse[name])
+    }
     for name in sorted(coarse):
         link = links[name]
-        link.parts = replace(link.parts, concavity=link.parts.concavity * FINER, most=2 * link.parts.most)
+        places = [pair.coarse[name] for pair in worst if pair.links in close and name in pair.links]
+        tight = np.concatenate([*places, np.zeros((0, 3))])
+        if len(tight):
+            link.tight = tight if link.tight is None else np.concatenate([link.tight, tight])
+        else:
+            link.parts = replace(link.parts, concavity=link.parts.concavity * FINER, most=2 * link.parts.most)
         robot = link.decompose(robot)
-    for name in sorted({name for pair in worst for name in pair.links}):
+    again = coarse | {name for pair in worst if pair.links not in close for name in pair.links}
+    for name in sorted(again):
         link = links[name]
-        places = np.concatenate([_shared(pair, name) for pair in worst if name in pair.links])
-        places[:, 3] = np.clip(GAP_SHARE * FASTER**k * places[:, 3], settings.finest, link.bounds.tolerance)
-        known = link.bounds.tight
-        link.bounds = replace(link.bounds, tight=places if known is None else np.concatenate([known, places]))
+        tight = [_shared(pair, name) for pair in worst if name in pair.links and pair.links not in close]
+        if tight:
+            places = np.concatenate(tight)
+            gaps = GAP_SHARE * FASTER**k * places[:, 3]
+            places[:, 3] = np.clip(gaps, settings.finest, link.bounds.tolerance)
+            known = [] if link.bounds.tight is None else [link.bounds.tight]
+            link.bounds = replace(link.bounds, tight=np.concatenate([*known, places]))
         robot = link.fit(robot, settings.spheres, seed)
-    return robot
+    of_parts = Links(robot)
+    tables = {table.links: table for table in robot.tables}
+    for pair in sorted(close | {pair for pair in tables if coarse & {*pair}}):
+        tables[pair] = joint_table(robot, of_parts, pair, settings.finest / 4)
+    return replace(robot, tables=tuple(tables.values()))
+
+
+def _beyond_spheres(robot: Robot, pair: PairRefusals, settings: PreparationSettings) -> bool:
+    """Whether the finest spheres refuse a pair too much, and a table over one or two joints can tell more."""
+    narrow = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
+    hopeless = narrow * (pair.by_spheres - pair.by_parts) > settings.refused / 3
+    return bool(hopeless) and len(joints_between(robot, *pair.links)) in (1, 2)
 
 
 def _shared(pair: PairRefusals, link: str) -> Float[ndarray, "n 4"]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import coal
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.robots.allowed_collisions import Links
@@ -22,6 +22,8 @@ CUBE = 0.01
 
 MOST_PLACES = 2000
 """Configurations from which places are taken, of each pair."""
+FEW_PLACES = 60
+"""The same where convex parts are too coarse."""
 FORGIVEN = 0.003
 """Share of the configurations with the narrowest gaps that a pair may go on to refuse."""
 
@@ -37,9 +39,14 @@ class PairRefusals:
     """Share of the free configurations in which convex parts of the two collide."""
     by_spheres: float
     """The same of spheres; those that parts refuse too are among them."""
+    gaps: Float[ndarray, "configurations"]
+    """Distances of the parts where spheres alone refuse, of some of these configurations [m]."""
     places: dict[str, Float[ndarray, "n 4"]]
     """In the frame of each of the two links: where spheres touch though the parts are apart, and how far the
     parts are from each other then, at least [m]."""
+    coarse: dict[str, Float[ndarray, "m 3"]]
+    """In the frame of each of the two links: where parts overlap though the true meshes are apart, of the one
+    whose parts stick out further there."""
 
 
 @dataclass(frozen=True)
@@ -66,18 +73,22 @@ def measure_refusals(
     """
     links = Links(robot)
     q = links.random(samples, rng)
-    for column, joint in enumerate(links.joints):
+    for i, joint in enumerate(links.joints):
         if joint.name in robot.locked:
-            q[:, column] = robot.locked[joint.name]
+            q[:, i] = robot.locked[joint.name]
     poses = links.poses(q)
     trees = {
         link: tuple(coal_surface(part.vertices, part.faces) for part in parts)
         for link, parts in surfaces.items()
     }
+    tables = {frozenset(table.links): (table,) for table in robot.tables}
+    column = {joint.name: i for i, joint in enumerate(links.joints)}
     found = []
     for a, b in robot.checked_pairs():
         depth, middle = deepest_touches(poses[a], poses[b], robot.spheres[a], robot.spheres[b], 0.0, 0.0)
         spheres = depth > 0
+        for table in tables.get(frozenset((a, b)), ()):
+            spheres &= ~table.at(*(q[:, column[name]] for name in table.joints))
         parts, meshes = np.zeros(samples, dtype=bool), np.zeros(samples, dtype=bool)
         for i in np.flatnonzero(spheres):
             parts[i] = links.collide(poses, a, b, int(i))
@@ -92,6 +103,7 @@ def measure_refusals(
     for (a, b), (spheres, parts, meshes, middle) in zip(robot.checked_pairs(), found, strict=True):
         idle = np.flatnonzero(spheres & ~parts & free)[:MOST_PLACES]
         gaps = np.array([links.mesh_distance(poses, a, b, int(i)) for i in idle])
+        every = gaps
         # the narrowest few stay refused
         wide = gaps >= np.sort(gaps)[: int(samples * FORGIVEN * len(idle) / max(spheres.sum(), 1)) + 1].max(
             initial=0.0
@@ -101,8 +113,10 @@ def measure_refusals(
         at = np.einsum("nij,nj->ni", T_base_a[:, :3, :3], middle[idle]) + T_base_a[:, :3, 3]
         on_b = np.einsum("nji,nj->ni", T_base_b[:, :3, :3], at - T_base_b[:, :3, 3])
         places = {a: _one_per_cube(middle[idle], gaps), b: _one_per_cube(on_b, gaps)}
+        vain = np.flatnonzero(parts & ~meshes & free)[:FEW_PLACES]
+        coarse = _sticking_out(links, trees, poses, (a, b), vain)
         shares = (float((parts & free).sum() / count), float((spheres & free).sum() / count))
-        pairs.append(PairRefusals((a, b), float(meshes.mean()), *shares, places))
+        pairs.append(PairRefusals((a, b), float(meshes.mean()), *shares, every, places, coarse))
     by_parts = np.any([parts for _, parts, _, _ in found], axis=0)
     by_spheres = np.any([spheres for spheres, _, _, _ in found], axis=0)
     return Refusals(
@@ -111,6 +125,34 @@ def measure_refusals(
         float((by_spheres & free).sum() / count),
         tuple(sorted(pairs, key=lambda pair: -pair.by_spheres)),
     )
+
+
+def _sticking_out(
+    links: Links,
+    trees: Mapping[str, tuple["coal.BVHModelOBBRSS", ...]],
+    poses: dict[str, ndarray],
+    pair: tuple[str, str],
+    rows: Int[ndarray, "n"],
+) -> dict[str, Float[ndarray, "places 3"]]:
+    """Places where parts of two links overlap in some configurations, for the link whose true meshes are
+    further from there."""
+    found: dict[str, list[ndarray]] = {link: [] for link in pair}
+    request, point = coal.DistanceRequest(), coal.Sphere(1e-6)
+    for i in rows:
+        for at in links.contacts(poses, *pair, int(i)):
+            far = [
+                min(
+                    coal.distance(
+                        point, coal.Transform3s(np.eye(3), at), tree, place, request, coal.DistanceResult()
+                    )
+                    for tree in trees[link]
+                )
+                for link, place in ((link, coal_pose(poses[link][i])) for link in pair)
+            ]
+            link = pair[int(np.argmax(far))]
+            T = poses[link][i]
+            found[link].append((at - T[:3, 3]) @ T[:3, :3])
+    return {link: np.reshape(places, (-1, 3)) for link, places in found.items()}
 
 
 def _one_per_cube(points: Float[ndarray, "n 3"], gaps: Float[ndarray, "n"]) -> Float[ndarray, "m 4"]:

@@ -14,10 +14,10 @@ from robotdiffuse.checks import LARGEST
 from robotdiffuse.errors import InputError, unknown_name
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
 from robotdiffuse.robots.inertias import Inertia
+from robotdiffuse.robots.joint_tables import TURN, JointTable
 from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
-TURN = 2 * np.pi
 TURNS = 3 * np.pi
 """Planners turn continuous joints this far either way [rad]: they begin within half a turn, and end at most a
 turn from there. The joints themselves have no limits."""
@@ -114,6 +114,8 @@ class Robot:
     """Of the links whose URDF gives them."""
     other_tips: tuple[str, ...] = ()
     """Where further arms end whose joints are planned too."""
+    tables: tuple[JointTable, ...] = ()
+    """Where pairs of links are apart that come closer to each other than spheres tell."""
 
     @cached_property
     def link_names(self) -> tuple[str, ...]:

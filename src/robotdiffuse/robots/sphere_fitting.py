@@ -159,13 +159,18 @@ class _Cells:
         sphere within bounds can cover; a larger one where there would be more than `most`."""
         soup, vertices, left_out = [], [], False
         planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
+        boxes = [(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh in solid.meshes]
         for k, mesh in enumerate(solid.meshes):
             triangles = mesh.vertices[mesh.faces]
             size = _disc(bounds.tolerance, solid.depth) / cut
             triangles = split(triangles, size)
             hidden = np.zeros(len(triangles), dtype=bool)
-            for other in planes[:k] + planes[k + 1 :]:
-                hidden |= within(triangles.reshape(-1, 3), *other, BURIED).reshape(-1, 3).all(1)
+            low, high = triangles.min(1), triangles.max(1)
+            for other, (lowest, highest) in enumerate(boxes):
+                if other != k:
+                    asked = np.flatnonzero(((low >= lowest) & (high <= highest)).all(1) & ~hidden)
+                    corners = triangles[asked].reshape(-1, 3)
+                    hidden[asked] = within(corners, *planes[other], BURIED).reshape(-1, 3).all(1)
             triangles = triangles[~hidden]
             if bounds.varies:
                 tolerances = bounds.tolerances(triangles.mean(1))

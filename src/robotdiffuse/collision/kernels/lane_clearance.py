@@ -7,8 +7,9 @@ from numba import njit
 
 from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.lanes import W, place, place_frames
+from robotdiffuse.collision.kernels.lanes import W, open_lanes, place, place_frames
 from robotdiffuse.collision.kernels.point_grid import KEEP, points_distance, points_lower_bound
+from robotdiffuse.collision.kernels.simd import load, lowest
 
 _ZERO = np.float32(0.0)
 
@@ -273,13 +274,20 @@ def pair_clearance(robot, p, limit, work, best):
 
 @allocation_free()
 def block_pair_clearances(robot, q, limit, work, out):
-    """Distances between the links of the checked pairs, at most `limit`, of q[dof, 16]: out[pairs, 16]."""
+    """Distances between the links of the checked pairs, at most `limit`, of q[dof, 16]: out[pairs, 16].
+
+    Where spheres touch, but the pair's table says that the links are apart, nothing is known: `limit`.
+    """
     place_frames(robot, q, work.frames, work.centres)
     work.placed[:] = False
     for p in range(len(robot.pairs)):
         pair_clearance(robot, p, limit, work, work.least)
+        table, bit, known = robot.pairs[p, 2], robot.pairs[p, 3], 0
+        if table >= 0 and lowest(load(work.least, 0, 0)) <= _ZERO:
+            known = ~open_lanes(robot, table, bit, q)
         for i in range(W):
-            out[p, i] = work.least[0, i]
+            apart = work.least[0, i] <= _ZERO and known >> i & 1
+            out[p, i] = limit if apart else work.least[0, i]
 
 
 @njit(cache=True)

@@ -304,7 +304,7 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
 
 
 @allocation_free(forceinline=True)
-def _open_lanes(robot, table, bit, q):
+def open_lanes(robot, table, bit, q):
     """The lanes in which a pair may touch by its table; see `near_pairs.py`."""
     row = robot.near[table]
     first, second = load(q, np.int32(row[0]), 0), load(q, np.int32(row[3]), 0)
@@ -324,7 +324,7 @@ def _hits_itself(robot, q, hits, stop_at_first, work):
         u, v, w = load(centres, b, 0), load(centres, b, 1), load(centres, b, 2)
         near = _touching_balls(x, y, z, bounds[a, 3], u, v, w, bounds[b, 3]) & ~hits
         if table >= 0:
-            near &= _open_lanes(robot, table, bit, q)
+            near &= open_lanes(robot, table, bit, q)
         if near:
             hits |= _touching_each_other(robot, a, b, near, stop_at_first, work)
             if stop_at_first and hits:
