@@ -197,6 +197,47 @@ def test_scene_in_the_world_of_a_robot_whose_base_moves_there_is_refused(tmp_pat
     assert isinstance(shape, Sphere) and shape.center.tolist() == [1, 0, 0]
 
 
+WHEELED = """<robot name="wheeled">
+  <link name="root"/><link name="x"/><link name="y"/>
+  <link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+  <link name="arm"><collision>
+    <origin xyz="0.3 0 0"/><geometry><box size="0.4 0.05 0.05"/></geometry></collision>
+  </link>
+  {above}
+  <joint name="turn" type="revolute"><parent link="base"/><child link="arm"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" velocity="1" effort="1"/></joint>
+</robot>"""
+"""An arm on wheels; joints above its base stand for these."""
+SLIDES = "".join(
+    f'<joint name="to_{child}" type="prismatic"><parent link="{parent}"/><child link="{child}"/>'
+    f'<axis xyz="{axis}"/><limit lower="-9" upper="9" velocity="1" effort="1"/></joint>'
+    for parent, child, axis in (("root", "x", "1 0 0"), ("x", "y", "0 1 0"))
+)
+WHEELS = {
+    "three joints": SLIDES + '<joint name="yaw" type="continuous"><parent link="y"/><child link="base"/>'
+    '<axis xyz="0 0 1"/></joint>',
+    "a planar joint": '<joint name="drive" type="planar"><parent link="root"/><child link="base"/></joint>'
+    '<joint name="a" type="fixed"><parent link="base"/><child link="x"/></joint>'
+    '<joint name="b" type="fixed"><parent link="base"/><child link="y"/></joint>',
+}
+
+
+@pytest.mark.parametrize("wheels", WHEELS)
+def test_a_scene_places_what_a_mobile_base_carries(tmp_path: Path, wheels: str) -> None:
+    """Every scene of a Fetch whose URDF has joints for its wheels was refused: a joint moves its base."""
+    (tmp_path / "wheeled.urdf").write_text(WHEELED.format(above=WHEELS[wheels]))
+    robot = read_urdf(tmp_path / "wheeled.urdf", base="base")
+    assert robot.root == robot.base == "base"
+    data = scene_data(**ball(header={"frame_id": "world"})) | state("world", [0.5, 0, 0])
+    assert place(data, robot) == [0.5, 0, 0]
+
+
+def test_a_lift_is_no_mobile_base(tmp_path: Path) -> None:
+    tilted = WHEELS["three joints"].replace('"0 1 0"', '"0 0 1"')
+    (tmp_path / "wheeled.urdf").write_text(WHEELED.format(above=tilted))
+    assert read_urdf(tmp_path / "wheeled.urdf", base="base").root == "root"
+
+
 def place(data: dict[str, Any], robot: Robot | None = None) -> list[float]:
     [shape] = moveit_scene(data, moveit_frames(data, robot), Path()).shapes
     assert isinstance(shape, Sphere)

@@ -16,6 +16,7 @@ from robotdiffuse.reading import parse_xml, read_triangles
 from robotdiffuse.robots.convex_parts import Surface, convex_hull
 from robotdiffuse.robots.groups import passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.inertias import Inertia, inertia_of
+from robotdiffuse.robots.mobile_bases import moves_in_a_plane
 from robotdiffuse.robots.packages import Packages, urdf_text
 from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
 from robotdiffuse.robots.srdf import Srdf
@@ -137,7 +138,7 @@ class UrdfTree:
             joints=tuple(joints),
             meshes={link: parts for link, parts in meshes.items() if parts},
             notes=(*self.notes, *passive_notes(srdf, joints)),
-            root=self.root,
+            root=self.carried(base),
             above=self.above(base),
             poses={} if srdf is None else dict(srdf.poses),
             inertias=inertias,
@@ -219,6 +220,26 @@ class UrdfTree:
             T_link_ancestor = T_link_ancestor @ inverse(self._origin(element, f"joint {name}"))
             found[link] = T_link_ancestor
         return found
+
+    def carried(self, link: str) -> str:
+        """What a scene that places the robot places, on the way to a link: the root, or what a mobile base
+        without geometry carries, be it one joint or three."""
+        way: list[str] = []
+        end = link
+        while end in self.parents:
+            way.insert(0, self.parents[end])
+            end = self._end(way[0], self.elements[way[0]], "parent")
+        bare = [self.links[self.root].find(kind) is None for kind in ("collision", "visual")]
+        for k, name in enumerate(way, 1):
+            if not all(bare):
+                break
+            child = self._end(name, self.elements[name], "child")
+            if self.elements[name].get("type") in ("planar", "floating"):
+                return child
+            if moves_in_a_plane([self._joint(above) for above in way[:k]]):
+                return child
+            bare += [self.links[child].find(kind) is None for kind in ("collision", "visual")]
+        return self.root
 
     def _joint(self, name: str) -> Joint:
         element = self.elements[name]
