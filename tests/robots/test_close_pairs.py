@@ -100,6 +100,14 @@ def test_a_table_is_left_aside_where_one_of_its_joints_is_held() -> None:
     assert refused == 1.0 and wrong == 0
 
 
+def test_a_table_over_other_joints_is_left_aside() -> None:
+    robot = made().robot
+    (table,) = robot.tables
+    other = replace(robot, tables=(replace(table, joints=table.joints[::-1]),))
+    refused, wrong = shares(other)
+    assert refused == 1.0 and wrong == 0
+
+
 def test_joints_between_links_are_those_of_the_chain_and_all_planned() -> None:
     robot = made().robot
     assert joints_between(robot, *PAIR) == joints_between(robot, *PAIR[::-1]) == (0, 1)

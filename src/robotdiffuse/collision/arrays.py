@@ -138,11 +138,13 @@ def _known_tables(
 ) -> dict[int, JointTable]:
     """The robot's tables by the number of their pair, of pairs that still have those joints between them."""
     number = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}
-    return {
-        number[frozenset(table.links)]: table
-        for table in robot.tables
-        if frozenset(table.links) in number and {*table.joints} <= {*robot.joint_names}
-    }
+    found = {}
+    for table in robot.tables:
+        near, far = sorted(map(robot.chain, table.links), key=len)
+        between = tuple(robot.joint_names[joint] for joint in far[len(near) :])
+        if frozenset(table.links) in number and far[: len(near)] == near and between == table.joints:
+            found[number[frozenset(table.links)]] = table
+    return found
 
 
 class _Group(NamedTuple):

@@ -89,8 +89,9 @@ def _check_tree(robot: Robot) -> None:
                 raise ValueError(f"joint {name} mimics itself")
             seen.add(name)
             name = leaders[name]
-    if not {*robot.tips, *robot.meshes} <= links:
-        raise ValueError("the tip or meshes of an unknown link")
+    of_tables = {link for table in robot.tables for link in table.links}
+    if not {*robot.tips, *robot.meshes, *of_tables} <= links:
+        raise ValueError("the tip, meshes or a table of an unknown link")
     if any((rows[:, 3] <= 0).any() for rows in robot.spheres.values() if len(rows)):
         raise ValueError("spheres without a size")
 
