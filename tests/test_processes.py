@@ -1,5 +1,6 @@
 """Processes that plan for another: a new one for one that died, and none that outlives it."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from robotdiffuse.processes import LoneWorker
+from robotdiffuse.processes import LoneWorker, end
 
 ROOT = Path(__file__).parents[1]
 HELD = 60
@@ -19,6 +20,15 @@ HELD = 60
 
 def nothing() -> None:
     pass
+
+
+class AliveWhenAsked(multiprocessing.get_context("spawn").Process):
+    """It has ended, and been waited for, as soon as it said that it runs."""
+
+    def is_alive(self) -> bool:
+        alive = super().is_alive()
+        self.join()
+        return alive
 
 
 def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
@@ -39,6 +49,15 @@ def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
         worker.close()
     with pytest.raises(BrokenProcessPool, match="closed"):
         worker.call(os.getpid)
+
+
+def test_a_process_that_ends_on_its_own_meanwhile_is_no_error() -> None:
+    """`LoneWorker.close` raised ProcessLookupError where the pool's thread had waited for the process."""
+
+    process = AliveWhenAsked(target=nothing)
+    process.start()
+    end([process], signal.SIGTERM, patience=float(HELD))
+    assert process.exitcode == 0
 
 
 @pytest.mark.skipif(not hasattr(os, "O_ASYNC"), reason="the system cannot tell of a pipe that closes")

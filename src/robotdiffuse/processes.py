@@ -272,7 +272,8 @@ def end(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -
     """Send the processes a signal, and kill those that have not ended after `patience` [s]."""
     processes = [process for process in processes if process.is_alive()]
     for process in processes:
-        os.kill(process.pid or 0, by)
+        with suppress(ProcessLookupError):  # a pool's own thread may have waited for it by now
+            os.kill(process.pid or 0, by)
     until = time.monotonic() + patience
     for process in processes:
         process.join(max(until - time.monotonic(), 0.0))

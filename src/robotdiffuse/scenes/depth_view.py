@@ -57,8 +57,10 @@ class DepthView:
         if configuration is not None:
             array = numbers(configuration)
             configuration = vector("view", "configuration", configuration, 1 if array is None else array.size)
+        with np.errstate(over="ignore"):  # beyond float32 is as far as +inf
+            depth = np.ascontiguousarray(depth, np.float32)
         for key, value in {
-            "depth": np.ascontiguousarray(depth, np.float32),
+            "depth": depth,
             "intrinsics": tuple(intrinsics.tolist()),
             "T_base_camera": rigid_transform("view.T_base_camera", self.T_base_camera),
             "configuration": configuration,
