@@ -1,7 +1,7 @@
 """Quality per millisecond: first motions, lengths over time, kernel, limits, timing, collisions.
 
     python benchmarks/core.py [--problems FOLDER --lengths FILE] [--parts first,lengths,...] [--each 25]
-                              [--motions 400] [--cpu]
+                              [--motions 400] [--seed 1] [--cpu]
                               [--limits 0.01,0.05,0.1,1] [--seeds 1]
 
 Prints the report that is kept in benchmarks/results/core.txt. FOLDER holds MotionBenchMaker families (scene
@@ -271,17 +271,17 @@ def steps(a: np.ndarray, b: np.ndarray) -> int:
     return max(int(np.ceil(np.abs(b - a).max() / 0.005)), 1)
 
 
-def collisions(_cases: Sequence[Case], _known: dict, motions: int) -> None:
+def collisions(_cases: Sequence[Case], _known: dict, motions: int, seed: int) -> None:
     """Motions checked on meshes every 5 mrad by Coal and by PyBullet, half of them in scenes with thin
     things."""
     from robotdiffuse.simulation.oracle import PyBulletOracle
 
-    rng, rows = np.random.default_rng(SEED), []
+    rng, rows = np.random.default_rng(seed), []
     families = [load_family(name) for name in FAMILIES]
     for name in ("aorrtc", "robotdiffuse"):
         planner, hits, checked, looked = load_planner(name), [0, 0], 0, 0
         for i in progress(range(motions // 2), name):
-            problem = families[i % len(families)].draw(PANDA, np.random.default_rng([SEED, i])).problem(PANDA)
+            problem = families[i % len(families)].draw(PANDA, np.random.default_rng([seed, i])).problem(PANDA)
             problem = thin(problem, rng) if i % 2 else problem
             result = planner.plan(problem, 0.05, seed=i, clearance=0.0)
             if result.trajectory is None:
@@ -309,6 +309,7 @@ def main() -> None:
     parser.add_argument("--limits", default="0.01,0.05,0.1,1", help="for lengths, in s, parted by commas")
     parser.add_argument("--seeds", type=int, default=1, help="of each problem, for lengths (1)")
     parser.add_argument("--motions", type=int, default=400, help="that are checked on meshes (400)")
+    parser.add_argument("--seed", type=int, default=SEED, help=f"of the scenes of these ({SEED})")
     parser.add_argument("--cpu", action="store_true", help="limits of CPU time, where other work runs beside")
     arguments = parser.parse_args()
     known = json.loads(arguments.lengths.read_text())["length"] if arguments.lengths else {}
@@ -320,7 +321,7 @@ def main() -> None:
     for name in ("aorrtc", "robotdiffuse", "rrt_connect"):
         load_planner(name).warm_up(cases[0].problem)  # compiles
     asked = [float(limit) for limit in arguments.limits.split(",")]
-    more = {"collisions": (arguments.motions,), "lengths": (asked, arguments.seeds)}
+    more = {"collisions": (arguments.motions, arguments.seed), "lengths": (asked, arguments.seeds)}
     for part in arguments.parts.split(","):
         PARTS[part](cases, known, *more.get(part, ()))
 

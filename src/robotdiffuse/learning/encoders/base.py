@@ -12,6 +12,7 @@ from numpy import ndarray
 from numpy.random import Generator
 from torch import Tensor, nn
 
+from robotdiffuse.learning.greatest import greatest
 from robotdiffuse.problems.seen import seen_points
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.depth_view import DepthView
@@ -126,7 +127,7 @@ def pool_max(
 ) -> Float[Tensor, "batch channels"]:
     """Greatest feature over the points that count; zeros where none does."""
     low = torch.finfo(features.dtype).min
-    best = features.masked_fill(~near[..., None], low).amax(1)
+    best = greatest(features.masked_fill(~near[..., None], low))
     return best.masked_fill(~near.any(1, keepdim=True), 0.0)
 
 

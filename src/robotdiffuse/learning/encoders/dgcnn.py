@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max, pool_mean
+from robotdiffuse.learning.greatest import greatest
 from robotdiffuse.settings import Count, Sizes
 
 SLOPE = 0.2
@@ -77,8 +78,9 @@ class EdgeConvolution(nn.Module):
         index = neighbours(x, near, self.count)
         other = self.other(x)
         offset = other.shape[1] * torch.arange(len(other), device=x.device)[:, None, None]
-        joined = other.flatten(0, 1)[(index + offset)]
-        return functional.leaky_relu(self.norm(self.own(x) + joined.amax(2)), SLOPE)
+        joined = other.flatten(0, 1)[(index + offset).flatten(0, 1)]
+        most = greatest(joined).view_as(other)
+        return functional.leaky_relu(self.norm(self.own(x) + most), SLOPE)
 
 
 class DGCNN(Encoder):

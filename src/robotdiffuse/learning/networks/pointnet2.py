@@ -9,10 +9,10 @@ from typing import Any
 
 import torch
 from jaxtyping import Float, Int64
-from numpy import ndarray
 from torch import Tensor, nn
 
-from robotdiffuse.learning.networks.point_groups import greatest, group_points, put_back
+from robotdiffuse.learning.greatest import greatest
+from robotdiffuse.learning.networks.point_groups import group_points
 
 
 class _Rectified(torch.autograd.Function):
@@ -32,30 +32,6 @@ class _Rectified(torch.autograd.Function):
         return back, g.t() @ x, (g.new_ones(1, len(g)) @ g)[0]
 
 
-class _Greatest(torch.autograd.Function):
-    """The maximum over the rows of groups; PyTorch's, or its gradient, takes longer than the layers."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor) -> Tensor:
-        best, which = x.new_empty(len(x), x.shape[2]), x.new_empty(len(x), x.shape[2], dtype=torch.int16)
-        greatest(_bits(x), _bits(best), which.numpy())
-        ctx.save_for_backward(which)
-        ctx.rows = x.shape[1]
-        return best
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> Tensor:
-        (which,) = ctx.saved_tensors
-        out = gradients[0].new_empty(len(which), ctx.rows, which.shape[1])
-        put_back(_bits(gradients[0].contiguous()), which.numpy(), _bits(out))
-        return out
-
-
-def _bits(x: Tensor) -> ndarray:
-    """The same memory as integers."""
-    return x.detach().view(torch.int16 if x.dtype == torch.bfloat16 else torch.int32).numpy()
-
-
 class PooledLayers(nn.Module):
     """Linear layers with ReLUs that see each point by itself, and the maximum of a group's points."""
 
@@ -72,7 +48,7 @@ class PooledLayers(nn.Module):
             rows = _Rectified.apply(rows, weight, bias)
         # the last bias and ReLU do not change which point is the greatest
         rows = rows @ self.last.weight.to(x.dtype).t()
-        best = _Greatest.apply(rows.view(-1, x.shape[-2], self.last.out_features))
+        best = greatest(rows.view(-1, x.shape[-2], self.last.out_features))
         return (best + self.last.bias.to(x.dtype)).relu().view(*x.shape[:-2], -1)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int8
+from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 from torch import Tensor
 
@@ -98,53 +98,59 @@ class ArmDistance:
         )
         self._kinematics = kinematics
         self._frame = torch.as_tensor(groups[groups > 0], device=kinematics.device).long()
-        self._centres = torch.nn.functional.pad(spheres[:, :3], (0, 1), value=1.0)
-        self._radii = spheres[:, 3]
+        self._centres, self._radii = spheres[:, :3], spheres[:, 3]
 
     def __call__(
         self, q: Float[Tensor, "n waypoints dof"], scenes: PackedScenes
     ) -> Float[Tensor, "n waypoints spheres"]:
         """D of the paper [m], negative inside; q in [rad]. A floor counts as the plane of its top."""
-        kinds, params = scenes.kinds, scenes.params
         T = self._kinematics(q)[..., self._frame, :3, :]
-        centres = (T @ self._centres[..., None])[..., 0]
-        least = torch.full_like(centres[..., 0], FAR)
+        centres = (T[..., :3] * self._centres[:, None]).sum(-1) + T[..., 3]
+        at = centres.movedim(-1, 0).flatten(2).contiguous()
+        obstacles = _obstacles(scenes).to(at)
+        with torch.no_grad():  # the distance to the nearest has a gradient, that to the others has none
+            slot, least = _nearest(at, obstacles, scenes.kinds > 0)
+        rows = torch.arange(len(slot), device=slot.device)[:, None]
+        distance = torch.where(least < FAR, _distance(at, obstacles[:, rows, slot]), FAR)
         if scenes.floors is not None:
-            top = torch.from_numpy(scenes.floors[:, 2] + scenes.floors[:, 5] / 2).to(centres)[:, None, None]
-            there = torch.from_numpy(scenes.floors.any(1)).to(centres.device)[:, None, None]
-            least = torch.where(there, centres[..., 2] - top, least)
-        rotation = rotation_from_quaternion(
-            np.where((kinds == BOX)[..., None], params[..., 6:], [1, 0, 0, 0])
-        )
-        for j in range(kinds.shape[1]):
-            present = kinds[:, j] > 0
-            if not present.any():
-                continue
-            rows = torch.from_numpy(np.flatnonzero(present)).to(q.device)
-            part = _distance(centres[rows], kinds[present, j], params[present, j], rotation[present, j])
-            least = least.index_put((rows,), torch.minimum(least[rows], part))
-        return least - self._radii
+            top = torch.from_numpy(scenes.floors[:, 2] + scenes.floors[:, 5] / 2).to(at)[:, None]
+            there = torch.from_numpy(scenes.floors.any(1)).to(at.device)[:, None]
+            distance = torch.where(there, torch.minimum(distance, at[2] - top), distance)
+        return distance.view(centres.shape[:-1]) - self._radii
+
+
+def _obstacles(scenes: PackedScenes) -> Float[Tensor, "16 n slots"]:
+    """Centre, half of the edges, radius and rotation; a sphere is a box without size, but for its radius."""
+    box, sphere = (scenes.kinds == BOX)[..., None], (scenes.kinds == SPHERE)[..., None]
+    centre, size, wxyz = np.split(scenes.params, (3, 6), -1)
+    rotation = rotation_from_quaternion(np.where(box, wxyz, [1, 0, 0, 0])).reshape(*scenes.kinds.shape, 9)
+    parts = centre, np.where(box, size / 2, 0), np.where(sphere, size[..., :1], 0), rotation
+    return torch.from_numpy(np.moveaxis(np.concatenate(parts, -1), -1, 0))
+
+
+def _nearest(
+    at: Float[Tensor, "3 n points"], obstacles: Float[Tensor, "16 n slots"], present: Bool[ndarray, "n slots"]
+) -> tuple[Int64[Tensor, "n points"], Float[Tensor, "n points"]]:
+    """The slot of the obstacle next to each point, and its distance [m], FAR at most."""
+    least = torch.full_like(at[0], FAR)
+    slot = torch.zeros_like(least, dtype=torch.int64)
+    for j in np.flatnonzero(present.any(0)):
+        rows = torch.from_numpy(np.flatnonzero(present[:, j])).to(at.device)
+        distance, before = _distance(at[:, rows], obstacles[:, rows, j, None]), least[rows]
+        slot[rows] = torch.where(distance < before, int(j), slot[rows])
+        least[rows] = torch.minimum(distance, before)
+    return slot, least
 
 
 def _distance(
-    at: Float[Tensor, "n waypoints spheres 3"],
-    kind: Int8[ndarray, "n"],
-    row: Float32[ndarray, "n 10"],
-    rotation: Float[ndarray, "n 3 3"],
-) -> Float[Tensor, "n waypoints spheres"]:
-    """To one obstacle for each trajectory, a sphere or a box [m]."""
-
-    def tensor(array: ndarray) -> Tensor:
-        return torch.as_tensor(np.asarray(array), dtype=at.dtype, device=at.device)
-
-    local = at - tensor(row[:, None, None, :3])
-    sphere = tensor(kind == SPHERE)[:, None, None]
-    # a sphere is a box without size, but for its radius
-    half = tensor(np.where((kind == BOX)[:, None], row[:, 3:6] / 2, 0.0))[:, None, None]
-    radius = tensor(np.where(kind == SPHERE, row[:, 3], 0.0))[:, None, None]
-    outside = (local @ tensor(rotation)[:, None]).abs() - half
-    away = (outside.clamp(min=0).square().sum(-1) + EPSILON).sqrt()
-    return away + (1 - sphere) * outside.amax(-1).clamp(max=0) - radius
+    at: Float[Tensor, "3 n points"], obstacles: Float[Tensor, "16 n #points"]
+) -> Float[Tensor, "n points"]:
+    """To one obstacle each [m]."""
+    centre, half, radius, rotation = obstacles.split((3, 3, 1, 9))
+    local = ((at - centre)[:, None] * rotation.unflatten(0, (3, 3))).sum(0)
+    outside = local.abs() - half
+    away = (outside.clamp(min=0).square().sum(0) + EPSILON).sqrt()
+    return away + outside.amax(0).clamp(max=0) - radius[0]
 
 
 def hinge(distance: Float[Tensor, "*shape"], safe_distance: float) -> Float[Tensor, "*shape"]:
