@@ -2,6 +2,7 @@
 
 import gc
 import sys
+from typing import NoReturn
 
 YOUNG = 10_000
 """Objects between two looks for garbage, of which imports, half a million objects, make none."""
@@ -18,12 +19,16 @@ def main() -> int:
     except KeyboardInterrupt:
         print("robotdiffuse: stopped", file=sys.stderr)
         return 130
-    status = cli.main()
-    gc.freeze()  # the process ends: what it holds need not be looked through for garbage once more
-    return status
+    return cli.main()
+
+
+def run() -> NoReturn:
+    """`main`, and the end of the process."""
+    status = main()
+    from robotdiffuse.processes import leave
+
+    leave(status)
 
 
 if __name__ == "__main__":
-    from robotdiffuse.processes import leave
-
-    leave(main())
+    run()
