@@ -92,7 +92,7 @@ def plan_beside_unseen(
             last = problem.unseen == OCCUPIED
             if not last and (1 - RESERVED) * call.time_limit - call.elapsed < LEAST * call.time_limit:
                 break
-            beside = _beside(problem, rung, goals)
+            beside = with_rung(problem, rung, goals)
             compile_scene_for(problem.robot, beside.scene)  # no part of the rung's share of the time
             left = (1 - RESERVED) * call.time_limit - call.elapsed
             until = call.time_limit if last else call.elapsed + max(SHARE * left, LEAST * call.time_limit)
@@ -122,7 +122,7 @@ def _goals(call: Call, as_seen: Problem) -> Float[ndarray, "n dof"] | PlanResult
     return ends if isinstance(ends, PlanResult) else np.stack(ends.goals)
 
 
-def _beside(problem: Problem, rung: Rung, goals: Float[ndarray, "n dof"]) -> Problem:
+def with_rung(problem: Problem, rung: Rung, goals: Float[ndarray, "n dof"]) -> Problem:
     """The problem in the scene as seen with a rung's obstacles; of several goals, with those that need the
     least carving."""
     start, *ends = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))

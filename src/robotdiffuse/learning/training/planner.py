@@ -42,10 +42,12 @@ def train_planner(settings: PlannerTraining, out: str) -> dict[str, float]:
     `samples`. Raises as `trainee.train`, and InputError if the data or the encoder do not fit.
     """
     processes = Processes(settings.device)
-    return train(_PlannerTrainee(settings, processes), settings, out, processes)
+    return train(PlannerTrainee(settings, processes), settings, out, processes)
 
 
-class _PlannerTrainee(MotionTrainee):
+class PlannerTrainee(MotionTrainee):
+    """The diffusion model in training."""
+
     def __init__(self, settings: PlannerTraining, processes: Processes) -> None:
         robot = load_robot(settings.robot)
         torch.manual_seed(settings.seed)
@@ -65,14 +67,14 @@ class _PlannerTrainee(MotionTrainee):
         self.identity = {"robot": robot.name} | self._print("encoder_fingerprint")
         # batches are made, and validations planned, on the CPU
         self._here = on_cpu(model)
-        self._clearances = packed_clearances(robot, model.settings)
+        self.clearances = packed_clearances(robot, model.settings)
         self._loss = _Loss(model, robot, settings, processes)
 
     def loss_of(
         self, data: TrajectoryData, fraction: float, rng: np.random.Generator, held_out: bool
     ) -> Float[Tensor, ""]:
         own = self.own
-        batches = Batches(data, self._here, self._clearances, own.trivial_share, own.weight_limit)
+        batches = Batches(data, self._here, self.clearances, own.trivial_share, own.weight_limit)
         batch, dropped = batches.draw(own.batch, rng), None
         if own.condition_drop > 0 and not held_out:
             dropped = torch.from_numpy(rng.random(own.batch) < own.condition_drop)

@@ -1,0 +1,301 @@
+"""A diffusion model that is told what the completing network imagines: whether its code changes anything.
+
+    python benchmarks/conditioned_on_views.py --data FOLDER --out FOLDER [--samples 1000000] [--motions 3000]
+    python benchmarks/conditioned_on_views.py --report --out FOLDER
+
+FOLDER of data: as for encoders_on_views.py. Killed, the same command goes on with what is missing.
+
+The model of the config `compact` is trained on views of one depth camera, one of every motion: it has the
+code of the completing auto-encoder, and clearances and gradients of the scene as the planner takes it, points
+seen and voxels imagined by one of the rungs' thresholds, the ends carved free; L_collision looks at the true
+scene. So it has in training what it has in planning. Tried are batches of 16 on held-out problems that the
+straight line does not solve and a search in the true scene does, in the scene imagined by the first rung; the
+judge has the true one. The controls are the code of another problem of the family, the condition hidden, the
+clearances hidden, the weights that ship, which were trained on exact scenes, and smooth noise without a
+network. `guided`: under collision guidance by the same imagined scene.
+"""
+
+import argparse
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from encoders_on_views import BATCH, CONTROL, FAMILIES, GUIDED, STEPS, UNGUIDED, cases, view_of
+from jaxtyping import Float
+from numpy import ndarray
+from report import header, print_table, progress
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.evaluation.methods import NETWORK_ALONE, judged
+from robotdiffuse.evaluation.statistics import bootstrap_interval
+from robotdiffuse.files import JsonLines
+from robotdiffuse.learning.checkpoint import load_encoder, load_model
+from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.completion import imagine
+from robotdiffuse.learning.completion.samples import camera_view
+from robotdiffuse.learning.guidance import CollisionGuidance
+from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.training.batches import TrajectoryData
+from robotdiffuse.learning.training.config import PlannerTraining
+from robotdiffuse.learning.training.configs import planner_training
+from robotdiffuse.learning.training.planner import PlannerTrainee
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.trainee import train
+from robotdiffuse.learning.weights_at_hand import BUNDLED
+from robotdiffuse.planners.diffusion import encode
+from robotdiffuse.planners.rungs import rungs
+from robotdiffuse.planners.smooth_noise import smooth_noise
+from robotdiffuse.planners.unseen import with_rung
+from robotdiffuse.problems.held_out import goal_of, held_out_problem
+from robotdiffuse.problems.problem import IMAGINED, JointGoal, Problem
+from robotdiffuse.scenes.depth_view import DepthView, SeenPoints, UnseenPoints
+from robotdiffuse.scenes.observed_volume import observe
+from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.scenes.scene import Scene
+
+ENCODER = "completing_autoencoder"
+KEPT_ASIDE = 200
+"""Motions for validation."""
+PART = 100
+"""Motions that are prepared together, and kept in a file."""
+RETRAINED, SHIPPED = "retrained", "as it ships"
+
+
+def imagined_scene(problem: Problem, view: DepthView, goal: Float[ndarray, "dof"], rung: int) -> Scene:
+    """The scene that a rung plans with, of what the view saw of the problem's scene; the floor is known."""
+    known = Scene(problem.scene.shapes[:1])
+    seen = Problem(problem.robot, known, problem.start, problem.goal, views=[view], unseen=IMAGINED)
+    volume = observe(seen.views, seen.robot, seen.start)
+    chosen = list(rungs(seen, volume, imagine(volume)))[rung]
+    return with_rung(seen, chosen, goal[None]).scene
+
+
+@dataclass(frozen=True, eq=False)
+class ImaginedScenes(PackedScenes):
+    """Scenes with what is imagined of each."""
+
+    checkers: ndarray = field(default_factory=lambda: np.zeros(0, object))
+    """[n] CollisionChecker."""
+
+    def __getitem__(self, rows: Any) -> "ImaginedScenes":
+        of = super().__getitem__(rows)
+        return ImaginedScenes(of.kinds, of.params, of.floors, self.checkers[rows])
+
+
+class Trainee(PlannerTrainee):
+    """The diffusion model that is told of imagined scenes."""
+
+    def __init__(self, settings: PlannerTraining, folder: Path, motions: int) -> None:
+        super().__init__(settings, Processes(settings.device))
+        self.kept = self._imagined(self.kept, folder / "imagined", motions)
+        self.held_out = self._imagined(self.held_out, folder / "imagined_validation", KEPT_ASIDE)
+        self.clearances = lambda scenes, q: told(scenes, q, self.model.settings)
+
+    def success(self, rng: np.random.Generator) -> None:
+        return None
+
+    def grow(self) -> bool:
+        return False
+
+    def _imagined(self, data: TrajectoryData, folder: Path, count: int) -> TrajectoryData:
+        """So many motions, random ones, with what a view of each says."""
+        rows = np.sort(np.random.default_rng(5).permutation(len(data))[:count])
+        codes, checkers = [], np.empty(len(rows), object)
+        for i in progress(range(0, len(rows), PART), "imagined scenes"):
+            part = prepared(folder / f"{i}.npz", data, rows[i : i + PART], i, self.robot)
+            codes.append(part["codes"])
+            for k in range(len(part["codes"])):
+                scene = data.scenes.scene(int(rows[i + k]))
+                checkers[i + k] = CollisionChecker(self.robot, stored(part, k, scene))
+        scenes = data.scenes[rows]
+        imagined = ImaginedScenes(scenes.kinds, scenes.params, scenes.floors, checkers)
+        return replace(
+            data, q=data.q[rows], scenes=imagined, trivial=data.trivial[rows], codes=np.concatenate(codes)
+        )
+
+
+def told(scenes: ImaginedScenes, q: ndarray, settings: MotionModelSettings) -> ndarray:
+    parts = zip(scenes.checkers, q, strict=True)
+    return np.concatenate([link_clearances(checker, settings)(row[None]) for checker, row in parts])
+
+
+def prepared(file: Path, data: TrajectoryData, rows: ndarray, seed: int, robot: Any) -> dict[str, ndarray]:
+    """Codes and imagined obstacles of views of some motions' scenes, made once."""
+    if not file.is_file():
+        encoder, rng = load_encoder(ENCODER), np.random.default_rng([6, seed])
+        codes, points, radii, first = [], [], [], [0]
+        for row in rows.tolist():
+            start, goal = data.q[row][[0, -1]].astype(np.float64)
+            problem = Problem(robot, data.scenes.scene(row), start, JointGoal(goal[None]))
+            view = camera_view(problem.scene, robot, start, rng)
+            with torch.inference_mode():
+                codes.append(encoder.of_views([view], robot, start).float().numpy())
+            shapes = imagined_scene(problem, view, goal, int(rng.integers(4))).shapes[1:]
+            for shape in shapes:
+                assert isinstance(shape, SeenPoints | UnseenPoints)
+                points.append(shape.points)
+                radii.append(np.full(len(shape.points), shape.point_radius))
+            first.append(first[-1] + sum(len(shape.points) for shape in shapes))
+        file.parent.mkdir(parents=True, exist_ok=True)
+        half = file.with_suffix(".half.npz")
+        np.savez(
+            half,
+            codes=np.array(codes, np.float16),
+            points=np.concatenate(points).astype(np.float32),
+            radii=np.concatenate(radii).astype(np.float32),
+            first=np.array(first),
+        )
+        half.rename(file)
+    with np.load(file) as arrays:
+        return dict(arrays)
+
+
+def stored(part: dict[str, ndarray], k: int, scene: Scene) -> Scene:
+    """The imagined scene of one of them, on the same floor."""
+    own = slice(*part["first"][k : k + 2])
+    points, radii = part["points"][own], part["radii"][own]
+    clouds = [UnseenPoints(points[radii == radius], float(radius)) for radius in np.unique(radii)]
+    return Scene([*scene.shapes[:1], *clouds])
+
+
+def train_model(arguments: argparse.Namespace) -> Path:
+    out = Path(arguments.out) / "model"
+    if not (out / "model.json").is_file():
+        given = {"data": arguments.data, "samples": arguments.samples, "views": True, "turns": 0}
+        settings = planner_training("compact", given | {"encoder": ENCODER})
+        trainee = Trainee(settings, Path(arguments.out), arguments.motions)
+        train(trainee, settings, str(out), trainee.processes)
+    return out
+
+
+def batches(
+    model: MotionModel,
+    own: Float[ndarray, "code"],
+    another: Float[ndarray, "code"],
+    problem: Problem,
+    checker: CollisionChecker,
+    seed: int,
+) -> Iterator[tuple[str, Float[ndarray, "n waypoints dof"]]]:
+    """What a model makes of an imagined scene, under each control."""
+    start, goals = problem.start, goal_of(problem)[None]
+    settings = model.settings
+
+    def nothing(q: ndarray) -> ndarray:
+        told = np.zeros((*q.shape[:2], len(model.robot.links) + model.dof), np.float32)
+        told[..., : len(model.robot.links)] = settings.clearance_high
+        return told
+
+    hidden = {"guidance_scale": 0.0}
+    controls: dict[str, tuple[ndarray, Any, dict[str, float]]] = {
+        "own": (own, None, {}),
+        "another": (another, None, {}),
+        "condition hidden": (own, None, hidden),
+        "clearances hidden": (own, nothing, {}),
+        "both hidden": (own, nothing, hidden),
+    }
+    for name, (code, clearances, changes) in controls.items():
+        for ending, base in (("", UNGUIDED), (", guided", GUIDED)):
+            planner = type(base)(replace(base.settings, **changes))
+            rng = np.random.default_rng(seed)
+            yield name + ending, planner.draw(model, checker, code, start, goals, rng, clearances)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    kept = JsonLines(Path(arguments.out) / "records.jsonl")
+    done = {(row["model"], row["family"], row["number"]) for row in kept.rows}
+    models = {RETRAINED: load_model(train_model(arguments)), SHIPPED: load_model(BUNDLED / "panda")}
+    todo, views = cases(arguments), {}
+    for case in todo:
+        views[case] = view_of(*case)
+    retrained = models[RETRAINED].encoder
+    assert retrained is not None
+    codes = {}
+    with torch.inference_mode():
+        for case, problem in ((case, held_out_problem(*case)) for case in todo):
+            codes[case] = retrained.of_views([views[case]], problem.robot, problem.start).float().numpy()
+    for i, case in enumerate(progress(todo, "problems")):
+        problem = held_out_problem(*case)
+        if all((name, *case) in done for name in (*models, CONTROL)):
+            continue
+        goal = goal_of(problem)
+        imagined = imagined_scene(problem, views[case], goal, 0)
+        checker = CollisionChecker(problem.robot, imagined)
+        other = todo[(i + len(FAMILIES)) % len(todo)]
+        found: dict[str, dict[str, ndarray]] = {}
+        for name, model in models.items():
+            pair = codes[case], codes[other]
+            if name == SHIPPED:
+                there = imagined_scene(
+                    held_out_problem(*other), views[other], goal_of(held_out_problem(*other)), 0
+                )
+                rng = np.random.default_rng(0)
+                scenes = checker, CollisionChecker(problem.robot, there)
+                pair = tuple(encode(model, of, 320, rng) for of in scenes)  # type: ignore[assignment]
+            found[name] = dict(batches(model, *pair, problem, checker, case[1]))
+        rng = np.random.default_rng(case[1])
+        q = smooth_noise(problem.start, goal[None], BATCH, 48, problem.robot, rng).astype(np.float64)
+        guided = CollisionGuidance(checker, NETWORK_ALONE.guidance)(q, STEPS)[0]
+        found[CONTROL] = {"none": q, "none, guided": guided}
+        for name, tried in found.items():
+            if (name, *case) in done:
+                continue
+            passed = {told: float(judged(problem, q).passed.mean()) for told, q in tried.items()}
+            kept.append({"model": name, "family": case[0], "number": case[1], "passed": passed})
+
+
+def report(arguments: argparse.Namespace) -> None:
+    rows = JsonLines(Path(arguments.out) / "records.jsonl").rows
+    lines, free = [], dict[tuple[str, str], ndarray]()
+    for name in (RETRAINED, SHIPPED, CONTROL):
+        mine = [row for row in rows if row["model"] == name]
+        for told in mine[0]["passed"] if mine else ():
+            passed = free[name, told] = np.array([row["passed"][told] for row in mine])
+            low, high = (100 * x for x in bootstrap_interval(passed))
+            families = [
+                f"{100 * np.mean([row['passed'][told] for row in mine if row['family'] == family]):.1f}"
+                for family in FAMILIES
+            ]
+            single = f"{100 * passed.mean():.1f} ({low:.1f} to {high:.1f})"
+            lines.append((name, told, single, f"{100 * (passed > 0).mean():.1f}", *families))
+    count = len({(row["family"], row["number"]) for row in rows})
+    print(header("numpy", "torch"))
+    print_table(
+        f"{arguments.samples:,} training samples, {arguments.motions:,} motions, problems: {count}",
+        ["model", "told", "single free, % (95 %)", "best, %", *FAMILIES],
+        lines,
+    )
+    for name in (RETRAINED, SHIPPED):
+        for control in ("another", "condition hidden", "clearances hidden"):
+            for ending in ("", ", guided"):
+                apart = free[name, "own" + ending] - free[name, control + ending]
+                low, high = (100 * x for x in bootstrap_interval(apart))
+                print(
+                    f"{name}{ending}: as told less {control} {100 * apart.mean():+.1f} points "
+                    f"({low:+.1f} to {high:+.1f})"
+                )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description="A diffusion model told of imagined scenes, and its controls."
+    )
+    parser.add_argument("--data", help="data set of motions")
+    parser.add_argument("--out", required=True, help="folder for the network and records")
+    parser.add_argument("--samples", type=int, default=1_000_000, help="of the training (1,000,000)")
+    parser.add_argument("--motions", type=int, default=3000, help="that are trained on, 4 MB each (3,000)")
+    parser.add_argument("--problems", type=int, default=200, help="(200)")
+    parser.add_argument("--report", action="store_true")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    if not arguments.report:
+        if arguments.data is None:
+            parser.error("--data is needed but for --report")
+        run(arguments)
+    report(arguments)
+
+
+if __name__ == "__main__":
+    main()
