@@ -12,7 +12,7 @@ meshes. 200 problems take a robot about a minute of one core, and 11 s more for 
 
 import argparse
 import time
-from contextlib import redirect_stdout
+from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -26,6 +26,7 @@ from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.oracle import PyBulletOracle
 
 FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
@@ -68,19 +69,22 @@ def check(problem: Problem, result: PlanResult, oracle: PyBulletOracle, tally: T
     tally.by_pybullet += oracle.check_frames(dense, tolerance=0.0) is not None
 
 
+def some(family: str, robot: Robot, count: int) -> list[tuple[str, Problem]]:
+    """So many problems of a family, with their names; fewer where its furniture rarely suits the arm."""
+    rng, found = np.random.default_rng(SEED), list[tuple[str, Problem]]()
+    for _ in range(2 * count):
+        with suppress(InputError):  # no free ends in many scenes
+            problem = family_for(family, robot).draw(robot, rng).problem(robot)
+            found.append((f"{family} {len(found)}", problem))
+        if len(found) == count:
+            break
+    return found
+
+
 def tried(name: str, problems: int) -> Tally:
     robot, tally = load_robot(name), Tally()
     hybrid, search = load_planner("robotdiffuse"), load_planner("aorrtc")
-    drawn: list[tuple[str, Problem]] = []
-    for family in FAMILIES:
-        rng = np.random.default_rng(SEED)
-        try:
-            drawn += [
-                (f"{family} {k}", family_for(family, robot).draw(robot, rng).problem(robot))
-                for k in range(problems // len(FAMILIES))
-            ]
-        except InputError:  # the arm is too small for this family's furniture
-            continue
+    drawn = [problem for family in FAMILIES for problem in some(family, robot, problems // len(FAMILIES))]
     if not drawn:
         return tally
     for planner in (hybrid, search):

@@ -12,7 +12,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact import ExactCollision
 from robotdiffuse.robots.allowed_collisions import Links, SamplingSettings
 from robotdiffuse.robots.bundle import read_bundle, write_bundle
-from robotdiffuse.robots.close_pairs import joint_table, joints_between
+from robotdiffuse.robots.close_pairs import joint_table
 from robotdiffuse.robots.convex_parts import PartSettings, Surface
 from robotdiffuse.robots.joint_tables import JointTable
 from robotdiffuse.robots.preparation import PreparationSettings, Prepared, prepare
@@ -110,9 +110,9 @@ def test_a_table_over_other_joints_is_left_aside() -> None:
 
 def test_joints_between_links_are_those_of_the_chain_and_all_planned() -> None:
     robot = made().robot
-    assert joints_between(robot, *PAIR) == joints_between(robot, *PAIR[::-1]) == (0, 1)
-    assert joints_between(robot, "wrist", "flange") == (1,)
-    assert joints_between(robot.with_locked({"bend": 0.0}), *PAIR) == ()
+    assert robot.joints_between(*PAIR) == robot.joints_between(*PAIR[::-1]) == (0, 1)
+    assert robot.joints_between("wrist", "flange") == (1,)
+    assert robot.with_locked({"bend": 0.0}).joints_between(*PAIR) == ()
 
 
 @pytest.mark.parametrize("pair", [PAIR, ("wrist", "flange")])

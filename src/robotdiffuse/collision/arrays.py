@@ -140,9 +140,8 @@ def _known_tables(
     number = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}
     found = {}
     for table in robot.tables:
-        near, far = sorted(map(robot.chain, table.links), key=len)
-        between = tuple(robot.joint_names[joint] for joint in far[len(near) :])
-        if frozenset(table.links) in number and far[: len(near)] == near and between == table.joints:
+        between = tuple(robot.joint_names[joint] for joint in robot.joints_between(*table.links))
+        if frozenset(table.links) in number and between == table.joints:
             found[number[frozenset(table.links)]] = table
     return found
 

@@ -13,7 +13,7 @@ from numpy import ndarray
 from robotdiffuse.robots.allowed_collisions import Links
 from robotdiffuse.robots.joint_tables import TURN, JointTable
 from robotdiffuse.robots.lever_arms import motion_radii
-from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.robots.robot import Robot
 
 CELLS = 128
 """Of a table along each joint: a power of two."""
@@ -21,28 +21,12 @@ SLACK = 1e-5
 """More than what rounding does to a distance [m]."""
 
 
-def joints_between(robot: Robot, a: str, b: str) -> tuple[int, ...]:
-    """The joints between two links on a chain, as numbers of planned ones; none if another one moves there,
-    or a joint on each side."""
-    by_child = {joint.child: joint for joint in robot.joints}
-
-    def above(link: str) -> tuple[str, ...]:
-        if link not in by_child:
-            return ()
-        joint = by_child[link]
-        return (*above(joint.parent), *((joint.name,) if joint.kind in MOVING_KINDS else ()))
-
-    near, far = sorted((above(a), above(b)), key=len)
-    between = far[len(near) :] if far[: len(near)] == near else ()
-    return tuple(map(robot.joint_names.index, between)) if {*between} <= {*robot.joint_names} else ()
-
-
 def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float) -> JointTable:
     """Where the convex parts of two links are apart that have one or two joints between them.
 
     Cells within which they move no further than `finest` [m] are not split.
     """
-    joints = joints_between(robot, *pair)
+    joints = robot.joints_between(*pair)
     far = max(pair, key=robot.link_frame)
     with_spheres = [link for link in robot.link_names if link in robot.spheres]
     lever = motion_radii(robot)[with_spheres.index(far), list(joints)]

@@ -22,7 +22,7 @@ from robotdiffuse.robots.allowed_collisions import (
     allowed_pairs,
     find_allowed_collisions,
 )
-from robotdiffuse.robots.close_pairs import joint_table, joints_between
+from robotdiffuse.robots.close_pairs import joint_table
 from robotdiffuse.robots.convex_parts import PartSettings, Surface, convex_parts
 from robotdiffuse.robots.interfaces import hidden_by_neighbours
 from robotdiffuse.robots.refusals import PairRefusals, Refusals, measure_refusals
@@ -240,7 +240,7 @@ def _beyond_spheres(robot: Robot, pair: PairRefusals, settings: PreparationSetti
     """Whether the finest spheres refuse a pair too much, and a table over one or two joints can tell more."""
     narrow = (pair.gaps < 2 * settings.finest).mean() if len(pair.gaps) else 0.0
     hopeless = narrow * (pair.by_spheres - pair.by_parts) > settings.refused / 3
-    return bool(hopeless) and len(joints_between(robot, *pair.links)) in (1, 2)
+    return bool(hopeless) and len(robot.joints_between(*pair.links)) in (1, 2)
 
 
 def _shared(pair: PairRefusals, link: str) -> Float[ndarray, "n 4"]:

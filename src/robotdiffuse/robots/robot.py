@@ -290,6 +290,21 @@ class Robot:
         """The planned joints that move a link, from the base on."""
         return tuple(np.flatnonzero(self.moved_by[self.link_frame(link)]).tolist())
 
+    def joints_between(self, a: str, b: str) -> tuple[int, ...]:
+        """The planned joints between two links on a chain; none if another one moves there, or a joint on
+        each side."""
+        by_child = {joint.child: joint for joint in self.joints}
+
+        def above(link: str) -> tuple[str, ...]:
+            if link not in by_child:
+                return ()
+            joint = by_child[link]
+            return (*above(joint.parent), *((joint.name,) if joint.kind in MOVING_KINDS else ()))
+
+        near, far = sorted((above(a), above(b)), key=len)
+        between = far[len(near) :] if far[: len(near)] == near else ()
+        return tuple(map(self.joint_names.index, between)) if {*between} <= {*self.joint_names} else ()
+
     def link_frame(self, link: str) -> int:
         """Index of the frame that the link is fixed to: 0 for the base, j + 1 behind planned joint j."""
         return self._link(link)[0]
