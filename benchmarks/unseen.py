@@ -57,8 +57,9 @@ SEARCH = 1.0
 """CPU time of the search that says whether a problem can be solved in the true scene [s]."""
 CAMERAS = CameraPlaces(distance=(1.4, 1.8), height=(0.5, 1.4), target_spread=0.1, roll=0.0)
 SIZE = (640, 480)
-HYBRID = "imagined, hybrid"
-"""With `robotdiffuse` in place of AORRTC: its network is told of imagined obstacles as of seen ones."""
+HYBRID = "hybrid"
+"""As imagined, with `robotdiffuse` in place of AORRTC: its network is told of imagined obstacles as of seen
+ones."""
 METHODS = {
     "as seen": "optimistic",
     "occupied": "occupied",
@@ -258,7 +259,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Planning on depth views, judged in the true scene.")
     parser.add_argument("--problems", type=int, default=300, help="(300)")
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
-    parser.add_argument("--methods", nargs="+", default=[*METHODS, TRUE], help="(all)")
+    every = [*METHODS, TRUE]
+    parser.add_argument("--methods", nargs="+", default=every, choices=every, metavar="NAME", help="(all)")
     parser.add_argument("--views", type=int, default=1, help="(1)")
     parser.add_argument("--noise", action="store_true")
     parser.add_argument(
