@@ -287,6 +287,6 @@ def test_poses_are_drawn_on_as_long_as_none_is_free() -> None:
     block = rd.Box([0.65, 0.325, 0.5], [0.7, 1.35, 1.0], name="block")
     narrow = PoseGoal("panda_hand", T, [0.0, 5.0, 0.0], [0.0, 0.0, np.pi])
     problem = rd.Problem(ROBOT, rd.Scene([block]), [-1.5, 0.2, 0, -2.0, 0, 2.2, 0.2], narrow)
-    result = rd.plan(problem, time_limit=20.0)
+    result = rd.plan(problem, time_limit=60.0, seed=5)
     assert result.path is not None, result.reason
     assert link_pose(ROBOT, result.path.positions[-1], "panda_hand")[1, 3] < -0.35
