@@ -53,7 +53,6 @@ def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
 
 def test_a_process_that_ends_on_its_own_meanwhile_is_no_error() -> None:
     """`LoneWorker.close` raised ProcessLookupError where the pool's thread had waited for the process."""
-
     process = AliveWhenAsked(target=nothing)
     process.start()
     end([process], signal.SIGTERM, patience=float(HELD))

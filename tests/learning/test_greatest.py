@@ -23,5 +23,5 @@ def test_it_is_the_maximum_and_has_its_gradient(dtype: torch.dtype) -> None:
 
 
 def test_slices_of_other_arrays_are_taken_as_they_are() -> None:
-    x = torch.arange(24.0).reshape(2, 3, 4).transpose(1, 2)
+    x = torch.arange(24.0).reshape(2, 3, 4).transpose(1, 2).requires_grad_()
     assert torch.equal(greatest(x), x.amax(1))

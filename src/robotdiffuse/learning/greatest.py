@@ -1,6 +1,7 @@
 """The maximum over the points of a cloud, or of a group of them, that training on a CPU waits for the least.
 
-PyTorch's, or its gradient, takes longer than the layers before it.
+The gradient of PyTorch's takes longer than the layers before it; without a gradient PyTorch's is the faster
+one, and planning need not load compiled code for it.
 """
 
 from typing import Any
@@ -15,7 +16,7 @@ from torch import Tensor
 
 def greatest(x: Float[Tensor, "groups rows width"]) -> Float[Tensor, "groups width"]:
     """The maximum over the rows; of equal ones the first has the gradient. At most 32,767 rows."""
-    return x.amax(1) if x.is_cuda else _Greatest.apply(x.contiguous())
+    return _Greatest.apply(x.contiguous()) if x.requires_grad and not x.is_cuda else x.amax(1)
 
 
 class _Greatest(torch.autograd.Function):
