@@ -26,7 +26,6 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motion import search_space
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners import load_planner
-from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.learned import nearest_goals
 from robotdiffuse.planners.robotdiffuse import WAYPOINTS, RobotDiffuse, RobotDiffuseSettings
@@ -90,12 +89,12 @@ def batches(learned: RobotDiffuse, problem: Problem, seed: int) -> dict[str, Bat
     checker = CollisionChecker(robot, problem.scene)
     ends = Ends(checker, problem.start, problem.goal.positions)
     start, goals = ends.rows()
-    model, count, codes = learned.model(robot), learned.settings.samples, list[ndarray]()
+    model, count, codes = learned.model(robot), learned.settings.samples, list[ndarray | None]()
     assert model is not None
 
     def network() -> ndarray:
         if not codes:
-            codes.append(encode(model, checker, learned.settings.points, rng))
+            codes.append(learned.code(model, checker, rng))
         return learned.draw(model, checker, codes[0], start, goals, rng)
 
     def noise() -> ndarray:

@@ -18,24 +18,37 @@ network. `guided`: under collision guidance by the same imagined scene.
 import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from encoders_on_views import BATCH, CONTROL, FAMILIES, GUIDED, STEPS, UNGUIDED, cases, view_of
+from encoders_on_views import (
+    BATCH,
+    CONTROL,
+    FAMILIES,
+    GUIDED,
+    STEPS,
+    UNGUIDED,
+    Free,
+    cases,
+    figures,
+    print_apart,
+    view_of,
+)
 from jaxtyping import Float
 from numpy import ndarray
 from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.methods import NETWORK_ALONE, judged
-from robotdiffuse.evaluation.statistics import bootstrap_interval
-from robotdiffuse.files import JsonLines
+from robotdiffuse.evaluation.methods import NETWORK_ALONE, judged, nothing_near
+from robotdiffuse.files import JsonLines, write_atomically
 from robotdiffuse.learning.checkpoint import load_encoder, load_model
 from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.completion import imagine
 from robotdiffuse.learning.completion.samples import camera_view
+from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
 from robotdiffuse.learning.training.batches import TrajectoryData
@@ -103,9 +116,9 @@ class Trainee(PlannerTrainee):
     def _imagined(self, data: TrajectoryData, folder: Path, count: int) -> TrajectoryData:
         """So many motions, random ones, with what a view of each says."""
         rows = np.sort(np.random.default_rng(5).permutation(len(data))[:count])
-        codes, checkers = [], np.empty(len(rows), object)
+        codes, checkers, encoder = [], np.empty(len(rows), object), load_encoder(ENCODER)
         for i in progress(range(0, len(rows), PART), "imagined scenes"):
-            part = prepared(folder / f"{i}.npz", data, rows[i : i + PART], i, self.robot)
+            part = prepared(folder / f"{i}.npz", data, rows[i : i + PART], i, self.robot, encoder)
             codes.append(part["codes"])
             for k in range(len(part["codes"])):
                 scene = data.scenes.scene(int(rows[i + k]))
@@ -122,10 +135,12 @@ def told(scenes: ImaginedScenes, q: ndarray, settings: MotionModelSettings) -> n
     return np.concatenate([link_clearances(checker, settings)(row[None]) for checker, row in parts])
 
 
-def prepared(file: Path, data: TrajectoryData, rows: ndarray, seed: int, robot: Any) -> dict[str, ndarray]:
+def prepared(
+    file: Path, data: TrajectoryData, rows: ndarray, seed: int, robot: Any, encoder: Encoder
+) -> dict[str, ndarray]:
     """Codes and imagined obstacles of views of some motions' scenes, made once."""
     if not file.is_file():
-        encoder, rng = load_encoder(ENCODER), np.random.default_rng([6, seed])
+        rng = np.random.default_rng([6, seed])
         codes, points, radii, first = [], [], [], [0]
         for row in rows.tolist():
             start, goal = data.q[row][[0, -1]].astype(np.float64)
@@ -133,22 +148,21 @@ def prepared(file: Path, data: TrajectoryData, rows: ndarray, seed: int, robot: 
             view = camera_view(problem.scene, robot, start, rng)
             with torch.inference_mode():
                 codes.append(encoder.of_views([view], robot, start).float().numpy())
-            shapes = imagined_scene(problem, view, goal, int(rng.integers(4))).shapes[1:]
-            for shape in shapes:
+            first.append(first[-1])
+            for shape in imagined_scene(problem, view, goal, int(rng.integers(4))).shapes[1:]:
                 assert isinstance(shape, SeenPoints | UnseenPoints)
                 points.append(shape.points)
                 radii.append(np.full(len(shape.points), shape.point_radius))
-            first.append(first[-1] + sum(len(shape.points) for shape in shapes))
-        file.parent.mkdir(parents=True, exist_ok=True)
-        half = file.with_suffix(".half.npz")
+                first[-1] += len(shape.points)
+        content = BytesIO()
         np.savez(
-            half,
+            content,
             codes=np.array(codes, np.float16),
             points=np.concatenate(points).astype(np.float32),
             radii=np.concatenate(radii).astype(np.float32),
             first=np.array(first),
         )
-        half.rename(file)
+        write_atomically(file, content.getvalue(), make_folder=True)
     with np.load(file) as arrays:
         return dict(arrays)
 
@@ -180,25 +194,16 @@ def batches(
     seed: int,
 ) -> Iterator[tuple[str, Float[ndarray, "n waypoints dof"]]]:
     """What a model makes of an imagined scene, under each control."""
-    start, goals = problem.start, goal_of(problem)[None]
-    settings = model.settings
-
-    def nothing(q: ndarray) -> ndarray:
-        told = np.zeros((*q.shape[:2], len(model.robot.links) + model.dof), np.float32)
-        told[..., : len(model.robot.links)] = settings.clearance_high
-        return told
-
-    hidden = {"guidance_scale": 0.0}
-    controls: dict[str, tuple[ndarray, Any, dict[str, float]]] = {
-        "own": (own, None, {}),
-        "another": (another, None, {}),
-        "condition hidden": (own, None, hidden),
-        "clearances hidden": (own, nothing, {}),
-        "both hidden": (own, nothing, hidden),
+    start, goals, nothing = problem.start, goal_of(problem)[None], nothing_near(model)
+    controls = {
+        "own": (own, None),
+        "another": (another, None),
+        "condition hidden": (None, None),
+        "clearances hidden": (own, nothing),
+        "both hidden": (None, nothing),
     }
-    for name, (code, clearances, changes) in controls.items():
-        for ending, base in (("", UNGUIDED), (", guided", GUIDED)):
-            planner = type(base)(replace(base.settings, **changes))
+    for name, (code, clearances) in controls.items():
+        for ending, planner in (("", UNGUIDED), (", guided", GUIDED)):
             rng = np.random.default_rng(seed)
             yield name + ending, planner.draw(model, checker, code, start, goals, rng, clearances)
 
@@ -207,33 +212,26 @@ def run(arguments: argparse.Namespace) -> None:
     kept = JsonLines(Path(arguments.out) / "records.jsonl")
     done = {(row["model"], row["family"], row["number"]) for row in kept.rows}
     models = {RETRAINED: load_model(train_model(arguments)), SHIPPED: load_model(BUNDLED / "panda")}
-    todo, views = cases(arguments), {}
-    for case in todo:
-        views[case] = view_of(*case)
-    retrained = models[RETRAINED].encoder
-    assert retrained is not None
-    codes = {}
-    with torch.inference_mode():
-        for case, problem in ((case, held_out_problem(*case)) for case in todo):
-            codes[case] = retrained.of_views([views[case]], problem.robot, problem.start).float().numpy()
+    encoder, todo = models[RETRAINED].encoder, cases(arguments)
+    assert encoder is not None
+    codes: dict[str, list[ndarray]] = {name: [] for name in models}
+    checkers = list[CollisionChecker]()
+    for case in progress(todo, "imagined scenes"):
+        problem, view = held_out_problem(*case), view_of(*case)
+        imagined = imagined_scene(problem, view, goal_of(problem), 0)
+        checkers.append(CollisionChecker(problem.robot, imagined))
+        with torch.inference_mode():
+            codes[RETRAINED].append(encoder.of_views([view], problem.robot, problem.start).float().numpy())
+        points = UNGUIDED.settings.points
+        codes[SHIPPED].append(encode(models[SHIPPED], checkers[-1], points, np.random.default_rng(0)))
     for i, case in enumerate(progress(todo, "problems")):
-        problem = held_out_problem(*case)
         if all((name, *case) in done for name in (*models, CONTROL)):
             continue
+        problem, checker, other = held_out_problem(*case), checkers[i], (i + len(FAMILIES)) % len(todo)
         goal = goal_of(problem)
-        imagined = imagined_scene(problem, views[case], goal, 0)
-        checker = CollisionChecker(problem.robot, imagined)
-        other = todo[(i + len(FAMILIES)) % len(todo)]
         found: dict[str, dict[str, ndarray]] = {}
         for name, model in models.items():
-            pair = codes[case], codes[other]
-            if name == SHIPPED:
-                there = imagined_scene(
-                    held_out_problem(*other), views[other], goal_of(held_out_problem(*other)), 0
-                )
-                rng = np.random.default_rng(0)
-                scenes = checker, CollisionChecker(problem.robot, there)
-                pair = tuple(encode(model, of, 320, rng) for of in scenes)  # type: ignore[assignment]
+            pair = codes[name][i], codes[name][other]
             found[name] = dict(batches(model, *pair, problem, checker, case[1]))
         rng = np.random.default_rng(case[1])
         q = smooth_noise(problem.start, goal[None], BATCH, 48, problem.robot, rng).astype(np.float64)
@@ -247,35 +245,23 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def report(arguments: argparse.Namespace) -> None:
-    rows = JsonLines(Path(arguments.out) / "records.jsonl").rows
-    lines, free = [], dict[tuple[str, str], ndarray]()
-    for name in (RETRAINED, SHIPPED, CONTROL):
-        mine = [row for row in rows if row["model"] == name]
-        for told in mine[0]["passed"] if mine else ():
-            passed = free[name, told] = np.array([row["passed"][told] for row in mine])
-            low, high = (100 * x for x in bootstrap_interval(passed))
-            families = [
-                f"{100 * np.mean([row['passed'][told] for row in mine if row['family'] == family]):.1f}"
-                for family in FAMILIES
-            ]
-            single = f"{100 * passed.mean():.1f} ({low:.1f} to {high:.1f})"
-            lines.append((name, told, single, f"{100 * (passed > 0).mean():.1f}", *families))
-    count = len({(row["family"], row["number"]) for row in rows})
+    free = dict[tuple[str, str], Free]()
+    for row in JsonLines(Path(arguments.out) / "records.jsonl").rows:
+        for told, passed in row["passed"].items():
+            free.setdefault((row["model"], told), {})[row["family"], row["number"]] = [passed]
+    of = sorted(free, key=lambda of: [RETRAINED, SHIPPED, CONTROL].index(of[0]))
+    count = len(free[of[0]])
     print(header("numpy", "torch"))
     print_table(
         f"{arguments.samples:,} training samples, {arguments.motions:,} motions, problems: {count}",
         ["model", "told", "single free, % (95 %)", "best, %", *FAMILIES],
-        lines,
+        [(*name, *figures(free[name])) for name in of],
     )
     for name in (RETRAINED, SHIPPED):
         for control in ("another", "condition hidden", "clearances hidden"):
             for ending in ("", ", guided"):
-                apart = free[name, "own" + ending] - free[name, control + ending]
-                low, high = (100 * x for x in bootstrap_interval(apart))
-                print(
-                    f"{name}{ending}: as told less {control} {100 * apart.mean():+.1f} points "
-                    f"({low:+.1f} to {high:+.1f})"
-                )
+                what = f"{name}{ending}: as told less {control}"
+                print_apart(what, free[name, "own" + ending], free[name, control + ending])
 
 
 def main() -> None:

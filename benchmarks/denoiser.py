@@ -33,7 +33,8 @@ from robotdiffuse.learning import motion_model
 from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, encode
+from robotdiffuse.planners.diffusion import encode
+from robotdiffuse.planners.robotdiffuse import RobotDiffuse
 from robotdiffuse.problems.problem import Problem
 
 SAMPLES = 16

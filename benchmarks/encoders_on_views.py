@@ -168,43 +168,47 @@ def run(arguments: argparse.Namespace) -> None:
                     keep(row, seed, code, case, float(verdict.passed.mean()), float(verdict.hit.mean()))
 
 
+Free = dict[tuple[str, int], list[float]]
+"""Family and number of each problem: the share of free samples of each training."""
+
+
+def figures(free: Free) -> tuple[str, ...]:
+    """Single samples with their interval, problems with a free one, and single samples of each family [%]."""
+    single = np.array([np.mean(shares) for shares in free.values()])
+    low, high = (100 * x for x in bootstrap_interval(single))
+    best = 100 * np.mean([share > 0 for shares in free.values() for share in shares])
+    of = [[shares for case, shares in free.items() if case[0] == family] for family in FAMILIES]
+    families = (f"{100 * np.mean(shares):.1f}" if shares else "–" for shares in of)
+    return (f"{100 * single.mean():.1f} ({low:.1f} to {high:.1f})", f"{best:.1f}", *families)
+
+
+def print_apart(what: str, free: Free, control: Free) -> None:
+    """By how much the same problems differ."""
+    apart = np.array([np.mean(shares) - np.mean(control[case]) for case, shares in free.items()])
+    low, high = (100 * x for x in bootstrap_interval(apart))
+    print(f"{what} {100 * apart.mean():+.1f} points ({low:+.1f} to {high:+.1f})")
+
+
 def report(out: str) -> None:
     rows = JsonLines(Path(out) / "records.jsonl").rows
-    sizes = sorted({row["samples"] for row in rows})
+    sizes = ", ".join(f"{size:,}" for size in sorted({row["samples"] for row in rows}))
     seeds = len({row["seed"] for row in rows})
-    count = len({(row["family"], row["number"]) for row in rows})
-    lines = []
-    for name in (*ROWS, CONTROL):
-        for code in dict.fromkeys(row["code"] for row in rows if row["row"] == name):
-            mine = [row for row in rows if (row["row"], row["code"]) == (name, code)]
-            by_case: dict[tuple[str, int], list[Any]] = {}
-            for row in mine:
-                by_case.setdefault((row["family"], row["number"]), []).append(row)
-            free = np.array([np.mean([row["passed"] for row in found]) for found in by_case.values()])
-            best = np.mean([row["passed"] > 0 for row in mine])
-            low, high = (100 * x for x in bootstrap_interval(free))
-            families = [
-                f"{100 * np.mean([row['passed'] for row in mine if row['family'] == family]):.1f}"
-                for family in FAMILIES
-            ]
-            single = f"{100 * free.mean():.1f} ({low:.1f} to {high:.1f})"
-            collided = f"{100 * np.mean([row['collided'] for row in mine]):.1f}"
-            lines.append((name, code, single, f"{100 * best:.1f}", collided, *families))
-    size = ", ".join(f"{size:,}" for size in sizes)
+    free = dict[tuple[str, str], Free]()
+    collided = dict[tuple[str, str], list[float]]()
+    for row in rows:
+        of = row["row"], row["code"]
+        free.setdefault(of, {}).setdefault((row["family"], row["number"]), []).append(row["passed"])
+        collided.setdefault(of, []).append(row["collided"])
+    of = sorted(free, key=lambda of: [*ROWS, CONTROL].index(of[0]))
     print(header("numpy", "torch"))
     print_table(
-        f"{size} training samples a row, seeds: {seeds}, problems: {count}",
-        ["encoder", "code", "single free, % (95 %)", "best, %", "collided, %", *FAMILIES],
-        lines,
+        f"{sizes} training samples a row, seeds: {seeds}, problems: {len(free[of[0]])}",
+        ["encoder", "code", "single free, % (95 %)", "best, %", *FAMILIES, "collided, %"],
+        [(*name, *figures(free[name]), f"{100 * np.mean(collided[name]):.1f}") for name in of],
     )
-    for name in ROWS:
-        free = {
-            code: np.array([r["passed"] for r in rows if (r["row"], r["code"]) == (name, code)])
-            for code in ("own", "another")
-        }
-        apart = free["own"] - free["another"]
-        low, high = (100 * x for x in bootstrap_interval(apart))
-        print(f"{name}: own less another {100 * apart.mean():+.1f} points ({low:+.1f} to {high:+.1f})")
+    for name in dict.fromkeys(row for row, _ in of if row != CONTROL):
+        for control in ("another", "mean"):
+            print_apart(f"{name}: own code less {control}", free[name, "own"], free[name, control])
 
 
 def main() -> None:

@@ -58,9 +58,10 @@ def try_all(loaded: RobotDiffuse, cases: list[Case], settings: Sequence[Setting]
     """One batch for each problem; the same random numbers for all settings."""
     methods = {}
     for gradient, scale, steps in settings:
-        changed = {"guidance_steps": gradient, "guidance_scale": scale, "sampling_steps": steps}
+        changed = {"guidance_steps": gradient, "sampling_steps": steps}
         planner = RobotDiffuse(replace(loaded.settings, **changed))
-        methods[name_of((gradient, scale, steps))] = sampled(from_network(planner))
+        drawn = from_network(planner, guidance_scale=scale)
+        methods[name_of((gradient, scale, steps))] = sampled(drawn)
     found = tried(cases, methods, seeds=(5,), title=title)
     show(summary(f"{title}, {len(cases)} problems", found, (SINGLE, BEST, CPU)), width=WIDTH)
     return {setting: found[name_of(setting)] for setting in settings}

@@ -1,15 +1,17 @@
 """The network alone, refinement and its control, the whole planner: on held-out problems of each family.
 
     python benchmarks/network.py [--families rop,shelf] [--problems 500] [--cases FOLDER] [--weights FOLDER]
-        [--parts a,b,c]
+        [--parts a,b,c,d]
 
 Prints the report that is kept in benchmarks/results/network.txt; FOLDER as in problems.py. Problems are not
 trivial (the straight line does not solve them) and ten seconds of search do solve them. Everything that is
 called solved passed the judge; motions of the whole planner are confirmed by PyBullet on meshes.
 
 What the network is told of the obstacles is the code z of their point cloud, and the clearances of the links
-along the noisy motion. Each is taken away in rows of its own: the code of another scene in place of z, and
-clearances as if there were no obstacles. Guidance, where there is some, knows the obstacles in any case.
+along the noisy motion. Each is taken away in rows of its own: in place of z the code of another scene of the
+family, or its whole condition hidden, of z, start and goal (the ends it finds in the noisy motion too), and
+clearances as if there were no obstacles. Guidance, where there is some, knows the obstacles in any case. Part
+d is the whole planner, which ships without the code, beside itself with it, two seeds of half a second.
 """
 
 import argparse
@@ -19,24 +21,31 @@ from dataclasses import replace
 from pathlib import Path as File
 
 import numpy as np
-from report import WIDTH, header
+from jaxtyping import Float
+from numpy import ndarray
+from report import WIDTH, header, print_table
 from searches import bumps, network, search
 
 from problems import PANDA, SEARCH_TIME, Case, Drawn, draw_cases, families_of
+from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     Draw,
     fields_of,
     from_network,
     measure_of,
+    planned,
     sampled,
     searched,
     without_network,
 )
 from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, SOLVED, summary
 from robotdiffuse.evaluation.tables import show
 from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial, tried
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import Problem
@@ -45,6 +54,8 @@ from robotdiffuse.types import Path
 
 TIME_LIMIT = 5.0
 """Of the whole planner [s]."""
+EQUAL_TIME = 0.5
+"""In which the whole planner is compared with itself told more [s]."""
 
 
 def alone(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
@@ -64,6 +75,8 @@ def alone(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
             f"{name}, clearances hidden": from_network(of, hidden=True),
             f"{name}, both": from_network(of, other, hidden=True),
         }
+        if model.settings.null_condition:
+            found[f"{name}, condition hidden"] = from_network(of, guidance_scale=0.0)
     control = without_network(planner.settings, model.settings.waypoints)
     return found | {"control: guidance of line and bumps": control}
 
@@ -82,6 +95,45 @@ def confirmed(planner: RobotDiffuse) -> Method:
         yield fields_of(result, measure_of(PANDA)) | {"cpu": clock.cpu, "refuted": float(hit)}
 
     return call
+
+
+class Told(RobotDiffuse):
+    """With the code of the scene."""
+
+    def code(
+        self, model: MotionModel, checker: CollisionChecker, rng: np.random.Generator
+    ) -> Float[ndarray, "code"]:
+        return encode(model, checker, self.settings.points, rng)
+
+
+def equal_time(every: dict[str, list[Case]], settings: RobotDiffuseSettings) -> None:
+    planners = {"as it ships": RobotDiffuse(settings), "with the code": Told(settings)}
+    for planner in planners.values():
+        planner.warm_up(next(iter(every.values()))[0].problem)  # loads the network
+    methods = {name: planned(planner, until="limit", clearance=0.0) for name, planner in planners.items()}
+    rows, ratios = [], dict[str, ndarray]()
+    own = {name: list[bool]() for name in planners}
+    for family, cases in every.items():
+        found = tried(cases, methods, seeds=(1, 2), limit=EQUAL_TIME, title=family)
+        lengths = []
+        for name, records in found.items():
+            own[name] += [record.stage in ("network", "refinement") for record in records if record.solved]
+            lengths.append(
+                [record.measures["joint_length"] if record.solved else np.nan for record in records]
+            )
+        shipped, told = np.array(lengths).reshape(2, len(cases), -1)
+        ratio = np.exp(np.log(told / shipped).mean(axis=1))
+        ratios[family] = ratio[~np.isnan(ratio)]
+    for family, of in [*ratios.items(), ("all", np.concatenate(list(ratios.values())))]:
+        low, high = bootstrap_interval(of)
+        rows.append((family, len(of), f"{of.mean():.5f} ({low:.5f} to {high:.5f})"))
+    shares = ", ".join(f"{name} {np.mean(of):.1%}" for name, of in own.items())
+    print_table(
+        f"(d) whole planner with the code, lengths over those without, {EQUAL_TIME:g} s",
+        ["family", "problems", "mean (95 %)"],
+        rows,
+        (f"answers that are the network's: {shares}",),
+    )
 
 
 def report(family: str, drawn: Drawn, weights: str | None, parts: str) -> None:
@@ -130,15 +182,19 @@ def main() -> None:
     parser.add_argument("--problems", type=int, default=500, help="non-trivial ones of each family (500)")
     parser.add_argument("--cases", type=File, help="folder that keeps what is known of the problems")
     parser.add_argument("--weights", help="folder of a trained model; default: the bundled one")
-    parser.add_argument("--parts", default="a,b,c", help="of the report (a,b,c)")
+    parser.add_argument("--parts", default="a,b,c,d", help="of the report (a,b,c,d)")
     arguments = parser.parse_args()
     print(header("numpy", "numba", "torch"))
     print(f"weights: {arguments.weights or 'the bundled ones'}")
     warm = draw_cases("rop", 1).hard[0].problem
     RobotDiffuse(RobotDiffuseSettings(weights=arguments.weights)).plan(warm)  # compiles
+    every = dict[str, list[Case]]()
     for family in arguments.families:
         drawn = draw_cases(family, arguments.problems, arguments.cases)
+        every[family] = drawn.hard
         report(family, drawn, arguments.weights, arguments.parts)
+    if "d" in arguments.parts:
+        equal_time(every, RobotDiffuseSettings(weights=arguments.weights))
     print(
         "\n* joint-space length against a path of `aorrtc`, mean of "
         "ratios\nsingle: share of samples that pass the judge; best: problems with one that does. Shares "

@@ -20,7 +20,6 @@ from robotdiffuse.evaluation.methods import Search
 from robotdiffuse.evaluation.trial import Trial
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.paths.simplify import shortcut
-from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.planners.ends import Ends
 from robotdiffuse.planners.robotdiffuse import RobotDiffuse, unlearned_starts
 from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
@@ -70,10 +69,10 @@ class Arena:
         space = search_space(self.checker, RESOLUTION)
         return line if motions_free(space, line).all() else None
 
-    def code(self) -> Float[ndarray, "code"]:
-        return encode(self.model, self.checker, self.planner.settings.points, self.rng)
+    def code(self) -> Float[ndarray, "code"] | None:
+        return self.planner.code(self.model, self.checker, self.rng)
 
-    def sampled(self, planner: RobotDiffuse, code: Float[ndarray, "code"]) -> Candidates:
+    def sampled(self, planner: RobotDiffuse, code: Float[ndarray, "code"] | None) -> Candidates:
         return self.told(planner.draw(self.model, self.checker, code, self.start, self.goals, self.rng))
 
     def bumps(self, number: int) -> Float[ndarray, "n waypoints dof"]:

@@ -347,9 +347,9 @@ def test_scale_of_classifier_free_guidance(monkeypatch):
         return denoise(features, level, condition)
 
     monkeypatch.setattr(model.denoiser, "forward", counted)
-    sample(model)
-    sample(model, 2.0)
-    assert batches == [3, 3, 3, 6, 6, 6]
+    for scale in (1.0, 0.0, 2.0):
+        sample(model, scale)
+    assert batches == [3, 3, 3, 3, 3, 3, 6, 6, 6]
 
 
 def test_a_model_that_always_had_its_condition_has_no_guidance_scale():

@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.box_arm import box_arm
+from helpers.small_model import small_model
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
@@ -13,7 +15,7 @@ from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.weights_at_hand import weights_for
 from robotdiffuse.planners.aorrtc.planner import AORRTCSettings
 from robotdiffuse.planners.aorrtc.search import SLICE, AnytimeSearch
-from robotdiffuse.planners.diffusion import encode
+from robotdiffuse.planners.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planners.robotdiffuse import (
     BATCH_WORK,
     RobotDiffuse,
@@ -81,6 +83,20 @@ def test_any_sampler_plans(sampler, no_search):
     planner = RobotDiffuse(RobotDiffuseSettings(sampler=sampler, guided_share=1.0, sampling_steps=8))
     result = planner.plan(PROBLEM, time_limit=10.0)
     assert result.stage == "network" and result.path is not None and verify(PROBLEM, result.path).valid
+
+
+def test_weights_that_can_do_without_the_code_are_not_told_it(planner, no_search, monkeypatch):
+    """The code of the scene made none of the hybrid's paths shorter, and took 2 ms."""
+    monkeypatch.setattr("robotdiffuse.planners.robotdiffuse.encode", None)
+    assert planner.plan(PROBLEM, time_limit=10.0).stage == "network"
+
+
+def test_weights_that_cannot_do_without_the_code_are_told_it(planner):
+    model = small_model().for_inference()
+    assert not model.settings.null_condition
+    checker = CollisionChecker(box_arm(), Scene([BALL]))
+    code = planner.code(model, checker, np.random.default_rng(0))
+    assert code.shape == (model.settings.code,) and np.isfinite(code).all()
 
 
 def test_a_free_straight_line_is_the_answer(planner):
@@ -227,12 +243,21 @@ def test_the_guidance_scale_reaches_the_network():
     assert model is not None
     code = encode(model, checker, 320, np.random.default_rng(0))
     plain, same, strong = (
-        RobotDiffuse(RobotDiffuseSettings(samples=2, guidance_steps=0, guidance_scale=scale)).draw(
-            model, checker, code, LEFT, RIGHT[None], np.random.default_rng(1)
+        RobotDiffuse(RobotDiffuseSettings(samples=2, guidance_steps=0)).draw(
+            model, checker, code, LEFT, RIGHT[None], np.random.default_rng(1), guidance_scale=scale
         )
         for scale in (1.0, 1.0, 3.0)
     )
     assert np.array_equal(plain, same) and np.abs(strong - plain).max() > 0.01
+
+
+def test_the_paper_s_planner_has_a_guidance_scale():
+    paths = [
+        Diffusion(DiffusionSettings(guidance_scale=scale)).plan(PROBLEM, time_limit=10.0).path
+        for scale in (0.0, 1.0, 3.0)
+    ]
+    assert all(path is not None and verify(PROBLEM, path).valid for path in paths)
+    assert len({path.length for path in paths if path is not None}) == 3
 
 
 def test_locked_joints_that_the_network_does_not_know_keep_the_weights():

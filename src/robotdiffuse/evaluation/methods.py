@@ -186,12 +186,16 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
 
 
 def from_network(
-    sampler: ModelSampler, seen: Callable[[Trial], Problem] | None = None, hidden: bool = False
+    sampler: ModelSampler,
+    seen: Callable[[Trial], Problem] | None = None,
+    hidden: bool = False,
+    guidance_scale: float = 1.0,
 ) -> Draw:
     """Straight from the network: no refinement, no search, no shortcuts.
 
     seen: whose obstacles are encoded, in place of the problem's own. hidden: the denoiser is told that no
-    link is anywhere near an obstacle. Guidance knows the obstacles in any case.
+    link is anywhere near an obstacle. Guidance knows the obstacles in any case. guidance_scale: see
+    `MotionModel.denoise_guided`; 0 hides the condition, the code with it.
     """
 
     def draw(trial: Trial, checker: CollisionChecker) -> ndarray:
@@ -201,7 +205,8 @@ def from_network(
         other = checker if seen is None else CollisionChecker(problem.robot, seen(trial).scene)
         code = encode(model, other, sampler.settings.points, rng)
         ends = problem.start, goal_of(problem)[None]
-        return sampler.draw(model, checker, code, *ends, rng, nothing_near(model) if hidden else None)
+        told = nothing_near(model) if hidden else None
+        return sampler.draw(model, checker, code, *ends, rng, told, guidance_scale=guidance_scale)
 
     return draw
 

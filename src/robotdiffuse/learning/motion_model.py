@@ -244,10 +244,13 @@ class MotionModel(TrajectoryRows, Network):
     ) -> Float[Tensor, "batch rows dof"]:
         """Classifier-free guidance: u + scale (c - u), of the predictions c with the condition and u without.
 
-        1 is the prediction itself, at no cost; other scales take a batch of twice the size.
+        1 is the prediction with it, 0 without it, both at no cost; other scales take a batch of twice the
+        size.
         """
         if scale == 1.0:
             return self.denoise(features, level, condition)
+        if scale == 0.0:
+            return self.denoise(features, level, condition, torch.ones_like(level, dtype=torch.bool))
         dropped = torch.arange(2 * len(level), device=level.device) >= len(level)
         twice = torch.cat([features] * 2), torch.cat([level] * 2), torch.cat([condition] * 2)
         with_it, without = self.denoise(*twice, dropped).chunk(2)
@@ -255,7 +258,7 @@ class MotionModel(TrajectoryRows, Network):
 
     def sample(
         self,
-        code: Float[ndarray, "code"],
+        code: Float[ndarray, "code"] | None,
         start: Float[ndarray, "dof"],
         goal: Float[ndarray, "dof"],
         count: int,
@@ -272,7 +275,7 @@ class MotionModel(TrajectoryRows, Network):
     ) -> Float[ndarray, "count waypoints dof"]:
         """Trajectories from start to goal [rad] (float64, the ends exact), of a model from `load_model`.
 
-        code: z of the scene, from `encode`.
+        code: z of the scene, from `encode`; None: the condition is hidden, as by a guidance_scale of 0.
         clearances: see ClearanceFn.
         steps: calls of the denoiser; None: as many as the checkpoint names.
         guide: improves the predicted clean trajectories in some of the steps (paper, section Motion Guided
@@ -301,6 +304,8 @@ class MotionModel(TrajectoryRows, Network):
                 guide=lambda q, level: guidance(q, 4, prefix=6)[0],
             )
         """
+        if code is None:
+            code, guidance_scale = np.zeros(self.settings.code, np.float32), 0.0
         if guidance_scale != 1.0 and not self.settings.null_condition:
             raise InputError(
                 f"guidance_scale is {guidance_scale}; it must be 1, for this model was trained with "

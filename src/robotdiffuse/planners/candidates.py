@@ -9,7 +9,6 @@ from numpy import ndarray
 
 from robotdiffuse.errors import InputError
 from robotdiffuse.planners.call import Call
-from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.planners.ends import usable_ends
 from robotdiffuse.planners.learned import nearest_goals
 from robotdiffuse.planners.robotdiffuse import WAYPOINTS, RobotDiffuse
@@ -52,7 +51,7 @@ def draw_candidates(problem: Problem, seed: int = 0) -> Candidates:
         q = smooth_noise(start, goals, planner.settings.samples, WAYPOINTS, problem.robot, call.rng)
         q = planner.refine(ends.checker, q)
     else:
-        code = encode(model, ends.checker, planner.settings.points, call.rng)
+        code = planner.code(model, ends.checker, call.rng)
         q = planner.draw(model, ends.checker, code, start, goals, call.rng)
     count, waypoints, dof = q.shape
     at = np.linspace(0, waypoints - 1, BETWEEN * (waypoints - 1) + 1)

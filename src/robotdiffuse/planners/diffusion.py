@@ -61,9 +61,6 @@ class SamplingSettings(LearnedSettings):
     """Gradient steps at each guided denoising step."""
     guided_share: Share = 0.5
     """Share of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
-    guidance_scale: float = 1.0
-    """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further.
-    Other than 1 needs weights that were trained with a condition_drop above 0."""
     points: Count = 320
     """Points of the cloud that the encoder sees (paper: 1,400), unless it wants clouds of its own size."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
@@ -71,6 +68,9 @@ class SamplingSettings(LearnedSettings):
 
 @dataclass(frozen=True)
 class DiffusionSettings(SamplingSettings, name="diffusion"):
+    guidance_scale: float = 1.0
+    """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further,
+    0 hides it. Other than 1 needs weights that were trained with a condition_drop above 0."""
     optimize_time: NotNegative = 0.0
     """Time in which further batches are drawn after the first that has a valid sample [s]; the shortest of
     all is the answer."""
@@ -97,16 +97,19 @@ class ModelSampler(LearnedPlanner[Own]):
         self,
         model: "MotionModel",
         checker: CollisionChecker,
-        code: Float[ndarray, "code"],
+        code: Float[ndarray, "code"] | None,
         start: Float[ndarray, "dof"],
         goals: Float[ndarray, "k dof"],
         rng: np.random.Generator,
         clearances: "ClearanceFn | None" = None,
         of_problem: Mapping[str, Cost] = MappingProxyType({}),
+        guidance_scale: float = 1.0,
     ) -> Float[ndarray, "count waypoints dof"]:
-        """A batch of samples under guidance, shared out among the nearest goals; `code` as by `encode`.
+        """A batch of samples under guidance, shared out among the nearest goals.
 
+        code: as by `encode`; None: hidden, as all of the condition, from weights that can do without it.
         clearances: what the model is told of the obstacles; None: what is true.
+        guidance_scale: of classifier-free guidance, see `MotionModel.denoise_guided`.
         of_problem: as for `CollisionGuidance`.
         """
         from robotdiffuse.learning.clearances import link_clearances
@@ -131,7 +134,7 @@ class ModelSampler(LearnedPlanner[Own]):
                 settings.sampling_steps,
                 guide if settings.guidance_steps else None,
                 settings.eta,
-                settings.guidance_scale,
+                guidance_scale,
                 settings.sampler,
                 settings.guided_share,
             )
@@ -176,7 +179,16 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         costs = {} if constraints is None else {"path_constraints": path_constraints(constraints, SHARE)}
         every, valid, until = list[Path](), list[Path](), call.time_limit
         while not every or call.elapsed < until:
-            batch = self.draw(model, ends.checker, code, start, goals, rng, of_problem=costs)
+            batch = self.draw(
+                model,
+                ends.checker,
+                code,
+                start,
+                goals,
+                rng,
+                of_problem=costs,
+                guidance_scale=self.settings.guidance_scale,
+            )
             if constraints is not None:
                 batch = [_projected(constraints, q) for q in batch]
             paths = [Path(names, ends.complete(q)) for q in batch]

@@ -14,9 +14,10 @@ shorter (the mean of 20 upright cups and of 20 lines; median: the same).
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from itertools import islice
 from pathlib import Path as FilePath
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -37,6 +38,9 @@ from robotdiffuse.planners.smooth_noise import smooth_noise
 from robotdiffuse.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.settings import Bound, Count, Natural
+
+if TYPE_CHECKING:
+    from robotdiffuse.learning.motion_model import MotionModel
 
 BATCH_WORK = 12_000
 """Iterations of search that take about as long as a batch of 16 samples in two steps, or its refinement."""
@@ -140,6 +144,13 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             batches.offer,
         )
 
+    def code(
+        self, model: "MotionModel", checker: CollisionChecker, rng: np.random.Generator
+    ) -> Float[ndarray, "code"] | None:
+        """What the network is told beside clearances: z of the scene if its weights cannot do without. Those
+        that ship can, and paths are as long with it, see benchmarks/results/network_inputs.txt."""
+        return None if model.settings.null_condition else encode(model, checker, self.settings.points, rng)
+
     def refine(
         self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]
     ) -> Float[ndarray, "count waypoints dof"]:
@@ -207,7 +218,6 @@ class _NetworkBatches(_Batches):
         self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch, weights: FilePath
     ) -> None:
         super().__init__(planner, call, ends, search)
-        self._code: Float[ndarray, "code"] | None = None
         self._weights = weights
 
     def _can(self) -> bool:
@@ -216,15 +226,22 @@ class _NetworkBatches(_Batches):
         at_hand = self._weights in self.planner.at_hand or self.call.remaining > LOAD_SECONDS
         return at_hand and super()._can()
 
+    @cached_property
+    def _model(self) -> "MotionModel":
+        model = self.planner.model(self.call.problem.robot)
+        assert model is not None  # there are weights, or these were no batches of a network
+        return model
+
+    @cached_property
+    def _code(self) -> Float[ndarray, "code"] | None:
+        return self.planner.code(self._model, self.ends.checker, self.call.rng)
+
     def _draw(self) -> None:
         planner, checker, call = self.planner, self.ends.checker, self.call
-        model = planner.model(call.problem.robot)
-        assert model is not None  # there are weights, or these were no batches of a network
+        model = self._model
         planner.at_hand.add(self._weights)
         start, goals = self.ends.rows()
         with self._timed("batch"):
-            if self._code is None:
-                self._code = encode(model, checker, planner.settings.points, call.rng)
             sampled = planner.draw(model, checker, self._code, start, goals, call.rng)
         if not self._take(sampled, "network") and self._time_for("refinement"):
             with self._timed("refinement"):
