@@ -225,21 +225,19 @@ def run(arguments: argparse.Namespace) -> None:
         points = UNGUIDED.settings.points
         codes[SHIPPED].append(encode(models[SHIPPED], checkers[-1], points, np.random.default_rng(0)))
     for i, case in enumerate(progress(todo, "problems")):
-        if all((name, *case) in done for name in (*models, CONTROL)):
-            continue
         problem, checker, other = held_out_problem(*case), checkers[i], (i + len(FAMILIES)) % len(todo)
         goal = goal_of(problem)
-        found: dict[str, dict[str, ndarray]] = {}
-        for name, model in models.items():
-            pair = codes[name][i], codes[name][other]
-            found[name] = dict(batches(model, *pair, problem, checker, case[1]))
-        rng = np.random.default_rng(case[1])
-        q = smooth_noise(problem.start, goal[None], BATCH, 48, problem.robot, rng).astype(np.float64)
-        guided = CollisionGuidance(checker, NETWORK_ALONE.guidance)(q, STEPS)[0]
-        found[CONTROL] = {"none": q, "none, guided": guided}
-        for name, tried in found.items():
+        for name in (*models, CONTROL):
             if (name, *case) in done:
                 continue
+            if name == CONTROL:
+                rng = np.random.default_rng(case[1])
+                q = smooth_noise(problem.start, goal[None], BATCH, 48, problem.robot, rng).astype(np.float64)
+                guided = CollisionGuidance(checker, NETWORK_ALONE.guidance)(q, STEPS)[0]
+                tried = {"none": q, "none, guided": guided}
+            else:
+                pair = codes[name][i], codes[name][other]
+                tried = dict(batches(models[name], *pair, problem, checker, case[1]))
             passed = {told: float(judged(problem, q).passed.mean()) for told, q in tried.items()}
             kept.append({"model": name, "family": case[0], "number": case[1], "passed": passed})
 
