@@ -2,10 +2,11 @@
 
 The straight line if it is free. Else a search for a first path, within milliseconds, then ever shorter ones;
 and, for a share of the work, batches of trajectories sampled by the diffusion model under collision guidance,
-or, where none of them is free, the same after more gradient steps (refinement). For an arm without weights
-the batches are smooth noise after as many such steps (see smooth_noise.py). What the batches propose is
-simplified by the same code as what search finds, and the shortest path of either bounds the next search.
-Everything goes through the judge, and the result names the stage that its path comes from.
+or, where none of them is free, the same after more gradient steps (refinement). Of the scene the model is
+told clearances, and no code (see `RobotDiffuse.code`). For an arm without weights the batches are smooth
+noise after as many such steps (see smooth_noise.py). What the batches propose is simplified by the same code
+as what search finds, and the shortest path of either bounds the next search. Everything goes through the
+judge, and the result names the stage that its path comes from.
 
 Under path constraints it is search alone: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
 shorter (the mean of 20 upright cups and of 20 lines; median: the same).
