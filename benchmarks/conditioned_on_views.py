@@ -238,15 +238,15 @@ def run(arguments: argparse.Namespace) -> None:
             else:
                 pair = codes[name][i], codes[name][other]
                 tried = dict(batches(models[name], *pair, problem, checker, case[1]))
-            passed = {told: float(judged(problem, q).passed.mean()) for told, q in tried.items()}
+            passed = {which: float(judged(problem, q).passed.mean()) for which, q in tried.items()}
             kept.append({"model": name, "family": case[0], "number": case[1], "passed": passed})
 
 
 def report(arguments: argparse.Namespace) -> None:
     free = dict[tuple[str, str], Free]()
     for row in JsonLines(Path(arguments.out) / "records.jsonl").rows:
-        for told, passed in row["passed"].items():
-            free.setdefault((row["model"], told), {})[row["family"], row["number"]] = [passed]
+        for which, passed in row["passed"].items():
+            free.setdefault((row["model"], which), {})[row["family"], row["number"]] = [passed]
     of = sorted(free, key=lambda of: [RETRAINED, SHIPPED, CONTROL].index(of[0]))
     count = len(free[of[0]])
     print(header("numpy", "torch"))
