@@ -96,7 +96,7 @@ def test_more_batches_after_the_first_path_make_it_no_longer() -> None:
 
 
 def test_no_valid_sample_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    def line(self, _model, _checker, _code, start, goals, _rng, of_problem):
+    def line(self, _model, _checker, _code, start, goals, _rng, **_how):
         return (start + np.linspace(0, 1, 48)[:, None] * (goals[0] - start))[None]
 
     monkeypatch.setattr(Diffusion, "draw", line)
