@@ -192,7 +192,6 @@ def print_apart(what: str, free: Free, control: Free) -> None:
 def report(out: str) -> None:
     rows = JsonLines(Path(out) / "records.jsonl").rows
     sizes = ", ".join(f"{size:,}" for size in sorted({row["samples"] for row in rows}))
-    seeds = len({row["seed"] for row in rows})
     free = dict[tuple[str, str], Free]()
     collided = dict[tuple[str, str], list[float]]()
     for row in rows:
@@ -202,9 +201,17 @@ def report(out: str) -> None:
     of = sorted(free, key=lambda of: [*ROWS, CONTROL].index(of[0]))
     print(header("numpy", "torch"))
     print_table(
-        f"{sizes} training samples a row, seeds: {seeds}, problems: {len(free[of[0]])}",
-        ["encoder", "code", "single free, % (95 %)", "best, %", *FAMILIES, "collided, %"],
-        [(*name, *figures(free[name]), f"{100 * np.mean(collided[name]):.1f}") for name in of],
+        f"{sizes} training samples a row, problems: {len(free[of[0]])}",
+        ["encoder", "code", "runs", "single free, % (95 %)", "best, %", *FAMILIES, "collided, %"],
+        [
+            (
+                *name,
+                len(collided[name]) // len(free[name]),
+                *figures(free[name]),
+                f"{100 * np.mean(collided[name]):.1f}",
+            )
+            for name in of
+        ],
     )
     for name in dict.fromkeys(row for row, _ in of if row != CONTROL):
         for control in ("another", "mean"):
