@@ -25,14 +25,13 @@ from typing import Any
 import numpy as np
 import torch
 from encoders_on_views import (
-    BATCH,
     CONTROL,
     FAMILIES,
     GUIDED,
-    STEPS,
     UNGUIDED,
     Free,
     cases,
+    control,
     figures,
     print_apart,
     view_of,
@@ -42,14 +41,13 @@ from numpy import ndarray
 from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.methods import NETWORK_ALONE, judged, nothing_near
+from robotdiffuse.evaluation.methods import judged, nothing_near
 from robotdiffuse.files import JsonLines, write_atomically
 from robotdiffuse.learning.checkpoint import load_encoder, load_model
 from robotdiffuse.learning.clearances import link_clearances
 from robotdiffuse.learning.completion import imagine
 from robotdiffuse.learning.completion.samples import camera_view
 from robotdiffuse.learning.encoders.base import Encoder
-from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.config import PlannerTraining
@@ -60,7 +58,6 @@ from robotdiffuse.learning.training.trainee import train
 from robotdiffuse.learning.weights_at_hand import BUNDLED
 from robotdiffuse.planners.diffusion import encode
 from robotdiffuse.planners.rungs import rungs
-from robotdiffuse.planners.smooth_noise import smooth_noise
 from robotdiffuse.planners.unseen import with_rung
 from robotdiffuse.problems.held_out import goal_of, held_out_problem
 from robotdiffuse.problems.problem import IMAGINED, JointGoal, Problem
@@ -226,15 +223,11 @@ def run(arguments: argparse.Namespace) -> None:
         codes[SHIPPED].append(encode(models[SHIPPED], checkers[-1], points, np.random.default_rng(0)))
     for i, case in enumerate(progress(todo, "problems")):
         problem, checker, other = held_out_problem(*case), checkers[i], (i + len(FAMILIES)) % len(todo)
-        goal = goal_of(problem)
         for name in (*models, CONTROL):
             if (name, *case) in done:
                 continue
             if name == CONTROL:
-                rng = np.random.default_rng(case[1])
-                q = smooth_noise(problem.start, goal[None], BATCH, 48, problem.robot, rng).astype(np.float64)
-                guided = CollisionGuidance(checker, NETWORK_ALONE.guidance)(q, STEPS)[0]
-                tried = {"none": q, "none, guided": guided}
+                tried = control(problem, checker, case[1])
             else:
                 pair = codes[name][i], codes[name][other]
                 tried = dict(batches(models[name], *pair, problem, checker, case[1]))
@@ -256,10 +249,10 @@ def report(arguments: argparse.Namespace) -> None:
         [(*name, *figures(free[name])) for name in of],
     )
     for name in (RETRAINED, SHIPPED):
-        for control in ("another", "condition hidden", "clearances hidden"):
+        for other in ("another", "condition hidden", "clearances hidden"):
             for ending in ("", ", guided"):
-                what = f"{name}{ending}: as told less {control}"
-                print_apart(what, free[name, "own" + ending], free[name, control + ending])
+                what = f"{name}{ending}: as told less {other}"
+                print_apart(what, free[name, "own" + ending], free[name, other + ending])
 
 
 def main() -> None:

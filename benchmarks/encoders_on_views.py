@@ -119,6 +119,13 @@ def sample(
     return planner.draw(model, checker, code, problem.start, goal_of(problem)[None], rng)
 
 
+def control(problem: Problem, checker: CollisionChecker, seed: int) -> dict[str, ndarray]:
+    """A batch of smooth noise, and the same under guidance by what the checker knows."""
+    rng, goal = np.random.default_rng(seed), goal_of(problem)
+    q = smooth_noise(problem.start, goal[None], BATCH, 48, problem.robot, rng).astype(np.float64)
+    return {"none": q, "none, guided": CollisionGuidance(checker, NETWORK_ALONE.guidance)(q, STEPS)[0]}
+
+
 def run(arguments: argparse.Namespace) -> None:
     kept = JsonLines(Path(arguments.out) / "records.jsonl")
     done = {(r["row"], r["seed"], r["code"], r["family"], r["number"]) for r in kept.rows}
@@ -132,14 +139,12 @@ def run(arguments: argparse.Namespace) -> None:
     for case in progress(todo, "views"):
         views[case] = view_of(*case)
     for case in progress(todo, CONTROL):
+        if all((CONTROL, 0, code, *case) in done for code in ("none", "none, guided")):
+            continue
         problem = held_out_problem(*case)
-        for code in ("none", "none, guided"):
+        for code, q in control(problem, as_seen(problem, views[case]), case[1]).items():
             if (CONTROL, 0, code, *case) in done:
                 continue
-            rng, goal = np.random.default_rng(case[1]), goal_of(problem)
-            q = smooth_noise(problem.start, goal[None], BATCH, 48, problem.robot, rng).astype(np.float64)
-            if "guided" in code:
-                q = CollisionGuidance(as_seen(problem, views[case]), NETWORK_ALONE.guidance)(q, STEPS)[0]
             verdict = judged(problem, q)
             keep(CONTROL, 0, code, case, float(verdict.passed.mean()), float(verdict.hit.mean()))
     for row, folders in places.items():
@@ -182,9 +187,9 @@ def figures(free: Free) -> tuple[str, ...]:
     return (f"{100 * single.mean():.1f} ({low:.1f} to {high:.1f})", f"{best:.1f}", *families)
 
 
-def print_apart(what: str, free: Free, control: Free) -> None:
+def print_apart(what: str, free: Free, other: Free) -> None:
     """By how much the same problems differ."""
-    apart = np.array([np.mean(shares) - np.mean(control[case]) for case, shares in free.items()])
+    apart = np.array([np.mean(shares) - np.mean(other[case]) for case, shares in free.items()])
     low, high = (100 * x for x in bootstrap_interval(apart))
     print(f"{what} {100 * apart.mean():+.1f} points ({low:+.1f} to {high:+.1f})")
 
@@ -214,8 +219,8 @@ def report(out: str) -> None:
         ],
     )
     for name in dict.fromkeys(row for row, _ in of if row != CONTROL):
-        for control in ("another", "mean"):
-            print_apart(f"{name}: own code less {control}", free[name, "own"], free[name, control])
+        for other in ("another", "mean"):
+            print_apart(f"{name}: own code less {other}", free[name, "own"], free[name, other])
 
 
 def main() -> None:
