@@ -23,19 +23,19 @@ from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
-from robotdiffuse.collision.motion import search_space
-from robotdiffuse.errors import InputError
-from robotdiffuse.planners import load_planner
-from robotdiffuse.planners.ends import Ends
-from robotdiffuse.planners.learned import nearest_goals
-from robotdiffuse.planners.robotdiffuse import WAYPOINTS, RobotDiffuse, RobotDiffuseSettings
-from robotdiffuse.planners.smooth_noise import smooth_noise
+from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.learned import nearest_goals
+from robotdiffuse.planning.diffusion.hybrid import WAYPOINTS, RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.types import Path
-from robotdiffuse.verify import verifier
+from robotdiffuse.core.types import Path
+from robotdiffuse.validation.validator import verifier
 
 FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
 SEED = 2026

@@ -21,15 +21,15 @@ import trimesh
 from report import header, print_table
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.errors import InputError
-from robotdiffuse.planners import load_planner
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
-from robotdiffuse.robots.add import AddReport, add_robot
-from robotdiffuse.robots.refusals import Refusals, measure_refusals
+from robotdiffuse.robots.fitting.add import AddReport, add_robot
+from robotdiffuse.robots.fitting.false_collisions import Refusals, measure_refusals
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.sphere_kernels import gaps
-from robotdiffuse.robots.urdf import UrdfTree
+from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
+from robotdiffuse.robots.parsing.urdf import UrdfTree
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 

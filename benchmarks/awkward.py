@@ -27,10 +27,10 @@ from arms import EXAMPLE, ROBOPLAN, Arm
 from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
-from robotdiffuse.planners import load_planner
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.robots.add import KILO, add_robot
+from robotdiffuse.robots.fitting.add import KILO, add_robot
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

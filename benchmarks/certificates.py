@@ -28,17 +28,17 @@ from ompl import util as ou
 from report import header, print_table, progress
 
 import robotdiffuse as rd
-from robotdiffuse.certificates.writer import certify
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.errors import InputError
+from robotdiffuse.certificates.search import certify
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.results import PlanResult
-from robotdiffuse.types import Path as JointPath
-from robotdiffuse.types import Status
-from robotdiffuse.verify import Report, VerifySettings, verify, verify_trajectory
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import Report, VerifySettings, verify, verify_trajectory
 
 PLANNERS = {
     "RRTConnect": og.RRTConnect,

@@ -26,14 +26,14 @@ ROWS = 2000
 def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
     """What is called, by name: numbers that compiled code returns."""
     import robotdiffuse as rd
-    from robotdiffuse.collision.arrays import compile_robot
+    from robotdiffuse.collision.kernel_arrays import compile_robot
     from robotdiffuse.collision.checker import CollisionChecker
-    from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
+    from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
     from robotdiffuse.learning.guidance import CollisionGuidance
     from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
     from robotdiffuse.robots.kinematics import link_pose
-    from robotdiffuse.scenes.packed import PackedScenes
-    from robotdiffuse.verify import Verifier
+    from robotdiffuse.scenes.scene_arrays import PackedScenes
+    from robotdiffuse.validation.validator import Verifier
 
     rng, robot = np.random.default_rng(seed), rd.load_robot("panda")
     q = rng.uniform(robot.lower, robot.upper, (ROWS, robot.dof))

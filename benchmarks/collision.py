@@ -27,19 +27,19 @@ from report import header, print_table
 from rich.progress import track
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.collision.kernels.lanes import W, make_workspace
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import Space, motion_free
-from robotdiffuse.collision.motion import search_space
+from robotdiffuse.collision.motions import search_space
 from robotdiffuse.collision.signed_distance import SignedDistance
-from robotdiffuse.planners.rrt_connect import RRTConnectSettings
+from robotdiffuse.planning.search.rrt_connect import RRTConnectSettings
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud
 

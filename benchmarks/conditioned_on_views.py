@@ -42,9 +42,9 @@ from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.methods import judged, nothing_near
-from robotdiffuse.files import JsonLines, write_atomically
+from robotdiffuse.core.output_files import JsonLines, write_atomically
 from robotdiffuse.learning.checkpoint import load_encoder, load_model
-from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.completion import imagine
 from robotdiffuse.learning.completion.samples import camera_view
 from robotdiffuse.learning.encoders.base import Encoder
@@ -54,16 +54,16 @@ from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import planner_training
 from robotdiffuse.learning.training.planner import PlannerTrainee
 from robotdiffuse.learning.training.processes import Processes
-from robotdiffuse.learning.training.trainee import train
-from robotdiffuse.learning.weights_at_hand import BUNDLED
-from robotdiffuse.planners.diffusion import encode
-from robotdiffuse.planners.rungs import rungs
-from robotdiffuse.planners.unseen import with_rung
+from robotdiffuse.learning.training.task import train
+from robotdiffuse.learning.weights_registry import BUNDLED
+from robotdiffuse.planning.diffusion.diffusion import encode
+from robotdiffuse.perception.assumptions import rungs
+from robotdiffuse.planning.pipeline.unknown_space import with_rung
 from robotdiffuse.problems.held_out import goal_of, held_out_problem
 from robotdiffuse.problems.problem import IMAGINED, JointGoal, Problem
-from robotdiffuse.scenes.depth_view import DepthView, SeenPoints, UnseenPoints
-from robotdiffuse.scenes.observed_volume import observe
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.perception.depth_view import DepthView, SeenPoints, UnseenPoints
+from robotdiffuse.perception.observed_volume import observe
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 
 ENCODER = "completing_autoencoder"

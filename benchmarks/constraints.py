@@ -34,21 +34,21 @@ from sscbirrt.testing import PlanarIK
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.planners import call
-from robotdiffuse.planners.base import Planner
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.planning import context
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.held_out import SEED, held_out_problem
-from robotdiffuse.problems.path_constraints import PathConstraints
+from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.simulation.oracle import PyBulletOracle
+from robotdiffuse.simulation.validator import PyBulletOracle
 from robotdiffuse.simulation.world import World
-from robotdiffuse.transforms import rotation_angle, rotation_from_quaternion, rotation_from_rpy, transform
-from robotdiffuse.types import Path
-from robotdiffuse.verify import verifier
+from robotdiffuse.core.transforms import rotation_angle, rotation_from_quaternion, rotation_from_rpy, transform
+from robotdiffuse.core.types import Path
+from robotdiffuse.validation.validator import verifier
 
 SHORT, LONG = 1.0, 10.0
 """Time limits [s]; the longer one says what can be solved."""
@@ -308,7 +308,7 @@ def main() -> None:
     parser.add_argument("--kinds", default="upright,line", help="(upright,line)")
     parser.add_argument("--without-peer", action="store_true", help="leave sscbirrt out")
     arguments = parser.parse_args()
-    call.time = CpuClock  # type: ignore[attr-defined]
+    context.time = CpuClock  # type: ignore[attr-defined]
     print(header("numba", "numpy", "coal", "pybullet", "sscbirrt"))
     for kind in arguments.kinds.split(","):
         compared(kind, arguments.number, not arguments.without_peer)

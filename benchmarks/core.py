@@ -30,24 +30,25 @@ from report import header, print_table, progress
 from collision import POINTS, check_edges, checked_configurations, fastest
 from problems import PANDA, Case
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.collision.kernels.lanes import make_workspace, place_frames
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.collision.kernels.lane_collision import make_workspace, place_frames
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.kernels.simd import W, lanes_array
-from robotdiffuse.collision.motion import search_space
+from robotdiffuse.collision.motions import search_space
 from robotdiffuse.evaluation.methods import planned
 from robotdiffuse.evaluation.problem_sets import gather_cases
 from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.trial import Clock, tried
-from robotdiffuse.paths.timing import TimingSettings, time_parameterize
-from robotdiffuse.planners import call, load_planner
-from robotdiffuse.planners.base import Planner
+from robotdiffuse.evaluation.runs import Clock, tried
+from robotdiffuse.trajectories.timing import TimingSettings, time_parameterize
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning import context
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud
-from robotdiffuse.types import Path as JointPath
+from robotdiffuse.core.types import Path as JointPath
 
 SEED = 20261122
 REPEATS = 50
@@ -274,7 +275,7 @@ def steps(a: np.ndarray, b: np.ndarray) -> int:
 def collisions(_cases: Sequence[Case], _known: dict, motions: int, seed: int) -> None:
     """Motions checked on meshes every 5 mrad by Coal and by PyBullet, half of them in scenes with thin
     things."""
-    from robotdiffuse.simulation.oracle import PyBulletOracle
+    from robotdiffuse.simulation.validator import PyBulletOracle
 
     rng, rows = np.random.default_rng(seed), []
     families = [load_family(name) for name in FAMILIES]
@@ -316,7 +317,7 @@ def main() -> None:
     print(header("numpy", "numba", "coal", "toppra"))
     print(f"limits of {'CPU' if arguments.cpu else 'wall'} time")
     if arguments.cpu:
-        call.time = SimpleNamespace(perf_counter=time.process_time)  # type: ignore[assignment]
+        context.time = SimpleNamespace(perf_counter=time.process_time)  # type: ignore[assignment]
     cases = cases_of(arguments.problems, arguments.each)
     for name in ("aorrtc", "robotdiffuse", "rrt_connect"):
         load_planner(name).warm_up(cases[0].problem)  # compiles

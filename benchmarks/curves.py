@@ -14,7 +14,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 from report import print_table
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 
 COLORS = ("#14487f", "#d1495b", "#e09a5f", "#5aa7a7", "#8d76c4", "#8a94a3", "#4d8f4d", "#b05f9b", "#000000")
 

@@ -30,11 +30,11 @@ from problems import PANDA, SEED, draw_cases, goal_of
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.methods import NETWORK_ALONE
 from robotdiffuse.learning import motion_model
-from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.planners.diffusion import encode
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse
+from robotdiffuse.planning.diffusion.diffusion import encode
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
 from robotdiffuse.problems.problem import Problem
 
 SAMPLES = 16

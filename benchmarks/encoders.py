@@ -49,10 +49,10 @@ from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.encoder import linear_readout
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.family import base_spheres
-from robotdiffuse.problems.seen import seen_points
+from robotdiffuse.perception.seen_points import seen_points
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.observed_volume import LOW, ObservedVolume, observe
-from robotdiffuse.scenes.sampling import PANDA_REGION, sample_surface
+from robotdiffuse.perception.observed_volume import LOW, ObservedVolume, observe
+from robotdiffuse.scenes.surface_points import PANDA_REGION, sample_surface
 
 SEED = 20261123
 ROBOT = load_robot("panda")

@@ -30,7 +30,7 @@ from unseen import problems
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, judged
 from robotdiffuse.evaluation.statistics import bootstrap_interval
-from robotdiffuse.files import JsonLines
+from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.completion.samples import camera_view
 from robotdiffuse.learning.guidance import CollisionGuidance
@@ -39,11 +39,11 @@ from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
-from robotdiffuse.planners.smooth_noise import smooth_noise
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.problems.held_out import SEED, goal_of, held_out_problem
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.scenes.depth_view import DepthView
+from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.scenes.scene import Scene
 
 FAMILIES = ("shelf", "crate", "table", "clutter")

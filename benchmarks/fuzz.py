@@ -107,7 +107,7 @@ Make = Callable[[np.random.Generator, FilePath], Callable[[], object]]
 
 def outcome(call: Callable[[], object]) -> tuple[str, str]:
     """answer, error or fault; and what was said."""
-    from robotdiffuse.errors import InputError
+    from robotdiffuse.core.errors import InputError
 
     try:
         call()
@@ -340,8 +340,8 @@ def _judged(file: FilePath) -> None:
     """A problem that is read is judged: its straight line, if it has a goal configuration."""
     from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
     from robotdiffuse.problems.problem import JointGoal
-    from robotdiffuse.types import Path
-    from robotdiffuse.verify import Verifier
+    from robotdiffuse.core.types import Path
+    from robotdiffuse.validation.validator import Verifier
 
     problem = load_problem(file)
     problem_from_record(problem_record(problem))
@@ -424,9 +424,9 @@ def _mesh(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     import trimesh
 
-    from robotdiffuse.robots.limits import read_limits, with_limits
-    from robotdiffuse.robots.srdf import read_srdf
-    from robotdiffuse.robots.urdf import UrdfTree
+    from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
+    from robotdiffuse.robots.parsing.srdf import read_srdf
+    from robotdiffuse.robots.parsing.urdf import UrdfTree
 
     part = bytes(trimesh.creation.box((0.1, 0.05, 0.3)).export(file_type="stl"))  # type: ignore[arg-type]
     (folder / "part.stl").write_bytes(damaged(rng, part) if rng.random() < 0.2 else part)
@@ -463,8 +463,8 @@ def numbers_changed(rng: np.random.Generator, content: bytes) -> bytes:
 
 def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     from robotdiffuse.problems.files import problem_from_record
-    from robotdiffuse.results import load_result
-    from robotdiffuse.verify import Verifier
+    from robotdiffuse.core.results import load_result
+    from robotdiffuse.validation.validator import Verifier
 
     rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
     record = {
@@ -553,9 +553,9 @@ def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
 
 def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Bodies of requests, read and answered as a worker of `robotdiffuse serve` does."""
-    from robotdiffuse.errors import InputError
+    from robotdiffuse.core.errors import InputError
     from robotdiffuse.robots import load_robot
-    from robotdiffuse.serve import worker
+    from robotdiffuse.server import worker
 
     what, body = asked(rng)
 
@@ -573,7 +573,7 @@ def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Requests to a running `robotdiffuse serve`; the server itself is checked now and then."""
     import fuzz_socket
 
-    from robotdiffuse.errors import InputError
+    from robotdiffuse.core.errors import InputError
 
     (what, body), (_, other) = asked(rng, 0.5), asked(rng, 0.5)
     sent = fuzz_socket.sent(rng, fuzz_socket.draft(rng, what, body, other), damaged)
@@ -591,12 +591,12 @@ def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.handover import read_motion, write_motion
-    from robotdiffuse.handover.recorded import fitted
-    from robotdiffuse.handover.records import joint_trajectory
+    from robotdiffuse.interop import read_motion, write_motion
+    from robotdiffuse.interop.recorded_motion import fitted
+    from robotdiffuse.interop.plain_messages import joint_trajectory
     from robotdiffuse.problems.files import problem_from_record
-    from robotdiffuse.types import Trajectory
-    from robotdiffuse.verify import Verifier
+    from robotdiffuse.core.types import Trajectory
+    from robotdiffuse.validation.validator import Verifier
 
     problem = problem_from_record(PROBLEM | {"scene": PROBLEM["scene"][:1]})
     rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3)
@@ -632,9 +632,9 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 def _certificate_record() -> dict[str, Any]:
     import tempfile
 
-    from robotdiffuse.certificates.writer import certify
+    from robotdiffuse.certificates.search import certify
     from robotdiffuse.problems.files import problem_from_record
-    from robotdiffuse.types import Path
+    from robotdiffuse.core.types import Path
 
     start = PROBLEM["start"]
     rows = np.array([start, start])
@@ -646,7 +646,7 @@ def _certificate_record() -> dict[str, Any]:
 
 
 def _certificate(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.certificates.certificate import load_certificate
+    from robotdiffuse.certificates.proof import load_certificate
 
     file = folder / "certificate.json"
     file.write_bytes(text_of(rng, _certificate_record(), ".json"))
@@ -676,8 +676,8 @@ def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Problem files that browsers send to the live page."""
-    from robotdiffuse.live.exchange import problem_text, uploaded_problem
-    from robotdiffuse.live.session import Session
+    from robotdiffuse.visualization.live.files import problem_text, uploaded_problem
+    from robotdiffuse.visualization.live.session import Session
     from robotdiffuse.robots import load_robot
 
     problem = PROBLEM | ({}, EQUIPPED, CONSTRAINED, MOVING)[rng.integers(4)]
@@ -694,7 +694,7 @@ def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Heads of requests, at the door of the live page: handed on or not, never an error."""
-    from robotdiffuse.live.door import admitted
+    from robotdiffuse.visualization.live.access import admitted
 
     token = ("", "abc")[rng.integers(2)]
     host = (b"localhost:8080", b"[::1]:1", b"a.example")[rng.integers(3)]
@@ -706,7 +706,7 @@ def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """What --set says of planners, and settings of trainings."""
     from robotdiffuse.learning.training.config import PlannerTraining
-    from robotdiffuse.planners import PLANNERS, planner_settings
+    from robotdiffuse.planning import PLANNERS, planner_settings
 
     if rng.random() < 0.5:
         data = mutated(rng, PlannerTraining(data="d", encoder="e").to_json())
@@ -739,7 +739,7 @@ def _npz(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """The authors' data sets."""
     import io
 
-    from robotdiffuse.data.robot_npz import import_npz
+    from robotdiffuse.datasets.robot_npz import import_npz
 
     stream, x = io.BytesIO(), np.zeros((2, 254, 7), np.float32)
     x += np.array(PROBLEM["start"], np.float32)

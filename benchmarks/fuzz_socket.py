@@ -385,7 +385,7 @@ def server() -> Server:
 def main() -> None:
     """The server: a worker, the shorter time to send, and an end when nobody holds its standard input."""
     from robotdiffuse.cli import main as command
-    from robotdiffuse.serve import settings
+    from robotdiffuse.server import settings
 
     settings.SENDING = settings.KEPT = SENDING
 

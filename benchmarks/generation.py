@@ -28,10 +28,10 @@ from robotdiffuse.cli.train_robot import MIX
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
-from robotdiffuse.collision.motion import search_space
+from robotdiffuse.collision.motions import search_space
 from robotdiffuse.generation import GenerationSettings
-from robotdiffuse.generation.aorrtc import AORRTCSearchSettings
-from robotdiffuse.generation.searches import SEARCHES
+from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
+from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.generation.shard_maker import draw, solve, with_near_goals
 from robotdiffuse.problems.families.family import Drawn
 from robotdiffuse.robots import load_robot

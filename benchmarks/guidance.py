@@ -25,8 +25,8 @@ from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.statistics import wilson_interval
 from robotdiffuse.evaluation.summary import BEST, CPU, SINGLE, half_width, summary
 from robotdiffuse.evaluation.tables import show
-from robotdiffuse.evaluation.trial import tried
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse
+from robotdiffuse.evaluation.runs import tried
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
 from robotdiffuse.problems.families import FAMILIES
 
 STEPS = (1, 2, 5, 10, 50, 200)

@@ -38,14 +38,14 @@ from searches import as_refined, as_sampled, bumps_repeated, network, network_re
 
 from problems import PANDA, SEED, Case, draw_cases, goal_of
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, searched
 from robotdiffuse.evaluation.problem_sets import gather_cases
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.statistics import compare
 from robotdiffuse.evaluation.tables import Cell, Column, Table, show
-from robotdiffuse.evaluation.trial import Trial, tried
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse
+from robotdiffuse.evaluation.runs import Trial, tried
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from report import header, print_table, progress
 
-from robotdiffuse.planners import load_planner
+from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.files import save_problem
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import Problem

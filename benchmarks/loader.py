@@ -17,15 +17,15 @@ import numpy as np
 import torch
 from report import header, print_table
 
-from robotdiffuse.data.dataset import RopDataset
-from robotdiffuse.data.manifest import Manifest, floor_record, write_manifest
-from robotdiffuse.data.shards import SPLITS, write_shard
+from robotdiffuse.datasets.loader import RopDataset
+from robotdiffuse.datasets.manifest import Manifest, floor_record, write_manifest
+from robotdiffuse.datasets.shards import SPLITS, write_shard
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 WAYPOINTS, SLOTS, GOALS, SHARD = 254, 12, 10, 1000
 POINTS, BATCH, DENSE_SHARE = 1400, 256, 0.15

@@ -30,15 +30,15 @@ from problems import PANDA, Case, draw_cases
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.evaluation.methods import NETWORK_ALONE
 from robotdiffuse.evaluation.tables import Column
-from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial, tried
-from robotdiffuse.paths.simplify import shortcut
-from robotdiffuse.planners.aorrtc import kernel
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, unlearned_starts
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial, tried
+from robotdiffuse.trajectories.simplification import shortcut
+from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, unlearned_starts
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.family import Family, uniform_configurations
 from robotdiffuse.problems.problem import JointGoal
-from robotdiffuse.types import Path
-from robotdiffuse.verify import VerifySettings, verifier
+from robotdiffuse.core.types import Path
+from robotdiffuse.validation.validator import VerifySettings, verifier
 
 EACH = 4
 """Starts of refinement for each goal."""
@@ -69,8 +69,8 @@ def with_goals(case: Case, planner: RobotDiffuse, family: Family, count: int, pl
 
 def search(arena: Arena, goal: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
     """Shortened; no rows if a pair of trees is full without a path."""
-    trees = kernel.make_trees(arena.start, goal[None], NODES)
-    path = kernel.connect(arena.space, trees, RANGE, 2 * NODES, arena.state)
+    trees = rrt_kernel.make_trees(arena.start, goal[None], NODES)
+    path = rrt_kernel.connect(arena.space, trees, RANGE, 2 * NODES, arena.state)
     return shortcut(arena.space, path, SHORTCUTS, arena.state) if len(path) else path
 
 

@@ -21,10 +21,10 @@ from report import header, print_table, progress
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.planners.lattice.planner import DStarLiteSearch, DStarLiteSettings
+from robotdiffuse.planning.baselines.lattice.planner import DStarLiteSearch, DStarLiteSettings
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.simulation.oracle import PyBulletOracle
-from robotdiffuse.transforms import transform
+from robotdiffuse.simulation.validator import PyBulletOracle
+from robotdiffuse.core.transforms import transform
 
 SPEED, RADIUS = 0.4, 0.1
 START, GOAL = [-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8], [1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]

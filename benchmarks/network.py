@@ -43,14 +43,14 @@ from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, SOLVED, summary
 from robotdiffuse.evaluation.tables import show
-from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial, tried
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial, tried
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.planners.diffusion import encode
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.diffusion.diffusion import encode
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.simulation.oracle import PyBulletOracle
-from robotdiffuse.types import Path
+from robotdiffuse.simulation.validator import PyBulletOracle
+from robotdiffuse.core.types import Path
 
 TIME_LIMIT = 5.0
 """Of the whole planner [s]."""

@@ -17,16 +17,16 @@ import unseen
 from report import header, print_table, progress
 
 from robotdiffuse.evaluation.statistics import compare
-from robotdiffuse.files import JsonLines
-from robotdiffuse.planners import call
-from robotdiffuse.planners.call import Request
-from robotdiffuse.planners.next_view import next_view, poses_around
-from robotdiffuse.planners.unseen import plan_beside_unseen
+from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.planning import context
+from robotdiffuse.planning.context import Request
+from robotdiffuse.planning.next_view import next_view, poses_around
+from robotdiffuse.planning.pipeline.unknown_space import plan_beside_unseen
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import IMAGINED, Problem
-from robotdiffuse.results import PlanResult
-from robotdiffuse.scenes.depth_view import DepthView
-from robotdiffuse.scenes.ray_caster import ray_cast
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.scenes.scene import Scene
 
 SECOND = ("next_view", "random", "opposite")
@@ -35,7 +35,7 @@ UNSURE = 0.9
 
 
 def run(records: str, count: int) -> None:
-    call.time = unseen.CpuClock  # type: ignore[attr-defined]
+    context.time = unseen.CpuClock  # type: ignore[attr-defined]
     kept = JsonLines(Path(records))
     done = {(row["family"], row["number"]) for row in kept.rows}
     for family in FAMILIES:

@@ -21,15 +21,15 @@ from report import header, print_table, progress
 from scipy.interpolate import CubicHermiteSpline
 
 import robotdiffuse as rd
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.planners import call
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.planning import context
 from robotdiffuse.problems.goals import JointGoal, PoseGoal
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.kinematics import link_origins, link_pose
-from robotdiffuse.simulation.oracle import PyBulletOracle
-from robotdiffuse.types import Trajectory
+from robotdiffuse.simulation.validator import PyBulletOracle
+from robotdiffuse.core.types import Trajectory
 
 HAND = "panda_hand"
 BLENDS = (0.02, 0.05, 0.1, 0.2)
@@ -181,7 +181,7 @@ def main() -> None:
     parser.add_argument("--number", type=int, default=20, help="of sequences (20)")
     parser.add_argument("--planner", default="aorrtc", help="(aorrtc)")
     arguments = parser.parse_args()
-    call.time = CpuClock  # type: ignore[attr-defined]
+    context.time = CpuClock  # type: ignore[attr-defined]
     print(header("numba", "numpy", "coal", "pybullet"))
     blended(arguments.number, arguments.planner)
     lifted(arguments.number, arguments.planner)

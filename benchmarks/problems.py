@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.problem_sets import SEARCH_TIME, case_file, judge, search
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import SEED, Case, goal_of

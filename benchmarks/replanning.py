@@ -18,8 +18,8 @@ from report import header, print_table
 from problems import goal_of
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.problem_sets import case_file, judge
-from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial, tried
-from robotdiffuse.planners.lattice.planner import DStarLiteSearch, DStarLiteSettings, Outcome
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial, tried
+from robotdiffuse.planning.baselines.lattice.planner import DStarLiteSearch, DStarLiteSettings, Outcome
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
 

@@ -32,24 +32,24 @@ from report import header, print_table, progress
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.arrays import compile_robot
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.collision.motion import levers
-from robotdiffuse.errors import InputError
-from robotdiffuse.planners import call
-from robotdiffuse.planners.call import Call
-from robotdiffuse.planners.ends import usable_ends
+from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.collision.motions import levers
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import context
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.start_goal import usable_ends
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.results import PlanResult
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.simulation.oracle import PyBulletOracle
+from robotdiffuse.simulation.validator import PyBulletOracle
 from robotdiffuse.simulation.world import World
-from robotdiffuse.tolerances import goal_error
-from robotdiffuse.transforms import inverse, rotation_from_rpy, transform
-from robotdiffuse.types import Path as JointPath
+from robotdiffuse.validation.tolerances import goal_error
+from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
+from robotdiffuse.core.types import Path as JointPath
 
 SHORT, LONG = 1.0, 10.0
 """Time limits, of CPU time [s]; the longer one says what can be solved."""
@@ -270,7 +270,7 @@ def main() -> None:
     parser.add_argument("--number", type=int, default=120, help="of problems of each other kind (120)")
     parser.add_argument("--planner", default="aorrtc", help="(aorrtc)")
     arguments = parser.parse_args()
-    call.time = CpuClock  # type: ignore[attr-defined]
+    context.time = CpuClock  # type: ignore[attr-defined]
     print(header("numba", "numpy", "coal", "pybullet"))
     kinds = arguments.kinds.split(",")
     if "carried" in kinds:

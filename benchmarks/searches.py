@@ -15,14 +15,14 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
-from robotdiffuse.collision.motion import search_space
+from robotdiffuse.collision.motions import search_space
 from robotdiffuse.evaluation.methods import Search
-from robotdiffuse.evaluation.trial import Trial
+from robotdiffuse.evaluation.runs import Trial
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.paths.simplify import shortcut
-from robotdiffuse.planners.ends import Ends
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, unlearned_starts
-from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
+from robotdiffuse.trajectories.simplification import shortcut
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, unlearned_starts
+from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
 from robotdiffuse.problems.held_out import SEED
 from robotdiffuse.problems.problem import JointGoal
 

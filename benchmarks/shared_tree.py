@@ -22,14 +22,14 @@ from problems import PANDA, SEED, Case, goal_of
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
-from robotdiffuse.collision.motion import search_space
+from robotdiffuse.collision.motions import search_space
 from robotdiffuse.evaluation.methods import planned
 from robotdiffuse.evaluation.tables import Column
-from robotdiffuse.evaluation.trial import Fields, Method, Trial, tried
+from robotdiffuse.evaluation.runs import Fields, Method, Trial, tried
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.shard_maker import draw as draw_problem
-from robotdiffuse.planners import load_planner
-from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, Problem
 

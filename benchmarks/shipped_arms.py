@@ -19,15 +19,15 @@ from itertools import pairwise
 import numpy as np
 from report import header, print_table, progress
 
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.errors import InputError
-from robotdiffuse.planners import load_planner
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.results import PlanResult
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.simulation.oracle import PyBulletOracle
+from robotdiffuse.simulation.validator import PyBulletOracle
 
 FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
 SEED = 11

@@ -11,7 +11,7 @@ scene does. Cameras stand where a person would place them, 1.4 to 1.8 m away, in
 the floor is known, all else is seen. Every method plans with AORRTC, but for the one that is said to plan
 with the hybrid, and the same CPU time. A motion is free if the judge finds path and timed motion valid in the
 true scene. What was tried is kept in a file of records and not tried again; `--report` prints the tables that
-are kept in benchmarks/results/unseen.txt, and `--fit` the constants of planners/confidence.py, from the
+are kept in benchmarks/results/unseen.txt, and `--fit` the constants of perception/confidence.py, from the
 calibration half: problems with even numbers. Settings were chosen on them, too; `--odd` leaves them out of
 the report. `--weights` adds the chain 'imagined' with other weights of the completing network, folders of
 `train completion`, as methods that are named by the folder: those of a training that left families out are
@@ -32,24 +32,25 @@ from numpy import ndarray
 from report import header, print_table, progress
 
 from robotdiffuse.evaluation.statistics import compare, wilson_interval
-from robotdiffuse.files import JsonLines
+from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.learning.checkpoint import load_completion
 from robotdiffuse.learning.completion import bundled, imagine
 from robotdiffuse.learning.completion.network import CompletionNetwork
 from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
-from robotdiffuse.planners import call, load_planner
-from robotdiffuse.planners.call import Request
-from robotdiffuse.planners.confidence import LEAST_RISK, confidence
-from robotdiffuse.planners.unseen import plan_beside_unseen
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning import context
+from robotdiffuse.planning.context import Request
+from robotdiffuse.perception.confidence import LEAST_RISK, confidence
+from robotdiffuse.planning.pipeline.unknown_space import plan_beside_unseen
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
 from robotdiffuse.problems.problem import IMAGINED, Problem
-from robotdiffuse.results import PlanResult
-from robotdiffuse.scenes.depth_view import DepthView
-from robotdiffuse.scenes.observed_volume import observe
-from robotdiffuse.scenes.ray_caster import DepthNoise, ray_cast
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.observed_volume import observe
+from robotdiffuse.perception.ray_caster import DepthNoise, ray_cast
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.verify import verify, verify_trajectory
+from robotdiffuse.validation.validator import verify, verify_trajectory
 
 LIMIT = 1.0
 """CPU time of every method on every problem [s]."""
@@ -149,7 +150,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Try what is not in the records yet."""
     networks = {BY + Path(folder).name: load_completion(folder) for folder in arguments.weights}
     methods = [*arguments.methods, *networks]
-    call.time = CpuClock  # type: ignore[attr-defined]
+    context.time = CpuClock  # type: ignore[attr-defined]
     kept = JsonLines(Path(arguments.records))
     place = {"views": arguments.views, "noise": arguments.noise}
     done = {(r["family"], r["number"], r["method"]) for r in kept.rows if place.items() <= r.items()}
@@ -319,7 +320,7 @@ def times(families: list[str]) -> None:
 
 
 def fit(rows: list[Row]) -> None:
-    """Print RATES and BY_RISK of planners/confidence.py."""
+    """Print RATES and BY_RISK of perception/confidence.py."""
     rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1 and not r["noise"]]
     plain = [row for row in rows if row["risk"] is None]
     for rung in dict.fromkeys(row["rung"] for row in plain):

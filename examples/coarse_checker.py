@@ -6,7 +6,7 @@ from ompl import geometric as og
 from ompl import util as ou
 
 import robotdiffuse as rd
-from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.collision.exact_meshes import ExactCollision
 
 ou.setLogLevel(ou.LOG_NONE)
 problem = rd.Problem(

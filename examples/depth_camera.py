@@ -7,7 +7,8 @@ view. With one camera the motion is likely to run through the unseen half of the
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.simulation import DepthCamera, World, point_cloud, replay
+from robotdiffuse.simulation import DepthCamera, World, point_cloud
+from robotdiffuse.simulation import replay
 
 robot = rd.load_robot("panda")
 scene = rd.Scene([rd.Box([0.55, 0.0, 0.3], [0.2, 0.2, 0.6]), rd.Sphere([0.45, -0.05, 0.95], 0.12)])

@@ -124,8 +124,8 @@ def test_import_loads_nothing_heavy() -> None:
 def test_searches_the_hybrid_the_judge_the_bench_and_the_data_factory_load_no_pytorch() -> None:
     """It takes longer to load than all else that their processes need at the start."""
     code = (
-        "import sys, robotdiffuse.generation.shard_maker, robotdiffuse.verify\n"
-        "import robotdiffuse.planners.rrt_connect, robotdiffuse.planners.robotdiffuse\n"
+        "import sys, robotdiffuse.generation.shard_maker, robotdiffuse.validation.validator\n"
+        "import robotdiffuse.planning.search.rrt_connect, robotdiffuse.planning.diffusion.hybrid\n"
         "import robotdiffuse.evaluation.bench.planner_process\n"
         "print('torch' in sys.modules)"
     )
@@ -153,7 +153,7 @@ def test_a_plan_by_search_loads_what_it_needs_and_no_more(tmp_path: Path) -> Non
 
 def test_public_names_resolve_and_verify_is_the_function() -> None:
     code = (
-        "import robotdiffuse as rd, robotdiffuse.verify\n"
+        "import robotdiffuse as rd, robotdiffuse.validation.validator\n"
         "print(callable(rd.verify), all(hasattr(rd, name) for name in rd.__all__))"
     )
     assert run(code) == "True True"

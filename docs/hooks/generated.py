@@ -120,7 +120,7 @@ def metrics() -> str:
 
 def planner_settings() -> str:
     """The settings of every planner, as `--set NAME=VALUE` takes them."""
-    from robotdiffuse.planners import PLANNERS
+    from robotdiffuse.planning import PLANNERS
 
     parts: dict[type, list[str]] = {}
     for name in PLANNERS:

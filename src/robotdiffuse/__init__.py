@@ -5,21 +5,21 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from robotdiffuse.compile_cache import ensure_cache
+from robotdiffuse.core.compile_cache import ensure_cache
 
 if TYPE_CHECKING:
-    from robotdiffuse.certificates.certificate import Certificate as Certificate
-    from robotdiffuse.certificates.certificate import load_certificate as load_certificate
-    from robotdiffuse.certificates.writer import certify as certify
-    from robotdiffuse.data.dataset import RopDataset as RopDataset
-    from robotdiffuse.errors import InputError as InputError
-    from robotdiffuse.planners import load_planner as load_planner
-    from robotdiffuse.planners import plan as plan
-    from robotdiffuse.planners.many import plan_many as plan_many
-    from robotdiffuse.planners.next_view import NextView as NextView
-    from robotdiffuse.planners.next_view import next_view as next_view
-    from robotdiffuse.planners.replanner import Replanner as Replanner
-    from robotdiffuse.planners.replanner import ReplannerSettings as ReplannerSettings
+    from robotdiffuse.certificates.proof import Certificate as Certificate
+    from robotdiffuse.certificates.proof import load_certificate as load_certificate
+    from robotdiffuse.certificates.search import certify as certify
+    from robotdiffuse.datasets.loader import RopDataset as RopDataset
+    from robotdiffuse.core.errors import InputError as InputError
+    from robotdiffuse.planning import load_planner as load_planner
+    from robotdiffuse.planning import plan as plan
+    from robotdiffuse.planning.plan_many import plan_many as plan_many
+    from robotdiffuse.planning.next_view import NextView as NextView
+    from robotdiffuse.planning.next_view import next_view as next_view
+    from robotdiffuse.planning.reactive.replanner import Replanner as Replanner
+    from robotdiffuse.planning.reactive.replanner import ReplannerSettings as ReplannerSettings
     from robotdiffuse.problems.constraints import AxisCone as AxisCone
     from robotdiffuse.problems.constraints import CartesianLine as CartesianLine
     from robotdiffuse.problems.constraints import OnLine as OnLine
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.goals import PoseGoal as PoseGoal
     from robotdiffuse.problems.goals import PosesGoal as PosesGoal
     from robotdiffuse.problems.problem import Problem as Problem
-    from robotdiffuse.results import PlanResult as PlanResult
-    from robotdiffuse.results import load_result as load_result
+    from robotdiffuse.core.results import PlanResult as PlanResult
+    from robotdiffuse.core.results import load_result as load_result
     from robotdiffuse.robots import load_robot as load_robot
     from robotdiffuse.robots.inertias import Payload as Payload
-    from robotdiffuse.scenes.depth_view import DepthView as DepthView
-    from robotdiffuse.scenes.moving import MovingObstacle as MovingObstacle
+    from robotdiffuse.perception.depth_view import DepthView as DepthView
+    from robotdiffuse.scenes.moving_obstacles import MovingObstacle as MovingObstacle
     from robotdiffuse.scenes.scene import Scene as Scene
     from robotdiffuse.scenes.shapes import Box as Box
     from robotdiffuse.scenes.shapes import Capsule as Capsule
@@ -44,29 +44,29 @@ if TYPE_CHECKING:
     from robotdiffuse.scenes.shapes import Mesh as Mesh
     from robotdiffuse.scenes.shapes import PointCloud as PointCloud
     from robotdiffuse.scenes.shapes import Sphere as Sphere
-    from robotdiffuse.types import Path as Path
-    from robotdiffuse.types import Status as Status
-    from robotdiffuse.types import Trajectory as Trajectory
-    from robotdiffuse.verify import verify as verify
-    from robotdiffuse.viewer.notebook import show as show
+    from robotdiffuse.core.types import Path as Path
+    from robotdiffuse.core.types import Status as Status
+    from robotdiffuse.core.types import Trajectory as Trajectory
+    from robotdiffuse.validation.validator import verify as verify
+    from robotdiffuse.visualization.notebook import show as show
 
 __version__ = "0.1.0"
 ensure_cache()
 
 _HOME = {
-    "Certificate": "robotdiffuse.certificates.certificate",
-    "certify": "robotdiffuse.certificates.writer",
-    "load_certificate": "robotdiffuse.certificates.certificate",
-    "InputError": "robotdiffuse.errors",
-    "RopDataset": "robotdiffuse.data.dataset",
-    "load_result": "robotdiffuse.results",
-    "load_planner": "robotdiffuse.planners",
-    "NextView": "robotdiffuse.planners.next_view",
-    "next_view": "robotdiffuse.planners.next_view",
-    "plan": "robotdiffuse.planners",
-    "plan_many": "robotdiffuse.planners.many",
-    "Replanner": "robotdiffuse.planners.replanner",
-    "ReplannerSettings": "robotdiffuse.planners.replanner",
+    "Certificate": "robotdiffuse.certificates.proof",
+    "certify": "robotdiffuse.certificates.search",
+    "load_certificate": "robotdiffuse.certificates.proof",
+    "InputError": "robotdiffuse.core.errors",
+    "RopDataset": "robotdiffuse.datasets.loader",
+    "load_result": "robotdiffuse.core.results",
+    "load_planner": "robotdiffuse.planning",
+    "NextView": "robotdiffuse.planning.next_view",
+    "next_view": "robotdiffuse.planning.next_view",
+    "plan": "robotdiffuse.planning",
+    "plan_many": "robotdiffuse.planning.plan_many",
+    "Replanner": "robotdiffuse.planning.reactive.replanner",
+    "ReplannerSettings": "robotdiffuse.planning.reactive.replanner",
     "AnyGoal": "robotdiffuse.problems.goals",
     "JointGoal": "robotdiffuse.problems.goals",
     "PoseGoal": "robotdiffuse.problems.goals",
@@ -80,8 +80,8 @@ _HOME = {
     "load_problem": "robotdiffuse.problems.files",
     "load_robot": "robotdiffuse.robots",
     "Scene": "robotdiffuse.scenes.scene",
-    "DepthView": "robotdiffuse.scenes.depth_view",
-    "MovingObstacle": "robotdiffuse.scenes.moving",
+    "DepthView": "robotdiffuse.perception.depth_view",
+    "MovingObstacle": "robotdiffuse.scenes.moving_obstacles",
     "Payload": "robotdiffuse.robots.inertias",
     "Box": "robotdiffuse.scenes.shapes",
     "Capsule": "robotdiffuse.scenes.shapes",
@@ -89,12 +89,12 @@ _HOME = {
     "Mesh": "robotdiffuse.scenes.shapes",
     "PointCloud": "robotdiffuse.scenes.shapes",
     "Sphere": "robotdiffuse.scenes.shapes",
-    "Path": "robotdiffuse.types",
-    "PlanResult": "robotdiffuse.results",
-    "Status": "robotdiffuse.types",
-    "Trajectory": "robotdiffuse.types",
-    "show": "robotdiffuse.viewer.notebook",
-    "verify": "robotdiffuse.verify",
+    "Path": "robotdiffuse.core.types",
+    "PlanResult": "robotdiffuse.core.results",
+    "Status": "robotdiffuse.core.types",
+    "Trajectory": "robotdiffuse.core.types",
+    "show": "robotdiffuse.visualization.notebook",
+    "verify": "robotdiffuse.validation.validator",
 }
 
 __all__ = ["__version__", *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
@@ -102,7 +102,7 @@ __all__ = ["__version__", *_HOME]  # pyright: ignore[reportUnsupportedDunderAll]
 
 class _Package(ModuleType):
     def __setattr__(self, name: str, value: object) -> None:
-        # The import system would put the module robotdiffuse.verify in the place of the function.
+        # The import system would put the module robotdiffuse.validation.validator in the place of the function.
         if not (name in _HOME and isinstance(value, ModuleType)):
             super().__setattr__(name, value)
 

@@ -12,7 +12,7 @@ def main() -> int:
     """As `cli.main`; Ctrl-C is one line while that is still imported, too."""
     gc.set_threshold(YOUNG)
     try:
-        from robotdiffuse.processes import interrupts_at_once
+        from robotdiffuse.core.processes import interrupts_at_once
 
         with interrupts_at_once():
             from robotdiffuse import cli
@@ -25,7 +25,7 @@ def main() -> int:
 def run() -> NoReturn:
     """`main`, and the end of the process."""
     status = main()
-    from robotdiffuse.processes import leave
+    from robotdiffuse.core.processes import leave
 
     leave(status)
 

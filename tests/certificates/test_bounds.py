@@ -15,7 +15,7 @@ from helpers.example_robots import example_robot
 from robotdiffuse.certificates.bounds import SCENE, Prover, Stretches
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.certificates.obstacles import CAP, Obstacles, Rounded, Surface
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.scenes.scene import Scene

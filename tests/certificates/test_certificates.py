@@ -12,16 +12,16 @@ import trimesh
 
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
-from robotdiffuse.certificates.certificate import Certificate, Tolerances, load_certificate
-from robotdiffuse.certificates.writer import NotValidError, certify
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.errors import InputError
+from robotdiffuse.certificates.proof import Certificate, Tolerances, load_certificate
+from robotdiffuse.certificates.search import NotValidError, certify
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.types import Path
-from robotdiffuse.verify import VerifySettings, verify
+from robotdiffuse.core.types import Path
+from robotdiffuse.validation.validator import VerifySettings, verify
 
 SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3], [0.6, 0.9, 0.3]])
 
@@ -102,7 +102,7 @@ def test_the_checker_loads_neither_compiled_code_nor_coal() -> None:
     code = (
         "import sys, robotdiffuse.certificates.checker, robotdiffuse.problems.files\n"
         "print([m for m in ('numba', 'coal', 'torch') if m in sys.modules])\n"
-        "print([m for m in sys.modules if 'robotdiffuse.collision' in m or m == 'robotdiffuse.verify'])"
+        "print([m for m in sys.modules if 'robotdiffuse.collision' in m or m == 'robotdiffuse.validation.validator'])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.split("\n")[:2] == ["[]", "[]"], done.stderr

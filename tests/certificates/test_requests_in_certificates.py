@@ -13,16 +13,16 @@ import pytest
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import Stretches
-from robotdiffuse.certificates.certificate import Certificate, load_certificate
+from robotdiffuse.certificates.proof import Certificate, load_certificate
 from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.constraints import kept
 from robotdiffuse.certificates.content import request_parts
-from robotdiffuse.certificates.moving import MovingProver
-from robotdiffuse.certificates.writer import certify
-from robotdiffuse.errors import InputError
-from robotdiffuse.problems.path_constraints import PathConstraints
+from robotdiffuse.certificates.moving_obstacles import MovingProver
+from robotdiffuse.certificates.search import certify
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.types import Trajectory
+from robotdiffuse.core.types import Trajectory
 
 PANDA, HAND = rd.load_robot("panda"), "panda_hand"
 START, GOAL = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2], [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]

@@ -16,18 +16,18 @@ from helpers.made_arms import chain, row, written
 from helpers.quick_preparation import QUICK
 from robotdiffuse.cli import main
 from robotdiffuse.cli.background_factory import filled_meanwhile
-from robotdiffuse.data.manifest import read_manifest, write_manifest
-from robotdiffuse.data.shards import check_shard, shard_indices
+from robotdiffuse.datasets.manifest import read_manifest, write_manifest
+from robotdiffuse.datasets.shards import check_shard, shard_indices
 from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.factory import manifest_of
 from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
-from robotdiffuse.planners import PLANNERS, planner_settings
-from robotdiffuse.results import PlanResult, load_result
+from robotdiffuse.planning import PLANNERS, planner_settings
+from robotdiffuse.core.results import PlanResult, load_result
 from robotdiffuse.robots import load_robot
-from robotdiffuse.types import Status
+from robotdiffuse.core.types import Status
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted(ROOT.glob("examples/*.yaml")) + sorted(ROOT.glob("src/robotdiffuse/examples/*.yaml"))
@@ -363,7 +363,7 @@ def test_robot_add_with_srdf_and_robot_list(
 ) -> None:
     """Pairs that an SRDF or the command allows, the comparison with sampling, progress without a terminal."""
     monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
-    monkeypatch.setattr("robotdiffuse.robots.add.PreparationSettings", lambda: QUICK)
+    monkeypatch.setattr("robotdiffuse.robots.fitting.add.PreparationSettings", lambda: QUICK)
     file = written(tmp_path, chain("base", row("j", 4), xyz="0 0 0.07", limits='lower="-3" upper="3"'))
     pairs = ("base", "j4_link", "User"), ("base", "j3_link", "Never"), ("base", "j1_link", "Adjacent")
     rows = (f'<disable_collisions link1="{a}" link2="{b}" reason="{why}"/>' for a, b, why in pairs)

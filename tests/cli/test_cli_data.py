@@ -13,8 +13,8 @@ from robotdiffuse.cli import main
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.viewer import gallery
-from robotdiffuse.viewer.picture import PictureSettings
+from robotdiffuse.visualization import gallery
+from robotdiffuse.visualization.picture import PictureSettings
 
 PANDA = load_robot("panda")
 START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])

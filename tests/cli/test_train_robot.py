@@ -10,16 +10,17 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.factory_runs import contents, in_this_process
-from robotdiffuse.cli import main, train_robot
+from robotdiffuse.cli import main
+from robotdiffuse.cli import train_robot
 from robotdiffuse.cli.train_robot import data_for, train_for_robot
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.generation import factory
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.training.configs import planner_training
-from robotdiffuse.learning.training.run import TrainingRun
-from robotdiffuse.learning.weights_at_hand import user_weights, weights_for
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.learning.training.loop import TrainingRun
+from robotdiffuse.learning.weights_registry import user_weights, weights_for
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.robots import load_robot
 

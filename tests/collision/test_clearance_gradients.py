@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.arrays import compile_robot
-from robotdiffuse.collision.packed import packed_clearances_and_gradients, packed_link_clearances
+from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
 from robotdiffuse.collision.signed_distance import SignedDistance
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model, save_network
-from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
 from robotdiffuse.learning.robot_identity import RobotIdentity
@@ -21,7 +21,7 @@ from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 

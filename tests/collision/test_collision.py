@@ -14,13 +14,13 @@ from helpers.box_arm import box_arm
 from helpers.clearances import least_clearance
 from helpers.example_robots import example_robot
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.arrays import compile_scene, robot_groups
-from robotdiffuse.collision.exact import ExactCollision, forward_frames
+from robotdiffuse.collision.kernel_arrays import compile_scene, robot_groups
+from robotdiffuse.collision.exact_meshes import ExactCollision, forward_frames
 from robotdiffuse.collision.kernels.lane_clearance import block_clearances
-from robotdiffuse.collision.kernels.lanes import block_hits, free_many, make_workspace
+from robotdiffuse.collision.kernels.lane_collision import block_hits, free_many, make_workspace
 from robotdiffuse.collision.kernels.motions import motion_free
-from robotdiffuse.collision.points import THINNING, build_grid, cover, thin
-from robotdiffuse.errors import InputError
+from robotdiffuse.collision.point_cloud_grid import THINNING, build_grid, cover, thin
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE

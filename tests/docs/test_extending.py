@@ -12,21 +12,21 @@ import pytest
 import robotdiffuse as rd
 from helpers.code_blocks import ROOT, Notebook, code_blocks
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.evaluation.metrics import METRICS
 from robotdiffuse.learning.costs import COSTS
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import ENCODERS
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.planners import PLANNERS
+from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.family import Family
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.scenes.files import SHAPES
-from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.simulation import PyBulletOracle
-from robotdiffuse.viewer.html import write_replay
+from robotdiffuse.visualization.replay_page import write_replay
 
 TABLES: tuple[dict[str, Any], ...] = (
     *(PLANNERS, FAMILIES, METRICS, SHAPES),

@@ -7,7 +7,7 @@ import pytest
 
 from helpers.example_robots import planar_arm
 from robotdiffuse.cli import main
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation import ablation
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.statistics import bootstrap_interval

@@ -9,16 +9,19 @@ import numpy as np
 import pytest
 
 from robotdiffuse.cli import main
-from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.bench import figures, page, plots, report
-from robotdiffuse.evaluation.bench.folder import Bench, read_bench
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation.bench import figures
+from robotdiffuse.evaluation.bench import page
+from robotdiffuse.evaluation.bench import plots
+from robotdiffuse.evaluation.bench import report
+from robotdiffuse.evaluation.bench.run_folder import Bench, read_bench
 from robotdiffuse.evaluation.bench.outcomes import GAVE_UP, LATER, RAN_OUT, counting, outcome
 from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
 from robotdiffuse.evaluation.problem_sets import case_file
 from robotdiffuse.evaluation.records import RESTARTED, Record, record_of_row, record_path
 from robotdiffuse.evaluation.tables import Table
 from robotdiffuse.problems.held_out import Case, held_out_problem
-from robotdiffuse.types import Path as Motion
+from robotdiffuse.core.types import Path as Motion
 
 RUN = {
     "date": "2026-01-02 03:04",

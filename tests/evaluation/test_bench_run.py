@@ -15,22 +15,22 @@ import pytest
 
 from helpers import faulty_planner
 from robotdiffuse.cli import main
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench import planner_process
-from robotdiffuse.evaluation.bench.contestants import Contestant
+from robotdiffuse.evaluation.bench.entries import Contestant
 from robotdiffuse.evaluation.bench.runner import BenchSettings, open_trials, run_bench
 from robotdiffuse.evaluation.problem_sets import gather_cases, judge
 from robotdiffuse.evaluation.records import Record, RecordFile, read_records
-from robotdiffuse.evaluation.trial import Trial
-from robotdiffuse.planners import PLANNERS
-from robotdiffuse.planners.aorrtc.planner import AORRTCSettings
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse
-from robotdiffuse.planners.rrt_connect import RRTConnect
+from robotdiffuse.evaluation.runs import Trial
+from robotdiffuse.planning import PLANNERS
+from robotdiffuse.planning.search.aorrtc import AORRTCSettings
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length
-from robotdiffuse.registry import Entry
-from robotdiffuse.types import Path as Motion
-from robotdiffuse.verify import verify
+from robotdiffuse.core.registry import Entry
+from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.validation.validator import verify
 
 RECORD = Record(
     "rrt_connect", "rop", "rop/0", "rop", False, 0, 1.0, "solved", "", 0.01, progress=((0.01, 2.0),)

@@ -9,14 +9,14 @@ import pytest
 
 from helpers.box_arm import box_arm
 from helpers.motion_stores import line, random_motions, record, write_motions
-from robotdiffuse.data.shards import motion_of, pick_rows, problem_of, read_shard, shard_path, write_shard
-from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data.check import KINDS, check_data
+from robotdiffuse.datasets.shards import motion_of, pick_rows, problem_of, read_shard, shard_path, write_shard
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation.datasets.check import KINDS, check_data
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.types import Path as Motion
-from robotdiffuse.types import Trajectory
+from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.core.types import Trajectory
 
 ARM = box_arm()
 BALL = Scene([Sphere([0.0, 0.9, 0.0], 0.1)])

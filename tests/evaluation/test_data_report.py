@@ -10,10 +10,10 @@ pytest.importorskip("matplotlib")
 
 from helpers.box_arm import box_arm
 from helpers.motion_stores import random_motions, write_motions
-from robotdiffuse.errors import InputError
-from robotdiffuse.evaluation.data import report
-from robotdiffuse.evaluation.data.page import write_page
-from robotdiffuse.evaluation.data.report import FRAMES_KEPT, facts, read_figures, size_in_words, tables
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation.datasets import report
+from robotdiffuse.evaluation.datasets.page import write_page
+from robotdiffuse.evaluation.datasets.report import FRAMES_KEPT, facts, read_figures, size_in_words, tables
 from robotdiffuse.robots import load_robot
 
 ARM = box_arm()

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from helpers.example_robots import planar_arm
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.errors import InputError
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.comscore import (
     PAPER_TABLE_1,
     Indicators,
@@ -32,9 +32,9 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.transforms import rotation_about, transform
-from robotdiffuse.types import Path, Trajectory
-from robotdiffuse.verify import VerifySettings, verify
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.validation.validator import VerifySettings, verify
 
 PANDA = load_robot("panda")
 ARM = planar_arm(0.5, 0.4)

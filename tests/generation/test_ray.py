@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 
 from helpers.factory_runs import contents, in_this_process
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
 from robotdiffuse.evaluation.records import read_records
-from robotdiffuse.generation import GenerationSettings, factory, generate
+from robotdiffuse.generation import GenerationSettings, generate
+from robotdiffuse.generation import factory
 
 # read when ray is imported: no telemetry, and no pages of logs when a node is lost
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"

@@ -32,9 +32,9 @@ from numpy import ndarray
 from safetensors.numpy import load_file
 
 from robotdiffuse.cli import main as main_of_cli
-from robotdiffuse.data.shards import read_shard
+from robotdiffuse.datasets.shards import read_shard
 from robotdiffuse.generation import factory
-from robotdiffuse.planners import load_planner
+from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem

@@ -3,11 +3,11 @@
 import os
 import signal
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.planners.call import Call
-from robotdiffuse.planners.ends import Ends
-from robotdiffuse.planners.rrt_connect import RRTConnect, RRTConnectSettings
-from robotdiffuse.results import PlanResult
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.search.rrt_connect import RRTConnect, RRTConnectSettings
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 
 __all__ = ["Deadly", "RRTConnectSettings"]

@@ -4,7 +4,7 @@ import ctypes
 import os
 import sys
 
-from robotdiffuse.processes import LoneWorker
+from robotdiffuse.core.processes import LoneWorker
 
 
 def nothing() -> None:

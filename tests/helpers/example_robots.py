@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.robots.urdf import read_urdf
-from robotdiffuse.transforms import transform
+from robotdiffuse.robots.parsing.urdf import read_urdf
+from robotdiffuse.core.transforms import transform
 
 TIPS = {
     "panda": "panda_hand",

@@ -4,11 +4,11 @@ import os
 import signal
 import time
 
-from robotdiffuse.planners import Entry
-from robotdiffuse.planners.call import Call
-from robotdiffuse.planners.rrt_connect import RRTConnect
+from robotdiffuse.planning import Entry
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.results import PlanResult
+from robotdiffuse.core.results import PlanResult
 
 SOLVES, RAISES, DIES, HANGS, TALKS, SEARCHES = range(6)
 

@@ -7,10 +7,10 @@ from numpy import ndarray
 
 from helpers.stores import GOALS, SLOTS, manifest_of
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.data.manifest import Manifest, write_manifest
-from robotdiffuse.data.shards import write_shard
+from robotdiffuse.datasets.manifest import Manifest, write_manifest
+from robotdiffuse.datasets.shards import write_shard
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 

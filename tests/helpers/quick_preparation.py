@@ -5,11 +5,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from robotdiffuse.robots import sphere_room
-from robotdiffuse.robots.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.convex_parts import PartSettings
-from robotdiffuse.robots.preparation import PreparationSettings
-from robotdiffuse.robots.sphere_fitting import SphereSettings
+from robotdiffuse.robots.fitting import sphere_size_grid
+from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
+from robotdiffuse.robots.fitting.convex_parts import PartSettings
+from robotdiffuse.robots.fitting.preparation import PreparationSettings
+from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings
 
 QUICK = PreparationSettings(
     parts=PartSettings(voxels=20_000, faces=60, rounding=2e-3),
@@ -24,5 +24,5 @@ QUICK = PreparationSettings(
 def coarse_grids() -> Iterator[None]:
     """Spheres are fitted on a tenth of the grid points."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sphere_room, "GRID_POINTS", sphere_room.GRID_POINTS // 10)
+        patch.setattr(sphere_size_grid, "GRID_POINTS", sphere_size_grid.GRID_POINTS // 10)
         yield

@@ -39,7 +39,7 @@ def serving(*arguments: str, **environment: str) -> Iterator[tuple[httpx.Client,
 if __name__ == "__main__":
     from helpers.faulty_planner import ENTRY
     from robotdiffuse.cli import main
-    from robotdiffuse.planners import PLANNERS
+    from robotdiffuse.planning import PLANNERS
 
     PLANNERS["faulty"] = ENTRY
     sys.exit(main())

@@ -7,11 +7,11 @@ import numpy as np
 from numpy import ndarray
 from numpy.random import Generator
 
-from robotdiffuse.data.manifest import Manifest, write_manifest
-from robotdiffuse.data.shards import write_shard
+from robotdiffuse.datasets.manifest import Manifest, write_manifest
+from robotdiffuse.datasets.shards import write_shard
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import BOX, SPHERE
+from robotdiffuse.scenes.scene_arrays import BOX, SPHERE
 
 WAYPOINTS, SLOTS, GOALS = 254, 4, 3
 

@@ -18,8 +18,8 @@ from robotdiffuse.learning.checkpoint import write_tensors
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.processes import Processes
-from robotdiffuse.learning.training.run import TrainingRun, Validation
-from robotdiffuse.processes import leave
+from robotdiffuse.learning.training.loop import TrainingRun, Validation
+from robotdiffuse.core.processes import leave
 
 STEP_SECONDS = 0.3
 STOP_AFTER = 3

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.robots.visual import PLAIN, UNIT, VisualMesh
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.visual_meshes import PLAIN, UNIT, VisualMesh
 
 
 def write_visual(visual: dict[str, VisualMesh], file: Path) -> None:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_completion, save_completion
 from robotdiffuse.learning.completion import imagine
-from robotdiffuse.learning.completion.ahead import SamplesAhead
+from robotdiffuse.learning.training.prefetch import SamplesAhead
 from robotdiffuse.learning.completion.network import (
     CompletionNetwork,
     CompletionSettings,
@@ -38,8 +38,8 @@ from robotdiffuse.learning.training.completion import (
 )
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.observed_volume import SHAPE, observe
-from robotdiffuse.scenes.ray_caster import looking_at, ray_cast
+from robotdiffuse.perception.observed_volume import SHAPE, observe
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 

@@ -9,7 +9,7 @@ import torch
 
 from helpers.box_arm import box_arm
 from helpers.small_model import small_model
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model, save_network
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import Denoiser

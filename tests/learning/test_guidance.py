@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal

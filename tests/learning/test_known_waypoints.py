@@ -9,17 +9,17 @@ from numpy import ndarray
 
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
-from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoderSettings
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.planners.diffusion import encode
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse
+from robotdiffuse.planning.diffusion.diffusion import encode
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere

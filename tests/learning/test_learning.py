@@ -10,7 +10,7 @@ import torch
 from helpers.box_arm import box_arm
 from helpers.example_robots import planar_arm
 from helpers.small_model import SMALL_ENCODER, small_model
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import (
     fingerprint,
     load_encoder,
@@ -28,7 +28,7 @@ from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.robots.normalizer import JointNormalizer
-from robotdiffuse.scenes.sampling import PANDA_REGION
+from robotdiffuse.scenes.surface_points import PANDA_REGION
 
 
 def cloud(n: int, seed: int = 0) -> torch.Tensor:

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.training.losses import ArmDistance, LossSettings, SurfacePoints, hinge
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.parametrization import PARAMETRIZATIONS, parametrization
 
 ROWS = {"waypoints": 48, "b_spline": 12}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.diffusion import SCHEDULES, NoiseSchedule, ScheduleSettings
 from robotdiffuse.learning.objectives import OBJECTIVES, objective_for

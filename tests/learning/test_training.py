@@ -20,10 +20,10 @@ from helpers.box_arm import box_arm
 from helpers.stores import WAYPOINTS as STORED
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.data.manifest import write_manifest
-from robotdiffuse.data.shards import shard_path, split_of, write_shard
-from robotdiffuse.errors import InputError
-from robotdiffuse.files import alone_in
+from robotdiffuse.datasets.manifest import write_manifest
+from robotdiffuse.datasets.shards import shard_path, split_of, write_shard
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import alone_in
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors, save_encoder
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
@@ -34,8 +34,8 @@ from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.objectives import OBJECTIVES
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training import planner as training
-from robotdiffuse.learning.training import run as training_run
-from robotdiffuse.learning.training import trainee
+from robotdiffuse.learning.training import loop as training_run
+from robotdiffuse.learning.training import task
 from robotdiffuse.learning.training.batches import (
     Batch,
     Batches,
@@ -48,9 +48,9 @@ from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.learning.training.processes import Processes
-from robotdiffuse.learning.training.run import TrainingRun, Validation
-from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
-from robotdiffuse.scenes.sampling import sample_surface
+from robotdiffuse.learning.training.loop import TrainingRun, Validation
+from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
@@ -240,14 +240,14 @@ def test_takes_in_data_that_are_still_being_made(tmp_path, data, monkeypatch, ca
         if self.at.step == 3:
             (tmp_path / "later").rename(shard_path(data, 1))
 
-    read = trainee.load_data
+    read = task.load_data
 
     def count_reading(*given):
         known.append(read(*given))
         return known[-1]
 
     monkeypatch.setattr(TrainingRun, "step", step)
-    monkeypatch.setattr(trainee, "load_data", count_reading)
+    monkeypatch.setattr(task, "load_data", count_reading)
     settings = planner_settings(data, checkpoint_seconds=0.0, samples=96)
     train_planner(settings, str(tmp_path / "out"))
     assert len(known) == 2 and len(known[0]) < len(known[1])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.generation.settings import TARGETS, GenerationSettings
 from robotdiffuse.generation.shard_maker import draw
 from robotdiffuse.problems.families import FAMILIES, load_family
@@ -17,7 +17,7 @@ from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 PANDA = load_robot("panda")
 every_family = pytest.mark.parametrize("name", FAMILIES)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families import furniture
 from robotdiffuse.problems.families.clutter import CLUTTER
 from robotdiffuse.problems.families.crate import CRATE
@@ -26,7 +26,7 @@ from robotdiffuse.problems.families.table import TABLE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import BOX, PackedScenes
+from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
 BASE = np.array([[0, 0, 0.1, 0.15], [-0.1, 0, 0.05, 0.1]])

@@ -12,16 +12,16 @@ from scipy.interpolate import CubicHermiteSpline
 from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
-from robotdiffuse.errors import InputError
-from robotdiffuse.planners import PLANNERS
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
 from robotdiffuse.problems.goals import AnyGoal, JointGoal, PoseGoal
 from robotdiffuse.robots.kinematics import link_origins, link_pose
-from robotdiffuse.tolerances import goal_error
-from robotdiffuse.transforms import inverse, rotation_from_rpy, rpy_from_rotation, transform
-from robotdiffuse.types import Path as JointPath
-from robotdiffuse.types import Status, Trajectory
-from robotdiffuse.verify import verify, verify_trajectory
+from robotdiffuse.validation.tolerances import goal_error
+from robotdiffuse.core.transforms import inverse, rotation_from_rpy, rpy_from_rotation, transform
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.core.types import Status, Trajectory
+from robotdiffuse.validation.validator import verify, verify_trajectory
 
 ROBOT = rd.load_robot("panda")
 START, MIDDLE, END = (

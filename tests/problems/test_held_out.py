@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.held_out import (
     Case,
     CaseFile,
@@ -15,7 +15,7 @@ from robotdiffuse.problems.held_out import (
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.types import Path as Motion
+from robotdiffuse.core.types import Path as Motion
 
 
 class Referee:

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 import yaml
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import load_motion_bench_maker, load_problems, problem_record
 from robotdiffuse.problems.moveit import (
     MoveItFrames,
@@ -20,13 +20,13 @@ from robotdiffuse.problems.moveit import (
     read_moveit_scene,
 )
 from robotdiffuse.problems.problem import JointGoal, PoseGoal
-from robotdiffuse.reading import read_yaml
+from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.robots import Robot, load_robot
-from robotdiffuse.robots.bundle import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.urdf import read_urdf
+from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
-from robotdiffuse.transforms import (
+from robotdiffuse.core.transforms import (
     quaternion_from_rotation,
     rotation_about,
     rotation_from_quaternion,

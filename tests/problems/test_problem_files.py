@@ -11,7 +11,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import (
     load_problem,
     load_problems,
@@ -24,7 +24,7 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
-from robotdiffuse.transforms import rotation_about, transform
+from robotdiffuse.core.transforms import rotation_about, transform
 
 Z = np.array([0.0, 0.0, 1.0])
 READY = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]

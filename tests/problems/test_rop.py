@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
-from robotdiffuse.scenes.packed import PackedScenes
-from robotdiffuse.scenes.sampling import VisibleRegion, sample_surface
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 

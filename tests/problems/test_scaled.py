@@ -10,8 +10,8 @@ from robotdiffuse.problems.families.scaled import ScaledFamily, family_for, scal
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.scaled import reach, scaled
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.robots.scaling import reach, scaled
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
 
 SMALL, EMPTY = load_robot("so101"), Scene([])

@@ -7,14 +7,14 @@ import pytest
 import trimesh
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.planners import load_planner
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import DATA, ROBOTS, load_robot
-from robotdiffuse.robots.bundle import read_source
+from robotdiffuse.robots.robot_folder import read_source
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.sphere_kernels import gaps, within
-from robotdiffuse.robots.sphere_room import stacked_planes
+from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps, within
+from robotdiffuse.robots.fitting.sphere_size_grid import stacked_planes
 from robotdiffuse.scenes.scene import Scene
 
 NOTICE = (Path(__file__).parents[2] / "NOTICE").read_text()

@@ -9,16 +9,16 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.example_robots import urdf_file
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
-from robotdiffuse.robots.bundle import read_bundle, write_bundle
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.robots.dynamics import GRAVITY, Dynamics
 from robotdiffuse.robots.inertias import Payload, inertia_of
 from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.transforms import rotation_about, transform
-from robotdiffuse.types import Path as JointPath
-from robotdiffuse.types import Status
-from robotdiffuse.verify import verify, verify_trajectory
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify, verify_trajectory
 
 pinocchio: Any = pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
 PANDA = rd.load_robot("panda")

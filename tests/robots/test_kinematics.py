@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from helpers.example_robots import TIPS, example_robot, planar_arm, urdf_file
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from helpers.box_arm import box_arm
-from robotdiffuse.collision.arrays import compile_robot
-from robotdiffuse.errors import InputError
+from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.bundle import MESH_FILE, ROBOT_FILE, write_bundle
+from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, write_bundle
 from robotdiffuse.robots.robot import VARIANTS, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere

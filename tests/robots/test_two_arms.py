@@ -15,25 +15,26 @@ from helpers.example_robots import example_robot
 from helpers.made_arms import chain, row, written
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.constraints import kept
-from robotdiffuse.cli import main, plan
+from robotdiffuse.cli import main
+from robotdiffuse.cli import plan
 from robotdiffuse.cli.console import Waiting
 from robotdiffuse.cli.plan import solve
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.arrays import reach_bound
-from robotdiffuse.collision.exact import ExactCollision
+from robotdiffuse.collision.kernel_arrays import reach_bound
+from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernels.compiled import parent_of
-from robotdiffuse.errors import InputError
-from robotdiffuse.planners.call import Call
-from robotdiffuse.robots.bundle import read_bundle, write_bundle
-from robotdiffuse.robots.covering import cover
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning.context import Call
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.inertias import Payload, inertia_of
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.scaled import reach
-from robotdiffuse.robots.srdf import read_srdf
-from robotdiffuse.robots.urdf import read_urdf
+from robotdiffuse.robots.scaling import reach
+from robotdiffuse.robots.parsing.srdf import read_srdf
+from robotdiffuse.robots.parsing.urdf import read_urdf
 
 PARTS = chain("base", ["waist"]), chain("waist_link", row("left_", 4)), chain("waist_link", row("right_", 4))
 

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 from numpy import ndarray
 from trimesh.triangles import closest_point
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.reading import read_triangles, read_yaml
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.input_files import read_triangles, read_yaml
 from robotdiffuse.scenes.files import SHAPES as KINDS
 from robotdiffuse.scenes.files import read_scene, scene_entries
 from robotdiffuse.scenes.point_cloud import crop, read_points, voxel_thin
-from robotdiffuse.scenes.sampling import DRAWS, VisibleRegion, sample_surface
+from robotdiffuse.scenes.surface_points import DRAWS, VisibleRegion, sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 

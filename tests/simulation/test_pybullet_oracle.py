@@ -10,8 +10,8 @@ from dataclasses import replace
 
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
-from robotdiffuse.collision.exact import ExactCollision
-from robotdiffuse.errors import InputError
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
@@ -19,8 +19,8 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 from robotdiffuse.simulation import PyBulletOracle
 from robotdiffuse.simulation.world import World
-from robotdiffuse.types import Path
-from robotdiffuse.verify import verify
+from robotdiffuse.core.types import Path
+from robotdiffuse.validation.validator import verify
 
 TOLERANCE = 7e-4
 """Most distances agree to 5e-6 m; Bullet rounds the edges of its boxes and cylinders by up to 0.6 mm."""

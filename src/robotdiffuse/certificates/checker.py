@@ -12,7 +12,7 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import CAP, SCENE, Claim, Prover
-from robotdiffuse.certificates.certificate import AGREEMENT, Certificate, Proof, Tolerances
+from robotdiffuse.certificates.proof import AGREEMENT, Certificate, Proof, Tolerances
 from robotdiffuse.certificates.content import (
     differences,
     motion_hash,
@@ -20,11 +20,11 @@ from robotdiffuse.certificates.content import (
     robot_parts,
     scene_parts,
 )
-from robotdiffuse.certificates.moving import MovingProver
+from robotdiffuse.certificates.moving_obstacles import MovingProver
 from robotdiffuse.certificates.requests import configurations, wrong
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.types import Path, Trajectory
+from robotdiffuse.core.types import Path, Trajectory
 
 JUDGE = Tolerances()
 

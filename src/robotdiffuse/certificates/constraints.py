@@ -14,11 +14,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.certificates.kinematics import Linkage, Postures, cross_matrix
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
 from robotdiffuse.problems.goals import JointGoal, poses_of
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.types import Trajectory
+from robotdiffuse.core.types import Trajectory
 
 
 class Kept(NamedTuple):

@@ -15,7 +15,7 @@ from numpy import ndarray
 from robotdiffuse.certificates.kinematics import Linkage
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.inertias import Inertia
-from robotdiffuse.types import Path, Trajectory
+from robotdiffuse.core.types import Path, Trajectory
 
 GRAVITY = 9.81
 """Along -z of the world [m/s²]."""

@@ -11,9 +11,9 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.processes import end, interrupts_not_passed_on, prepare_worker
-from robotdiffuse.registry import Added, added
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.processes import end, interrupts_not_passed_on, prepare_worker
+from robotdiffuse.core.registry import Added, added
 
 if TYPE_CHECKING:
     from robotdiffuse.generation import GenerationSettings
@@ -55,7 +55,7 @@ def filled_meanwhile(folder: str, workers: int, robot: str) -> Iterator[None]:
 
 
 def _has_shard(folder: str) -> bool:
-    from robotdiffuse.data.shards import shard_indices
+    from robotdiffuse.datasets.shards import shard_indices
 
     return bool(shard_indices(folder))
 
@@ -110,7 +110,7 @@ def _fill(folder: str, workers: int, robot: str, connection: Connection, entries
 
 
 def _settings(folder: str, robot: str) -> "GenerationSettings":
-    from robotdiffuse.data.manifest import MANIFEST, read_manifest
+    from robotdiffuse.datasets.manifest import MANIFEST, read_manifest
     from robotdiffuse.generation import GenerationSettings
 
     if not (Path(folder) / MANIFEST).exists():

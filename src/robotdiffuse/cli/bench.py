@@ -5,14 +5,14 @@ import os
 from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import count, positive
-from robotdiffuse.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.problems.families import FAMILIES
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from robotdiffuse.evaluation.bench.figures import Section
-    from robotdiffuse.evaluation.bench.folder import Bench
+    from robotdiffuse.evaluation.bench.run_folder import Bench
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -137,9 +137,9 @@ def run_report(arguments: argparse.Namespace) -> int:
 
     from robotdiffuse.evaluation.bench import report
     from robotdiffuse.evaluation.bench.figures import sections
-    from robotdiffuse.evaluation.bench.folder import read_bench
+    from robotdiffuse.evaluation.bench.run_folder import read_bench
     from robotdiffuse.evaluation.bench.page import write_page, write_plots
-    from robotdiffuse.files import write_atomically
+    from robotdiffuse.core.output_files import write_atomically
 
     planners = None if arguments.planners is None else arguments.planners.split(",")
     limits = None if arguments.limits is None else _limits(arguments.limits)
@@ -160,8 +160,8 @@ def run_report(arguments: argparse.Namespace) -> int:
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
     """The name of the file; None if there is nothing to replay."""
     from robotdiffuse.evaluation.bench.page import worth_showing
-    from robotdiffuse.types import Path as Waypoints
-    from robotdiffuse.viewer.gallery import Exhibit, write_gallery
+    from robotdiffuse.core.types import Path as Waypoints
+    from robotdiffuse.visualization.gallery import Exhibit, write_gallery
 
     shown = worth_showing(bench, parts)
     if not shown:

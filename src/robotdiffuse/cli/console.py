@@ -7,8 +7,8 @@ if TYPE_CHECKING:
     from rich.status import Status
 
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.results import PlanResult
-    from robotdiffuse.verify import Report
+    from robotdiffuse.core.results import PlanResult
+    from robotdiffuse.validation.validator import Report
 
 
 PATIENCE = 2.0
@@ -87,8 +87,8 @@ def print_result(result: "PlanResult") -> None:
 
 def print_next_view(problem: "Problem", result: "PlanResult") -> None:
     """Where a camera is to look next, as problem files say it."""
-    from robotdiffuse.planners.next_view import next_view
-    from robotdiffuse.transforms import pose_entry
+    from robotdiffuse.planning.next_view import next_view
+    from robotdiffuse.core.transforms import pose_entry
 
     proposed = next_view(problem, result)
     camera = ", ".join(

@@ -2,7 +2,8 @@
 
 import argparse
 
-from robotdiffuse.cli import data_generate, data_look
+from robotdiffuse.cli import data_generate
+from robotdiffuse.cli import data_inspect
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -11,8 +12,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     data_generate.add_generate(actions)
-    data_look.add_info(actions)
-    data_look.add_check(actions)
-    data_look.add_view(actions)
-    data_look.add_export(actions)
-    data_look.add_import(actions)
+    data_inspect.add_info(actions)
+    data_inspect.add_check(actions)
+    data_inspect.add_view(actions)
+    data_inspect.add_export(actions)
+    data_inspect.add_import(actions)

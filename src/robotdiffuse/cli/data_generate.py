@@ -85,9 +85,9 @@ SETTINGS = (
 def run_generate(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
-    from robotdiffuse.errors import InputError
+    from robotdiffuse.core.errors import InputError
     from robotdiffuse.generation import GenerationSettings
-    from robotdiffuse.generation.searches import SEARCHES
+    from robotdiffuse.generation.solvers import SEARCHES
 
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers is for this machine's processes; --cluster uses all cores that it has")

@@ -9,7 +9,7 @@ import threading
 from typing import NoReturn
 
 from robotdiffuse.cli.arguments import positive
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 
 LOOPBACK = "127.0.0.1"
 PORT = 8080
@@ -56,7 +56,7 @@ def port(text: str) -> int:
 
 def run(arguments: argparse.Namespace) -> NoReturn:
     try:
-        from robotdiffuse.live.page import Page
+        from robotdiffuse.visualization.live.page import Page
     except ModuleNotFoundError as error:
         if error.name != "viser":
             raise
@@ -64,10 +64,10 @@ def run(arguments: argparse.Namespace) -> NoReturn:
     from rich.console import Console
 
     from robotdiffuse.cli import STOPPED
-    from robotdiffuse.live.door import bound, is_loopback, new_token
-    from robotdiffuse.live.exchange import first_problem
-    from robotdiffuse.live.session import Choice, Session
-    from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS
+    from robotdiffuse.visualization.live.access import bound, is_loopback, new_token
+    from robotdiffuse.visualization.live.files import first_problem
+    from robotdiffuse.visualization.live.session import Choice, Session
+    from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
 
     planner = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(planner)

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 from robotdiffuse.cli.arguments import natural, not_negative, positive, share
 from robotdiffuse.cli.console import Waiting, print_next_view, print_result
-from robotdiffuse.cli.draw import ENDINGS, draw, show
-from robotdiffuse.handover import WRITERS
-from robotdiffuse.types import SHORT, UNTIL
+from robotdiffuse.cli.drawing import ENDINGS, draw, show
+from robotdiffuse.interop import WRITERS
+from robotdiffuse.core.types import SHORT, UNTIL
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.results import PlanResult
-    from robotdiffuse.settings import Settings
+    from robotdiffuse.core.results import PlanResult
+    from robotdiffuse.core.settings import Settings
 
 RESULT_ENDINGS = (".json", ".csv", *ENDINGS, *WRITERS)
 DEMO, DEMO_FAMILY = "shelf.yaml", "shelf"
@@ -128,9 +128,9 @@ def add_demo(commands: argparse._SubParsersAction) -> None:
 
 
 def run_plan(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.files import check_output
-    from robotdiffuse.handover import check_export, write_motion
-    from robotdiffuse.planners import DEFAULT_PLANNER, PLANNERS, planner_settings
+    from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.interop import check_export, write_motion
+    from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, planner_settings
     from robotdiffuse.problems.files import load_problem, problem_record
 
     name = arguments.planner or DEFAULT_PLANNER
@@ -193,15 +193,15 @@ def with_policy(problem: "Problem", unseen: str) -> "Problem":
 
 def check_seen(option: str, problem: "Problem") -> None:
     """InputError for a problem without views."""
-    from robotdiffuse.errors import InputError
+    from robotdiffuse.core.errors import InputError
 
     if not problem.views:
         raise InputError(f"{option} is for problems that cameras saw; this one has no views")
 
 
 def run_demo(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.files import check_output
-    from robotdiffuse.planners import DEFAULT_PLANNER
+    from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.planning import DEFAULT_PLANNER
     from robotdiffuse.problems.files import load_problem
 
     outputs = [check_output(file, ENDINGS) for file in ("demo.png", "demo.html")]
@@ -219,7 +219,7 @@ def run_demo(arguments: argparse.Namespace) -> int:
     if result.trajectory is None or result.path is None:
         return 1
     if arguments.camera:
-        from robotdiffuse.verify import verify
+        from robotdiffuse.validation.validator import verify
 
         violation = verify(true, result.path).violation
         print("in the true scene:", "free" if violation is None else violation.message)
@@ -247,7 +247,7 @@ def through_camera(problem: "Problem") -> "Problem":
 
     from robotdiffuse.problems.families.furniture import FLOOR
     from robotdiffuse.problems.problem import IMAGINED
-    from robotdiffuse.scenes.ray_caster import looking_at, ray_cast
+    from robotdiffuse.perception.ray_caster import looking_at, ray_cast
     from robotdiffuse.scenes.scene import Scene
 
     T_base_camera = looking_at(np.array(DEMO_CAMERA), np.array(DEMO_TARGET))
@@ -270,9 +270,9 @@ def solve(
 
     The compiled code is loaded before, or compiled on a new machine, which would otherwise use up the limit.
     """
-    from robotdiffuse.planners import load_planner
-    from robotdiffuse.planners.base import compiles_first
-    from robotdiffuse.processes import interrupts_at_once
+    from robotdiffuse.planning import load_planner
+    from robotdiffuse.planning.planner import compiles_first
+    from robotdiffuse.core.processes import interrupts_at_once
 
     loading = Waiting(f"loading compiled code ({compiles_first(problem.robot)})")
     with interrupts_at_once(loading.stop), loading:

@@ -15,7 +15,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation.tables import Column, Table, show
-    from robotdiffuse.planners import PLANNERS, planner_settings
+    from robotdiffuse.planning import PLANNERS, planner_settings
 
     if arguments.planner is None:
         rows = [(name, entry.kind, entry.description) for name, entry in PLANNERS.items()]

@@ -6,13 +6,13 @@ from collections import Counter
 from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import assignment, folder, natural
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
     from jaxtyping import Float
     from numpy import ndarray
 
-    from robotdiffuse.robots.add import AddReport
+    from robotdiffuse.robots.fitting.add import AddReport
     from robotdiffuse.robots.robot import Joint, Robot
 
 
@@ -92,9 +92,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run_list(arguments: argparse.Namespace) -> int:
     from robotdiffuse.evaluation.tables import Column, Table, show
-    from robotdiffuse.learning.weights_at_hand import weights_for
+    from robotdiffuse.learning.weights_registry import weights_for
     from robotdiffuse.robots import known_robots, load_robot
-    from robotdiffuse.robots.bundle import read_source
+    from robotdiffuse.robots.robot_folder import read_source
 
     rows = []
     for name, place in known_robots().items():
@@ -124,13 +124,13 @@ def run_add(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from robotdiffuse.processes import interrupts_at_once
+    from robotdiffuse.core.processes import interrupts_at_once
 
     console = Console(stderr=True)
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
     with interrupts_at_once(bar.stop), bar:
-        from robotdiffuse.cli.preparation import print_preparation
-        from robotdiffuse.robots.add import add_robot
+        from robotdiffuse.cli.robot_report import print_preparation
+        from robotdiffuse.robots.fitting.add import add_robot
 
         task = bar.add_task("reading")
 
@@ -180,7 +180,7 @@ def _print_pairs(report: "AddReport") -> None:
 
 def print_robot(robot: "Robot") -> None:
     from robotdiffuse.evaluation.tables import Column, Table, show
-    from robotdiffuse.transforms import inverse
+    from robotdiffuse.core.transforms import inverse
 
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
     joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]
@@ -206,7 +206,7 @@ def _range(joint: "Joint") -> tuple[float | None, float | None]:
 
 
 def _place(T: "Float[ndarray, '4 4']") -> str:
-    from robotdiffuse.transforms import quaternion_from_rotation
+    from robotdiffuse.core.transforms import quaternion_from_rotation
 
     xyz, wxyz = T[:3, 3], quaternion_from_rotation(T[:3, :3])
     return " ".join(["xyz", *(f"{value:g}" for value in xyz), "wxyz", *(f"{value:.4g}" for value in wxyz)])

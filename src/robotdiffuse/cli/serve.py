@@ -66,14 +66,14 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.errors import InputError, shown
-    from robotdiffuse.reading import MEGABYTE
+    from robotdiffuse.core.errors import InputError, shown
+    from robotdiffuse.core.input_files import MEGABYTE
 
     try:
-        from robotdiffuse.serve.server import serve
+        from robotdiffuse.server.server import serve
     except ImportError:
         raise InputError('serve needs fastapi and uvicorn: pip install "robotdiffuse[serve]"') from None
-    from robotdiffuse.serve.settings import ServeSettings
+    from robotdiffuse.server.settings import ServeSettings
 
     settings = ServeSettings(
         host=arguments.host,
@@ -96,7 +96,7 @@ def served_robots(names: Sequence[str]) -> "dict[str, Robot]":
 
     Raises InputError where two would have one name.
     """
-    from robotdiffuse.errors import InputError, shown
+    from robotdiffuse.core.errors import InputError, shown
     from robotdiffuse.robots import ROBOTS, known_robots, load_robot
 
     robots = {name: load_robot(name) for name in ROBOTS}

@@ -4,7 +4,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.view import read
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
     from robotdiffuse.simulation.replay import Replay
@@ -33,10 +33,11 @@ def add(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     from rich.console import Console
 
-    from robotdiffuse.files import check_output
+    from robotdiffuse.core.output_files import check_output
 
     try:
-        from robotdiffuse.simulation import replay, write_gif, write_png
+        from robotdiffuse.simulation import write_gif, write_png
+        from robotdiffuse.simulation import replay
     except ModuleNotFoundError as error:
         if error.name != "pybullet":
             raise

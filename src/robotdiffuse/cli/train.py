@@ -7,7 +7,7 @@ from functools import partial
 from typing import Any
 
 from robotdiffuse.cli.arguments import count, names, natural, positive, share
-from robotdiffuse.errors import InputError, shown
+from robotdiffuse.core.errors import InputError, shown
 
 SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
 PARTS = (

@@ -14,8 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.files import write_atomically
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
@@ -42,7 +42,7 @@ BYTES_OF_RUN = 100_000_000
 def data_for(source: str, robot: Robot, motions: int | None, seed: int | None) -> "GenerationSettings":
     """The motions that a network for the arm learns from."""
     from robotdiffuse.generation import GenerationSettings
-    from robotdiffuse.generation.aorrtc import AORRTCSearchSettings
+    from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
     from robotdiffuse.problems.families.scaled import scale_for
 
     return GenerationSettings(
@@ -76,7 +76,7 @@ def train_for_robot(
     from robotdiffuse.cli.data_generate import generated
     from robotdiffuse.learning.training.config import PlannerTraining
     from robotdiffuse.learning.training.planner import train_planner
-    from robotdiffuse.learning.weights_at_hand import user_weights
+    from robotdiffuse.learning.weights_registry import user_weights
 
     if int(os.environ.get("WORLD_SIZE", "1")) > 1:
         raise InputError("torchrun is for the training alone: make data first, then name them with --data")
@@ -116,7 +116,7 @@ def _check_room(work: Path, motions: int) -> None:
 def _leave_encoder(folder: Path) -> None:
     """The encoder of the weights that come with the package, as training takes one."""
     from robotdiffuse.learning.checkpoint import load_model, save_encoder
-    from robotdiffuse.learning.weights_at_hand import BUNDLED
+    from robotdiffuse.learning.weights_registry import BUNDLED
 
     if (folder / "encoder.json").is_file():
         return

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 from robotdiffuse.cli.arguments import natural
 from robotdiffuse.cli.console import clearances
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
-    from robotdiffuse import types
+    from robotdiffuse.core import types
     from robotdiffuse.problems.problem import Problem
 
 HELD, NOT_HELD = 0, 1
@@ -74,7 +74,7 @@ def add_certificate(commands: argparse._SubParsersAction) -> None:
 
 
 def run_verify(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.files import check_output
+    from robotdiffuse.core.output_files import check_output
 
     out = None if arguments.certificate is None else check_output(arguments.certificate, (".json",))
     problem, motions, notes = _asked(arguments)
@@ -82,7 +82,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
         print(f"note: {note}")
     valid = all([_judged(problem, what, motion, arguments.all) for what, motion in motions.items()])
     if out is not None and valid:
-        from robotdiffuse.certificates.writer import certify
+        from robotdiffuse.certificates.search import certify
 
         certificate = certify(problem, list(motions.values())[-1])
         certificate.save(out)
@@ -92,7 +92,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
 
 
 def run_check(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.certificates.certificate import load_certificate
+    from robotdiffuse.certificates.proof import load_certificate
     from robotdiffuse.problems.files import load_problem
 
     certificate = load_certificate(arguments.file)
@@ -107,8 +107,8 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 
 def _judged(problem: "Problem", what: str, motion: "types.Path | types.Trajectory", everything: bool) -> bool:
-    from robotdiffuse.types import Trajectory
-    from robotdiffuse.verify import verify, verify_trajectory
+    from robotdiffuse.core.types import Trajectory
+    from robotdiffuse.validation.validator import verify, verify_trajectory
 
     timed = isinstance(motion, Trajectory)
     report = verify_trajectory(problem, motion) if timed else verify(problem, motion)
@@ -117,7 +117,7 @@ def _judged(problem: "Problem", what: str, motion: "types.Path | types.Trajector
         return True
     found = (report.violation,)
     if everything:
-        from robotdiffuse.violations import violations
+        from robotdiffuse.validation.violations import violations
 
         found = violations(problem, motion) or found
     for violation in found:
@@ -129,7 +129,7 @@ def _along(file: str) -> "Problem":
     """The problem in a file of ours; InputError if it has none."""
     problem = None
     if file.lower().endswith(".mcap"):
-        from robotdiffuse.handover.mcap_file import problem_in
+        from robotdiffuse.interop.mcap_file import problem_in
 
         problem = problem_in(Path(file))
     if problem is None:
@@ -141,10 +141,10 @@ def _asked(
     arguments: argparse.Namespace,
 ) -> "tuple[Problem, dict[str, types.Path | types.Trajectory], tuple[str, ...]]":
     """The problem, the motions to judge, and what was changed to read them."""
-    from robotdiffuse.handover import read_motion
-    from robotdiffuse.handover.recorded import fitted, own_problem
+    from robotdiffuse.interop import read_motion
+    from robotdiffuse.interop.recorded_motion import fitted, own_problem
     from robotdiffuse.problems.files import load_problem
-    from robotdiffuse.types import Trajectory
+    from robotdiffuse.core.types import Trajectory
 
     if (arguments.scene is None) != (arguments.robot is None):
         raise InputError("--scene and --robot belong together: a planning scene does not say which robot")

@@ -4,12 +4,12 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.draw import ENDINGS, draw, show
-from robotdiffuse.errors import InputError
+from robotdiffuse.cli.drawing import ENDINGS, draw, show
+from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.results import PlanResult
+    from robotdiffuse.core.results import PlanResult
 
 
 def add_view(commands: argparse._SubParsersAction) -> None:
@@ -31,7 +31,7 @@ def add_view(commands: argparse._SubParsersAction) -> None:
 def read(file: str) -> "tuple[PlanResult, Problem]":
     """A solved result and its problem. Raises InputError where the file holds no motion or no problem."""
     from robotdiffuse.problems.files import problem_from_record
-    from robotdiffuse.results import load_result
+    from robotdiffuse.core.results import load_result
 
     saved = load_result(file)
     if not saved.result.solved:
@@ -44,7 +44,7 @@ def read(file: str) -> "tuple[PlanResult, Problem]":
 
 
 def run_view(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.files import check_output
+    from robotdiffuse.core.output_files import check_output
 
     files = arguments.out or [f"{Path(arguments.result).stem}.html"]
     outputs = [check_output(file, ENDINGS) for file in files]

@@ -4,9 +4,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.collision.arrays import compile_robot, compile_scene_for, robot_groups
-from robotdiffuse.collision.kernels import clearance_gradients, distance, lane_clearance, lanes
-from robotdiffuse.errors import InputError
+from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
+from robotdiffuse.collision.kernels import clearance_gradients
+from robotdiffuse.collision.kernels import distance
+from robotdiffuse.collision.kernels import lane_clearance
+from robotdiffuse.collision.kernels import lane_collision
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -32,7 +35,7 @@ class CollisionChecker:
 
     def free(self, q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
         """Whether each configuration is free of collision."""
-        return lanes.free_many(self.robot_arrays, self.scene_arrays, self._rows(q), self.padding)
+        return lane_collision.free_many(self.robot_arrays, self.scene_arrays, self._rows(q), self.padding)
 
     def link_clearances(self, q: Float[ndarray, "n dof"], limit: float = 1.0) -> Float[ndarray, "n links"]:
         """Signed distance of each moving link to the scene [m], at most `limit`; the lower, the faster.

@@ -4,11 +4,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.exact import Distance, ExactCollision
-from robotdiffuse.collision.hulls import checks_of
-from robotdiffuse.collision.kernels import sweep as kernel
-from robotdiffuse.collision.kernels.sweep import Motion
-from robotdiffuse.collision.motion import EPISODE_TRAVEL, Contact, ContinuousCollision
+from robotdiffuse.collision.exact_meshes import Distance, ExactCollision
+from robotdiffuse.collision.convex_geometry import checks_of
+from robotdiffuse.collision.kernels import motion_certificate as kernel
+from robotdiffuse.collision.kernels.motion_certificate import Motion
+from robotdiffuse.collision.motions import EPISODE_TRAVEL, Contact, ContinuousCollision
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.collision.arrays import SceneArrays, compile_robot, compile_scene_for, robot_groups
+from robotdiffuse.collision.kernel_arrays import SceneArrays, compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels.point_grid import KEEP
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot

@@ -15,25 +15,25 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.data.manifest import read_manifest
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.datasets.manifest import read_manifest
+from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, without_network
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.tables import Column, Table
-from robotdiffuse.evaluation.trial import tried
-from robotdiffuse.files import alone_in
+from robotdiffuse.evaluation.runs import tried
+from robotdiffuse.core.output_files import alone_in
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.planners.robotdiffuse import RobotDiffuse, RobotDiffuseSettings
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.held_out import Case
-from robotdiffuse.processes import Workers
+from robotdiffuse.core.processes import Workers
 from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"

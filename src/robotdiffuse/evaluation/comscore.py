@@ -34,7 +34,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 
 
 @dataclass(frozen=True)

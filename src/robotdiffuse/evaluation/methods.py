@@ -17,16 +17,16 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.metrics import Measure
 from robotdiffuse.evaluation.records import ENDED, RAISED, RESTARTABLE, SOLVED
-from robotdiffuse.evaluation.trial import Clock, Fields, Method, Trial
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial
 from robotdiffuse.learning.guidance import CollisionGuidance
-from robotdiffuse.planners.base import Planner
-from robotdiffuse.planners.diffusion import ModelSampler, encode
-from robotdiffuse.planners.robotdiffuse import RobotDiffuseSettings, unlearned_starts
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.planning.diffusion.diffusion import ModelSampler, encode
+from robotdiffuse.planning.diffusion.hybrid import RobotDiffuseSettings, unlearned_starts
 from robotdiffuse.problems.held_out import goal_of
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.results import PlanResult
-from robotdiffuse.types import Path, Status
-from robotdiffuse.verify import Report, VerifySettings, verifier
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Status
+from robotdiffuse.validation.validator import Report, VerifySettings, verifier
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.exact import forward_frames
-from robotdiffuse.results import PlanResult
+from robotdiffuse.collision.exact_meshes import forward_frames
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.types import Path, Trajectory
-from robotdiffuse.verify import Report
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.validation.validator import Report
 
 STEP = 0.02
 """Longest step [rad, joint-space L2] of a path whose links are followed; an arc is then 2e-5 too short."""

@@ -4,14 +4,14 @@ import itertools
 from dataclasses import replace
 from pathlib import Path as FilePath
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.planners.aorrtc.planner import AORRTC, AORRTCSettings
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import load_problems
 from robotdiffuse.problems.held_out import Case, CaseFile, Report, line_length
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.types import Path
-from robotdiffuse.verify import VerifySettings, verifier
+from robotdiffuse.core.types import Path
+from robotdiffuse.validation.validator import VerifySettings, verifier
 
 NONTRIVIAL = "_nontrivial"
 """Suffix of a family's name: only problems that the straight line does not solve and search does."""

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.files import JsonLines
-from robotdiffuse.types import Status
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.types import Status
 
 SOLVED, CRASHED, OVERRAN, RAISED = "solved", "crashed", "overran", "exception"
 """Statuses of records beside those of `types.Status`: the process died, hung, or the planner raised."""

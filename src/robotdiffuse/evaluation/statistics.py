@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 
 RESAMPLES = 2000
 TIE = 1e-6

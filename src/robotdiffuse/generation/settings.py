@@ -3,15 +3,15 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.generation.aorrtc import AORRTCSearchSettings
-from robotdiffuse.generation.searches import SEARCHES
-from robotdiffuse.planners.shared_tree.planner import SharedTreeSettings
+from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
+from robotdiffuse.generation.solvers import SEARCHES
+from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import POSE, POSITION, Family
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.robots import load_robot
-from robotdiffuse.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
+from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
 
 TARGETS = (POSITION, POSE)
 TIMINGS = ("arc", "time")

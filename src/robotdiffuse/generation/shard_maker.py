@@ -9,21 +9,21 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
-from robotdiffuse.collision.motion import search_space
-from robotdiffuse.data.rows import resample
-from robotdiffuse.data.shards import Row, row_of
-from robotdiffuse.errors import InputError
-from robotdiffuse.generation.aorrtc import AORRTCSearch
-from robotdiffuse.generation.searches import SEARCHES
+from robotdiffuse.collision.motions import search_space
+from robotdiffuse.datasets.rows import resample
+from robotdiffuse.datasets.shards import Row, row_of
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.generation.aorrtc_solver import AORRTCSearch
+from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.generation.settings import GenerationSettings
-from robotdiffuse.paths.timing import time_parameterize
-from robotdiffuse.planners.shared_tree.planner import SharedTreeSearch
+from robotdiffuse.trajectories.timing import time_parameterize
+from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSearch
 from robotdiffuse.problems.families.family import Drawn
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import PackedScenes
-from robotdiffuse.types import Path
-from robotdiffuse.verify import Verifier, VerifySettings
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.core.types import Path
+from robotdiffuse.validation.validator import Verifier, VerifySettings
 
 TRIES = 50
 """Problems drawn for each row, and GRACE more, before the settings are called hopeless."""
@@ -36,7 +36,7 @@ Counts = dict[str, int]
 
 
 def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts]:
-    """Arrays and counts of a shard, as `data.shards` keeps them.
+    """Arrays and counts of a shard, as `datasets.shards` keeps them.
 
     Counts: `tried` problems; of those `solved` ones are in the shard, `thinned` ones are trivial and left
     out, of `unsolved` ones the search found no path, and `refused` ones did not pass the judge. Raises

@@ -18,8 +18,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError, shortened
-from robotdiffuse.files import write_atomically
+from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.learning.completion.network import CompletionNetwork, CompletionSettings
 from robotdiffuse.learning.encoders import COMPLETES, ENCODERS, encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Encoder
@@ -31,10 +31,10 @@ from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.network import Network
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.weights_at_hand import BUNDLED, check_weights, untrained, weights_for
+from robotdiffuse.learning.weights_registry import BUNDLED, check_weights, untrained, weights_for
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.settings import Settings
+from robotdiffuse.core.settings import Settings
 
 FORMAT = 2
 

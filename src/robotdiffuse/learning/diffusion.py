@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.settings import Bound, NotNegative, OneOf, Settings
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Bound, NotNegative, OneOf, Settings
 
 Levels = tuple[Float[ndarray, "levels"], Float[ndarray, "levels"]]
 """Signal and noise of the levels 0 .. T."""

@@ -31,11 +31,11 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.costs import COSTS
 from robotdiffuse.learning.costs.cost import Cost
 from robotdiffuse.learning.guidance_kernel import OFF, Steps, descend
-from robotdiffuse.settings import NotNegative, Positive, Settings, Share
+from robotdiffuse.core.settings import NotNegative, Positive, Settings, Share
 
 
 @dataclass(frozen=True)

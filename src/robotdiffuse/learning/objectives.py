@@ -13,9 +13,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.diffusion import NoiseSchedule
-from robotdiffuse.registry import Entry, Registry
+from robotdiffuse.core.registry import Entry, Registry
 
 Array = TypeVar("Array", ndarray, Tensor)
 """Clean, noise, noisy trajectories and network outputs are all of one kind and shape, [..., waypoints,

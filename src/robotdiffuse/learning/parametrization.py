@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from scipy.interpolate import BSpline
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, unknown_name
 
 DEGREE = 3
 

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.learning.diffusion import noise_factor, white_factor
 from robotdiffuse.learning.parametrization import Parametrization
 from robotdiffuse.robots.normalizer import JointNormalizer

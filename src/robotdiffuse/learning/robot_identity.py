@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotdiffuse.collision.arrays import robot_groups
-from robotdiffuse.errors import InputError, joined, shortened
+from robotdiffuse.collision.kernel_arrays import robot_groups
+from robotdiffuse.core.errors import InputError, joined, shortened
 from robotdiffuse.robots.robot import Robot, once_per_robot
-from robotdiffuse.settings import Settings
+from robotdiffuse.core.settings import Settings
 
 if TYPE_CHECKING:
     from robotdiffuse.robots.normalizer import JointNormalizer

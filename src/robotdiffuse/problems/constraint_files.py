@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint, PositionBox
-from robotdiffuse.problems.equipment import pose_of
+from robotdiffuse.problems.robot_setup_files import pose_of
 from robotdiffuse.scenes.files import check_fields
-from robotdiffuse.transforms import pose_entry
+from robotdiffuse.core.transforms import pose_entry
 
 POSE = ("xyz", "wxyz")
 

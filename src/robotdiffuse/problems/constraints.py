@@ -13,8 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import LARGEST, numbers, rigid_transform, vector
-from robotdiffuse.errors import InputError, shown
+from robotdiffuse.core.bounds import LARGEST, numbers, rigid_transform, vector
+from robotdiffuse.core.errors import InputError, shown
 
 LEAST_TOLERANCE, LEAST_ANGLE = 1e-4, 1e-3
 """The tightest constraints [m], [rad]."""

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import yaml
 
-from robotdiffuse.checks import numbers
-from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.core.bounds import numbers
+from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.constraint_files import constraint_entry, read_constraints
-from robotdiffuse.problems.equipment import (
+from robotdiffuse.problems.robot_setup_files import (
     equipment_entries,
     equipped,
     payload_entry,
@@ -27,7 +27,7 @@ from robotdiffuse.problems.moveit import (
     moveit_request,
     moveit_scene,
 )
-from robotdiffuse.problems.moving_files import moving_entry, read_moving
+from robotdiffuse.problems.moving_obstacle_files import moving_entry, read_moving
 from robotdiffuse.problems.problem import (
     OPTIMISTIC,
     JointGoal,
@@ -36,14 +36,14 @@ from robotdiffuse.problems.problem import (
     check_clearance,
     moved_goal,
 )
-from robotdiffuse.reading import no_files, parse_json, parse_yaml, read_text, read_yaml
+from robotdiffuse.core.input_files import no_files, parse_json, parse_yaml, read_text, read_yaml
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
-from robotdiffuse.scenes.depth_view import DepthView
-from robotdiffuse.scenes.depth_view_files import read_views, view_entry
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view_files import read_views, view_entry
 from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.transforms import pose_entry
+from robotdiffuse.core.transforms import pose_entry
 
 FIELDS = ("robot", "scene", "start", "goal")
 OPTIONAL = (

@@ -13,14 +13,14 @@ from typing import Any
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.checks import numbers
-from robotdiffuse.errors import InputError, shown, unknown_name
-from robotdiffuse.problems.equipment import pose_of
+from robotdiffuse.core.bounds import numbers
+from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.problems.robot_setup_files import pose_of
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
 from robotdiffuse.scenes.files import check_fields
-from robotdiffuse.scenes.placement import placed
+from robotdiffuse.scenes.shape_transforms import placed
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.transforms import pose_entry
+from robotdiffuse.core.transforms import pose_entry
 
 GOALS = ("joints", "joint_set", "pose", "poses", "any")
 TOLERANCES = ("xyz_tolerance", "rpy_tolerance")

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import numbers, rigid_transform
-from robotdiffuse.errors import InputError, shown
-from robotdiffuse.transforms import rotation_from_rpy, transform
+from robotdiffuse.core.bounds import numbers, rigid_transform
+from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.transforms import rotation_from_rpy, transform
 
 INWARDS = 1e-3
 """Poses are drawn within tolerances less this share: inverse kinematics has an error of its own."""

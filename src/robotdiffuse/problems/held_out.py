@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.files import JsonLines
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.types import Path
+from robotdiffuse.core.types import Path
 
 SEED = 20261121
 """Of the held-out problems; data are drawn from other seed sequences."""

@@ -13,15 +13,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.checks import unit_quaternion, vector
-from robotdiffuse.errors import InputError, shown, unknown_name
-from robotdiffuse.reading import read_triangles, read_yaml
+from robotdiffuse.core.bounds import unit_quaternion, vector
+from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.input_files import read_triangles, read_yaml
 from robotdiffuse.robots.bodies import Attached
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Shape, Sphere
-from robotdiffuse.transforms import inverse, quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, rotation_from_quaternion, transform
 
 PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shape]]] = {
     "box": (3, lambda size, xyz, wxyz, name: Box(xyz, size, wxyz, name)),
@@ -281,7 +281,7 @@ def _attached(i: int, entry: object, frames: MoveItFrames, folder: Path) -> Move
 
 def holding_at(robot: Robot, held: MoveItAttached, start: list[float]) -> Robot:
     """The robot with an object that it holds at the start. Links that it has no geometry of may be named."""
-    from robotdiffuse.robots.attached import attach  # compiled code, which most problems do not need
+    from robotdiffuse.robots.attached_bodies import attach  # compiled code, which most problems do not need
 
     shapes = held.shapes
     if not held.in_link and held.link in robot.link_names:

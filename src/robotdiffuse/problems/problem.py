@@ -13,8 +13,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import LARGEST, numbers, rigid_transform
-from robotdiffuse.errors import InputError, shown, unknown_name
+from robotdiffuse.core.bounds import LARGEST, numbers, rigid_transform
+from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
 from robotdiffuse.problems.goals import Goal, OneGoal, moved_goal
@@ -24,10 +24,10 @@ from robotdiffuse.problems.goals import PosesGoal as PosesGoal
 from robotdiffuse.robots.dynamics import check_dynamics
 from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.scenes.depth_view import DepthView, SeenPoints
-from robotdiffuse.scenes.moving import MovingObstacle
+from robotdiffuse.perception.depth_view import DepthView, SeenPoints
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.transforms import inverse
+from robotdiffuse.core.transforms import inverse
 
 LIMIT_SLACK = 1e-5
 """Configurations that exceed a joint limit by no more than this are clamped, with a note [rad]."""
@@ -36,7 +36,7 @@ LEAST_BLEND, MOST_BLEND = 1e-3, 10.0
 OPTIMISTIC, PADDED, IMAGINED, OCCUPIED = "optimistic", "padded", "imagined", "occupied"
 UNSEEN = (OPTIMISTIC, PADDED, IMAGINED, OCCUPIED)
 """What space that no view saw is taken for: free; free but near what was seen; as the completing network
-imagines it; occupied. See `planners/unseen.py`."""
+imagines it; occupied. See `planning/pipeline/unknown_space.py`."""
 
 
 @no_type_check
@@ -130,7 +130,7 @@ class Problem:
             T_world_base = rigid_transform("T_world_base", T_world_base)
         scene = self.scene
         if views:
-            from robotdiffuse.problems.seen import seen_shapes  # compiled code, which only views need
+            from robotdiffuse.perception.seen_points import seen_shapes  # compiled code, which only views need
 
             scene = self.known_scene
             ends = goal.positions if isinstance(goal, JointGoal) else start[None]

@@ -4,10 +4,10 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
-from robotdiffuse.errors import InputError, unknown_name
-from robotdiffuse.reading import is_file
-from robotdiffuse.robots.bundle import MESH_FILE, ROBOT_FILE, read_bundle, read_source
-from robotdiffuse.robots.places import user_robots
+from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.input_files import is_file
+from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, read_bundle, read_source
+from robotdiffuse.robots.user_data_dir import user_robots
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 
 __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
@@ -79,8 +79,8 @@ def _added() -> dict[str, Path]:
 
 
 def _from_urdf(urdf: Path) -> Robot:
-    from robotdiffuse.robots.add import add_robot
-    from robotdiffuse.robots.urdf import UrdfTree
+    from robotdiffuse.robots.fitting.add import add_robot
+    from robotdiffuse.robots.parsing.urdf import UrdfTree
 
     tree, source = UrdfTree(urdf, {}), str(urdf.resolve())
     digest = tree.digest

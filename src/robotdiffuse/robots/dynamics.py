@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.inertias import Inertia, Payload
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.torque_bounds import Body, Stretches, bend

@@ -5,7 +5,7 @@ import json
 
 import numpy as np
 
-from robotdiffuse.robots.bundle import LIMITS
+from robotdiffuse.robots.robot_folder import LIMITS
 from robotdiffuse.robots.robot import Robot
 
 DIGITS = 9

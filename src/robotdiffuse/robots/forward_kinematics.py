@@ -6,7 +6,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 
 

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import LARGEST, numbers, within
-from robotdiffuse.errors import InputError, shown
+from robotdiffuse.core.bounds import LARGEST, numbers, within
+from robotdiffuse.core.errors import InputError, shown
 
 SLACK = 1e-6
 """By which share the least moment of a link may be negative, for rounding in files."""

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.checks import rigid_transform
-from robotdiffuse.errors import InputError, shown
+from robotdiffuse.core.bounds import rigid_transform
+from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.robots.ik_kernel import CONTINUOUS, PRISMATIC, REVOLUTE, solve_seeds
 from robotdiffuse.robots.robot import Robot
 

@@ -5,7 +5,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.robots.robot import Robot, once_per_robot
-from robotdiffuse.transforms import rotation_about, transform
+from robotdiffuse.core.transforms import rotation_about, transform
 
 Z = np.array([0.0, 0.0, 1.0])
 

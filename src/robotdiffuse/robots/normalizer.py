@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 
 Joints = TypeVar("Joints", ndarray, Tensor)
 """[*batch, dof], of either kind; the result is of the same kind, type and device."""

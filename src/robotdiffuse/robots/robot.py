@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.checks import LARGEST
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.core.bounds import LARGEST
+from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
 from robotdiffuse.robots.inertias import Inertia
 from robotdiffuse.robots.joint_tables import TURN, JointTable
-from robotdiffuse.transforms import inverse, rotation_about, rotation_z_to, transform
+from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
 TURNS = 3 * np.pi
@@ -351,7 +351,7 @@ class Robot:
         if held == self.locked:
             return self
         if self.attached:
-            from robotdiffuse.robots.attached import attached_again
+            from robotdiffuse.robots.attached_bodies import attached_again
 
             return attached_again(self.arm.with_locked(locked), self.attached)
         return _variant(self.unlocked, tuple(sorted(held.items())))
@@ -369,13 +369,13 @@ class Robot:
         as a polyhedron around it, at most 2 % of its radius larger. Raises InputError for unknown links, a
         link that no planned joint moves, a name that is taken, and a cloud of points.
         """
-        from robotdiffuse.robots.attached import holding
+        from robotdiffuse.robots.attached_bodies import holding
 
         return holding(self, shape, link, touch_links)
 
     def detach(self, name: str) -> "Robot":
         """The robot without a held object or tool; InputError if it has none of that name."""
-        from robotdiffuse.robots.attached import detach
+        from robotdiffuse.robots.attached_bodies import detach
 
         return detach(self, name)
 
@@ -391,7 +391,7 @@ class Robot:
 
         The tool is the new tip if it is behind all planned joints. Shapes are as in `attach`.
         """
-        from robotdiffuse.robots.attached import with_tool
+        from robotdiffuse.robots.attached_bodies import with_tool
 
         return with_tool(self, link, T_link_tool, shapes, touch_links, name)
 

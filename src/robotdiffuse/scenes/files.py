@@ -7,8 +7,8 @@ from typing import Any
 
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, shown, unknown_name
-from robotdiffuse.reading import read_triangles
+from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.input_files import read_triangles
 from robotdiffuse.scenes.point_cloud import read_points
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, shortened, shown, unknown_name
-from robotdiffuse.reading import input_file, read_arrays
+from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.input_files import input_file, read_arrays
 
 
 def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m 3"]:

@@ -9,11 +9,11 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Shape
-from robotdiffuse.transforms import inverse
+from robotdiffuse.core.transforms import inverse
 
 
 @no_type_check

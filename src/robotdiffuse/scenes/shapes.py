@@ -14,11 +14,11 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.checks import SMALLEST, form, numbers, points, positive, unit_quaternion, vector
-from robotdiffuse.errors import InputError, shown
+from robotdiffuse.core.bounds import SMALLEST, form, numbers, points, positive, unit_quaternion, vector
+from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.point_cloud import voxel_thin
-from robotdiffuse.transforms import rotation_from_quaternion, transform
+from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
@@ -44,13 +44,13 @@ class Shape(ABC):
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
         """The shape after a rigid motion."""
-        from robotdiffuse.scenes.placement import moved
+        from robotdiffuse.scenes.shape_transforms import moved
 
         return moved(self, T)
 
     def solid(self) -> tuple[Float[ndarray, "4 4"], tuple[ConvexMesh, ...]]:
         """Where it stands, and convex meshes in its own frame that hold it, for a robot that holds it."""
-        from robotdiffuse.scenes.solids import solid
+        from robotdiffuse.scenes.convex_solids import solid
 
         return solid(self)
 

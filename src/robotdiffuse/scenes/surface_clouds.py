@@ -16,9 +16,9 @@ import torch
 from jaxtyping import Bool, Float32, Int8
 from torch import Generator, Tensor
 
-from robotdiffuse.scenes.packed import BOX, NONE, SPHERE, PackedScenes
-from robotdiffuse.scenes.sampling import VisibleRegion
-from robotdiffuse.scenes.surface_kernel import fill_clouds
+from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
+from robotdiffuse.scenes.surface_points import VisibleRegion
+from robotdiffuse.scenes.surface_clouds_kernel import fill_clouds
 
 PART = 1 << 15
 """Points that are done at once on the CPU: their arrays fit the second-level cache."""

@@ -21,8 +21,8 @@ def _import_pybullet() -> None:
 _import_pybullet()
 
 from robotdiffuse.simulation.camera import DepthCamera, DepthImage, point_cloud, render  # noqa: E402
-from robotdiffuse.simulation.film import FilmSettings, write_gif, write_png  # noqa: E402
-from robotdiffuse.simulation.oracle import OracleContact, PyBulletOracle  # noqa: E402
+from robotdiffuse.simulation.recording import FilmSettings, write_gif, write_png  # noqa: E402
+from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle  # noqa: E402
 from robotdiffuse.simulation.replay import Replay, ReplayContact, ReplaySettings, replay  # noqa: E402
 from robotdiffuse.simulation.world import World  # noqa: E402
 

@@ -9,7 +9,7 @@ import pybullet
 from jaxtyping import Float, Int, UInt8
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.scenes.point_cloud import voxel_thin
 from robotdiffuse.scenes.shapes import PointCloud
 from robotdiffuse.simulation.world import World

@@ -16,11 +16,11 @@ import pybullet
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import DENSITY, World
-from robotdiffuse.types import Trajectory
+from robotdiffuse.core.types import Trajectory
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from numba import njit
 
 from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.lanes import W, open_lanes, place, place_frames
+from robotdiffuse.collision.kernels.lane_collision import W, open_lanes, place, place_frames
 from robotdiffuse.collision.kernels.point_grid import KEEP, points_distance, points_lower_bound
 from robotdiffuse.collision.kernels.simd import load, lowest
 

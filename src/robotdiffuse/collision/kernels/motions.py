@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.lanes import block_hits, make_workspace
+from robotdiffuse.collision.kernels.lane_collision import block_hits, make_workspace
 from robotdiffuse.collision.kernels.simd import W, ramp, store
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)

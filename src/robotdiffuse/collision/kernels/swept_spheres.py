@@ -19,7 +19,7 @@ from robotdiffuse.collision.kernels.lane_clearance import (
     make_clearance_workspace,
     to_scene,
 )
-from robotdiffuse.collision.kernels.lanes import W, place, place_frames
+from robotdiffuse.collision.kernels.lane_collision import W, place, place_frames
 from robotdiffuse.collision.kernels.point_grid import KEEP, points_distance
 
 _ZERO, _TINY = np.float32(0.0), np.float32(1e-9)

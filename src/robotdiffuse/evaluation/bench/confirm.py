@@ -5,12 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import NamedTuple
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import Record, read_records
 from robotdiffuse.problems.held_out import Case
-from robotdiffuse.simulation.oracle import OracleContact, PyBulletOracle
-from robotdiffuse.types import Path
+from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle
+from robotdiffuse.core.types import Path
 
 STEP = 0.02
 """Between the configurations that are looked at [rad, joint-space L2]."""

@@ -13,9 +13,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench.curves import Curve, curves
-from robotdiffuse.evaluation.bench.folder import Bench, plain_name
+from robotdiffuse.evaluation.bench.run_folder import Bench, plain_name
 from robotdiffuse.evaluation.bench.outcomes import Calls, Key, Outcome, calls_on, counting, outcome
 from robotdiffuse.evaluation.comscore import Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from robotdiffuse.evaluation.records import CRASHED, ENDED, OVERRAN, RAISED, Record
-from robotdiffuse.types import Status
+from robotdiffuse.core.types import Status
 
 LATE_SHARE, LATE = 0.1, 0.05
 """A returned motion may be this share of the limit, or this time [s], late: planners stop in time, and then

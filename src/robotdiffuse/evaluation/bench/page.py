@@ -11,16 +11,17 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.evaluation import look
-from robotdiffuse.evaluation.bench import plots, report
+from robotdiffuse.evaluation import style
+from robotdiffuse.evaluation.bench import plots
+from robotdiffuse.evaluation.bench import report
 from robotdiffuse.evaluation.bench.figures import Comparison, Section
-from robotdiffuse.evaluation.bench.folder import Bench
+from robotdiffuse.evaluation.bench.run_folder import Bench
 from robotdiffuse.evaluation.bench.outcomes import Outcome, calls_on, counting, outcome
-from robotdiffuse.evaluation.look import card
+from robotdiffuse.evaluation.style import card
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.tables import html as html_table
-from robotdiffuse.files import check_output, write_atomically
+from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
 
@@ -80,7 +81,7 @@ def write_page(bench: Bench, parts: Sequence[Section], file: str | FilePath, rep
     Raises InputError without matplotlib and for a file that cannot be written.
     """
     target = check_output(file, (".html", ".htm"))
-    with look.style():
+    with style.style():
         text = _page(bench, parts, replays)
     write_atomically(target, text, make_folder=True)
 
@@ -91,7 +92,7 @@ def write_plots(bench: Bench, parts: Sequence[Section], folder: FilePath) -> lis
     Raises InputError as `write_page`.
     """
     planners, drawn = list(bench.records), {}
-    with look.style():
+    with style.style():
         for section in (section for section in parts if section.curves):
             name = "_".join(re.findall(r"\w+", section.name))
             drawn[f"success_{name}.svg"] = plots.success_over_time(section, planners)
@@ -134,7 +135,7 @@ def _page(bench: Bench, parts: Sequence[Section], replays: str | None) -> str:
     )
     script = f"<script>const mains = {mains};{SCRIPT}</script>"
     name = bench.folder.resolve().name
-    return look.page(name, report.about(bench), _facts(bench), "\n".join(content), OWN_STYLE, script)
+    return style.page(name, report.about(bench), _facts(bench), "\n".join(content), OWN_STYLE, script)
 
 
 def _facts(bench: Bench) -> list[tuple[str, str]]:

@@ -17,17 +17,17 @@ from dataclasses import astuple
 from pathlib import Path as FilePath
 from typing import TextIO
 
-from robotdiffuse.evaluation.bench.contestants import Contestant
+from robotdiffuse.evaluation.bench.entries import Contestant
 from robotdiffuse.evaluation.methods import measure_of, planner_calls
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN
-from robotdiffuse.evaluation.trial import Fields, Trial
-from robotdiffuse.planners.base import Planner
+from robotdiffuse.evaluation.runs import Fields, Trial
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.processes import Companion
-from robotdiffuse.registry import Entry, added, take_over
+from robotdiffuse.core.processes import Companion
+from robotdiffuse.core.registry import Entry, added, take_over
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.types import SHORT
+from robotdiffuse.core.types import SHORT
 
 FAR_SIDE = sys.executable, "-m", "robotdiffuse.evaluation.bench.planner_process"
 START_SECONDS = 300.0

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from robotdiffuse.evaluation.bench.figures import ROP, Comparison, Row, Section
-from robotdiffuse.evaluation.bench.folder import Bench, base_name, plain_name
+from robotdiffuse.evaluation.bench.run_folder import Bench, base_name, plain_name
 from robotdiffuse.evaluation.bench.outcomes import FAILURES
 from robotdiffuse.evaluation.comscore import PAPER_TABLE_1, Indicators, comscores
 from robotdiffuse.evaluation.records import RESTARTED

@@ -7,11 +7,11 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path as FilePath
 from tempfile import TemporaryDirectory
 
-from robotdiffuse import processes
-from robotdiffuse.evaluation.bench.contestants import Contestant
+from robotdiffuse.core import processes
+from robotdiffuse.evaluation.bench.entries import Contestant
 from robotdiffuse.evaluation.bench.planner_process import PlannerProcess
 from robotdiffuse.evaluation.records import RESTARTED, Record
-from robotdiffuse.evaluation.trial import Execute, Fields, Made, Trial
+from robotdiffuse.evaluation.runs import Execute, Fields, Made, Trial
 
 CHUNK = 20
 """Calls of one planner that a node of a cluster makes in one go, with one start of the process."""

@@ -10,7 +10,7 @@ from robotdiffuse.learning.completion.samples import pack
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.completion.network import CompletionNetwork
-    from robotdiffuse.scenes.observed_volume import ObservedVolume
+    from robotdiffuse.perception.observed_volume import ObservedVolume
 
 
 def imagine(

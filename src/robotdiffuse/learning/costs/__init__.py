@@ -1,6 +1,6 @@
 """The cost functions of guidance by name. A new one is one file and one line in COSTS."""
 
-from robotdiffuse.registry import Entry, Registry
+from robotdiffuse.core.registry import Entry, Registry
 
 _ROOM = "robotdiffuse.learning.costs."
 COSTS = Registry(

@@ -13,7 +13,7 @@ about 20 %.
 | unet            |   1.7   |     16.4     | 1.1  | 1.3  |
 """
 
-from robotdiffuse.registry import Entry, Registry
+from robotdiffuse.core.registry import Entry, Registry
 
 _ROOM = "robotdiffuse.learning.denoisers."
 DENOISERS = Registry(

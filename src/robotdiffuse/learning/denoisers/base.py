@@ -7,8 +7,8 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError
-from robotdiffuse.settings import Count, Settings
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Count, Settings
 
 
 @dataclass(frozen=True)

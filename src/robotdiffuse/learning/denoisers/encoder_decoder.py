@@ -16,7 +16,7 @@ from robotdiffuse.learning.denoisers.layers import (
     start_at_zero,
     two_layers,
 )
-from robotdiffuse.settings import Count
+from robotdiffuse.core.settings import Count
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.denoisers.base import Denoiser, DenoiserSettings
 from robotdiffuse.learning.denoisers.layers import (
     LevelEmbedding,
@@ -16,7 +16,7 @@ from robotdiffuse.learning.denoisers.layers import (
     start_small,
     two_layers,
 )
-from robotdiffuse.settings import Count, Sizes
+from robotdiffuse.core.settings import Count, Sizes
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from robotdiffuse.registry import Entry, Registry
+from robotdiffuse.core.registry import Entry, Registry
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings

@@ -18,14 +18,14 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.completion.network import CompletionNetwork, CompletionSettings
 from robotdiffuse.learning.completion.samples import OCCUPIED, pack
 from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.depth_view import DepthView
-from robotdiffuse.scenes.observed_volume import LOW, SHAPE, VOXEL, observe
-from robotdiffuse.settings import Count
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, observe
+from robotdiffuse.core.settings import Count
 
 SHARE = 8
 """A cell of the bottleneck has so many voxels along each edge."""
@@ -79,7 +79,7 @@ class CompletingAutoencoder(Encoder):
     def of_views(
         self, views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"]
     ) -> Float[Tensor, "code"]:
-        """z of the volume that depth views observed together, see `scenes.observed_volume.observe`."""
+        """z of the volume that depth views observed together, see `perception.observed_volume.observe`."""
         seen, behind = (torch.from_numpy(a)[None] for a in pack(observe(views, robot, start)))
         return self.of_volumes(seen, behind)[0]
 

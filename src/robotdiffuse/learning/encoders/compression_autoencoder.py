@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
 from robotdiffuse.scenes.surface_clouds import sort_points
-from robotdiffuse.settings import Count, Sizes
+from robotdiffuse.core.settings import Count, Sizes
 
 
 @dataclass(frozen=True)

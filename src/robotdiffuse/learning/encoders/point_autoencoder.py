@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
-from robotdiffuse.settings import Count, Natural, NotNegative, Sizes
+from robotdiffuse.core.settings import Count, Natural, NotNegative, Sizes
 
 QUERIES = 96
 """Points per cloud at which the distance field is reconstructed."""

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max
-from robotdiffuse.settings import Count, Sizes
+from robotdiffuse.core.settings import Count, Sizes
 
 
 @dataclass(frozen=True)

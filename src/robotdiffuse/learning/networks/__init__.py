@@ -1,6 +1,6 @@
 """The networks by name. A new one is one file and one line in NETWORKS."""
 
-from robotdiffuse.registry import Entry, Registry
+from robotdiffuse.core.registry import Entry, Registry
 
 _ROOM = "robotdiffuse.learning.networks."
 NETWORKS = Registry(

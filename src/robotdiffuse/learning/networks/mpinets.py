@@ -37,7 +37,7 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 from torch import Tensor, nn
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.networks.pointnet2 import GroupAll, SetAbstraction
 from robotdiffuse.learning.robot_identity import RobotIdentity
@@ -47,10 +47,10 @@ from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import PackedScenes
-from robotdiffuse.scenes.sampling import VisibleRegion
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.surface_points import VisibleRegion
 from robotdiffuse.scenes.surface_clouds import surface_clouds
-from robotdiffuse.settings import Count, NotNegative, Positive, Settings, Share, Sizes
+from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings, Share, Sizes
 
 SMOOTH = 0.1
 """Added to the distance to the goal, in units of half the joint ranges, where it is made a direction."""

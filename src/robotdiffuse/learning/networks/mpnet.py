@@ -4,7 +4,7 @@ A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging
 Learning-based and Classical Motion Planners", T-RO 2020. Enet is a contractive auto-encoder of the obstacles'
 point cloud. Pnet is a perceptron from (z, a configuration, the goal) to the next waypoint, learnt from the
 waypoints of planned paths in both directions. Its dropout stays on while it plans: that is where MPNet's
-randomness comes from. The planner around it is `planners.mpnet`.
+randomness comes from. The planner around it is `planning.baselines.mpnet`.
 
 Differences from the paper:
 
@@ -38,15 +38,15 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Generator, Tensor, nn
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.sampling import PANDA_REGION, VisibleRegion
+from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 from robotdiffuse.scenes.surface_clouds import surface_clouds
-from robotdiffuse.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Share, Sizes
+from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Share, Sizes
 
 BITS = 10
 """Of each coordinate in the place of a point along the space-filling curve."""

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int64
 from torch import Tensor, nn
 
-from robotdiffuse.learning.greatest import greatest
+from robotdiffuse.learning.max_pool import greatest
 from robotdiffuse.learning.networks.point_groups import group_points
 
 

@@ -1,6 +1,6 @@
 """Samplers: from noise to clean trajectories by calls of a denoiser. A new one is one file and one line."""
 
-from robotdiffuse.registry import Entry, Registry
+from robotdiffuse.core.registry import Entry, Registry
 
 _ROOM = "robotdiffuse.learning.samplers."
 SAMPLERS = Registry(

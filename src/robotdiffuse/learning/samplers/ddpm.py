@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.diffusion import NoiseSchedule
 from robotdiffuse.learning.samplers.sampler import DrawNoise, Predict, check_eta
 

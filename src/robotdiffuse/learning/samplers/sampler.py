@@ -6,7 +6,7 @@ from typing import Protocol
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.diffusion import NoiseSchedule
 
 Predict = Callable[[ndarray, int], ndarray]

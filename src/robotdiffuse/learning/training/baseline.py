@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.networks.base import BaselineNetwork
@@ -16,8 +16,8 @@ from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.config import BaselineTraining
 from robotdiffuse.learning.training.processes import Processes
-from robotdiffuse.learning.training.run import Validation
-from robotdiffuse.learning.training.trainee import MotionTrainee, train
+from robotdiffuse.learning.training.loop import Validation
+from robotdiffuse.learning.training.task import MotionTrainee, train
 from robotdiffuse.robots import load_robot
 
 

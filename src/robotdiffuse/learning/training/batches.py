@@ -13,18 +13,18 @@ from jaxtyping import Bool, Float, Float16, Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.data.rows import read_rows
-from robotdiffuse.data.shards import SPLITS, shard_indices
-from robotdiffuse.data.turns import turns_about_vertical
-from robotdiffuse.errors import InputError
-from robotdiffuse.files import write_atomically
+from robotdiffuse.datasets.rows import read_rows
+from robotdiffuse.datasets.shards import SPLITS, shard_indices
+from robotdiffuse.datasets.augmentation import turns_about_vertical
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.learning.checkpoint import fingerprint
-from robotdiffuse.learning.clearances import PackedClearanceFn
+from robotdiffuse.learning.clearance_features import PackedClearanceFn
 from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.training.views import clouds_of_views, codes_of_views
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import BOX, NONE, SPHERE, PackedScenes
+from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from robotdiffuse.learning.checkpoint import save_code, save_completion
-from robotdiffuse.learning.completion.ahead import MOST, SamplesAhead
+from robotdiffuse.learning.training.prefetch import MOST, SamplesAhead
 from robotdiffuse.learning.completion.network import (
     CompletionNetwork,
     CompletionSettings,
@@ -28,13 +28,13 @@ from robotdiffuse.learning.encoders.completing_autoencoder import (
 from robotdiffuse.learning.training.batches import fast_bf16, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, ShareBelowOne, TrainingSettings
 from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.run import Validation
-from robotdiffuse.learning.training.trainee import Trainee, train
+from robotdiffuse.learning.training.loop import Validation
+from robotdiffuse.learning.training.task import Trainee, train
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.observed_volume import VOXEL
-from robotdiffuse.settings import Count, Filled, Natural, OneOf, Positive
+from robotdiffuse.perception.observed_volume import VOXEL
+from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
 
 HELD_OUT = 20261122
 """Seed of the samples that are held out; training's are drawn from other seed sequences."""

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from robotdiffuse.errors import InputError
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import DenoiserSettings
 from robotdiffuse.learning.encoders import COMPLETES, ENCODERS
@@ -11,7 +11,7 @@ from robotdiffuse.learning.encoders.base import EncoderSettings
 from robotdiffuse.learning.motion_model import MOST_WAYPOINTS, ModelParts
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.training.losses import LossSettings
-from robotdiffuse.settings import (
+from robotdiffuse.core.settings import (
     Bound,
     Count,
     Natural,

@@ -1,5 +1,5 @@
 """Named settings of planner training: the paper's, the compact ones that ship, the rows of its Table 2, and
-the prior of MPD and EDMP (see `planners.guided_prior`).
+the prior of MPD and EDMP (see `planning.baselines.guided_prior`).
 
 The rows share everything but what they compare, and a size that a CPU can train. Unlike `paper` they diffuse
 48 waypoints in patches of 4, as residuals to the straight line, with smooth noise: fewer samples teach more.
@@ -10,7 +10,7 @@ Their networks see no clearances, as the paper's: these would make up for what a
 
 from typing import Any, NamedTuple
 
-from robotdiffuse.errors import InputError, unknown_name
+from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.diffusion import ScheduleSettings

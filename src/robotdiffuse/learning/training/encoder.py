@@ -14,8 +14,8 @@ from robotdiffuse.learning.encoders.base import Autoencoder, Encoder
 from robotdiffuse.learning.training.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.run import Validation
-from robotdiffuse.learning.training.trainee import Trainee, train
+from robotdiffuse.learning.training.loop import Validation
+from robotdiffuse.learning.training.task import Trainee, train
 
 READ, CHECKED = 2048, 512
 """Scenes that a linear read-out is fitted to, and further ones that it is judged by."""

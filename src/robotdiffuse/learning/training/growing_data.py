@@ -3,8 +3,8 @@
 import sys
 from collections.abc import Callable
 
-from robotdiffuse.data.manifest import read_manifest
-from robotdiffuse.data.shards import shard_indices
+from robotdiffuse.datasets.manifest import read_manifest
+from robotdiffuse.datasets.shards import shard_indices
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.processes import Processes
 

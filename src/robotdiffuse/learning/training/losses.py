@@ -12,12 +12,12 @@ from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.collision.arrays import compile_robot
-from robotdiffuse.errors import InputError
+from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
-from robotdiffuse.scenes.packed import BOX, SPHERE, PackedScenes
-from robotdiffuse.settings import Count, NotNegative, Settings, Share
-from robotdiffuse.transforms import rotation_from_quaternion
+from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+from robotdiffuse.core.settings import Count, NotNegative, Settings, Share
+from robotdiffuse.core.transforms import rotation_from_quaternion
 
 POINT_UNIT = 0.1
 """[m] in L_point and L_collision, so that they are of the size of L_joint."""

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, save_network
-from robotdiffuse.learning.clearances import packed_clearances
+from robotdiffuse.learning.clearance_features import packed_clearances
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.encoders import encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Encoder
@@ -21,7 +21,7 @@ from robotdiffuse.learning.training.batches import Batch, Batches, TrajectoryDat
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.losses import POINT_UNIT, ArmDistance, SurfacePoints, hinge
 from robotdiffuse.learning.training.processes import Processes, on_cpu
-from robotdiffuse.learning.training.trainee import MotionTrainee, train
+from robotdiffuse.learning.training.task import MotionTrainee, train
 from robotdiffuse.learning.training.validation import planning_success
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics

@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.learning.clearances import link_clearances
+from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.training.batches import TrajectoryData, encode_scenes
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 SAMPLING_STEPS = 6
 """Of every network alike, so that all of the levels do not take longer than the training."""

@@ -9,8 +9,8 @@ from numpy import ndarray
 from robotdiffuse.learning.completion.samples import camera_view
 from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.depth_view import DepthView
-from robotdiffuse.scenes.packed import PackedScenes
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 
 def random_views(

@@ -20,7 +20,7 @@ from robotdiffuse.problems.families.furniture import (
     is_free,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.settings import Count, Natural, Share
+from robotdiffuse.core.settings import Count, Natural, Share
 
 
 @dataclass(frozen=True)

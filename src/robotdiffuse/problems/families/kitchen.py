@@ -17,7 +17,7 @@ from robotdiffuse.problems.families.furniture import (
     count,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.settings import Natural, Positive, Share
+from robotdiffuse.core.settings import Natural, Positive, Share
 
 BENEATH = 0.25
 """Counters at least this high may be open in front, with a region beneath [m]."""

@@ -14,12 +14,12 @@ from numpy.random import Generator
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.families.family import CONFIGURATION, Drawn, Family
 from robotdiffuse.robots.robot import Robot, once_per_robot
-from robotdiffuse.robots.scaled import reach, scaled
+from robotdiffuse.robots.scaling import reach, scaled
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
 PANDA_REACH = 0.855
-"""[m], by `robots.scaled.reach`."""
+"""[m], by `robots.scaling.reach`."""
 ALIKE = (0.8, 1.25)
 """Arms whose reach is such a share of a Panda's get the families as they are: a table is a table."""
 

@@ -17,7 +17,7 @@ from robotdiffuse.problems.families.furniture import (
     count,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.settings import Bound, Count, NotNegative, Positive, Share
+from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Share
 
 AtLeastTwo = Annotated[int, Bound(least=2.0)]
 

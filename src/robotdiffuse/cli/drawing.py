@@ -1,0 +1,40 @@
+"""Replays (.html) and pictures (.png): the only place that imports the viewer."""
+
+import os
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from robotdiffuse.problems.problem import Problem
+    from robotdiffuse.core.results import PlanResult
+
+ENDINGS = (".html", ".png")
+
+
+def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
+    """Draw the motion of a solved result in its scene, by the ending of the file; with it what was imagined
+    beside what cameras saw, if it was."""
+    motion = result.trajectory or result.path
+    assert motion is not None, "only a solved result has a motion"
+    if file.suffix.lower() == ".html":
+        from robotdiffuse.visualization.replay_page import write_replay as write
+    else:
+        from robotdiffuse.visualization.picture import write_picture as write
+    if problem.views and problem.unseen == "imagined":
+        from robotdiffuse.planning.pipeline.unknown_space import imagined_obstacles
+        from robotdiffuse.scenes.scene import Scene
+
+        seen = Scene([*problem.scene.shapes, imagined_obstacles(problem)])
+        problem = replace(problem, scene=seen, views=())
+    robot, scene = problem.standing()
+    write(robot, scene, motion, file, result=result)
+
+
+def show(file: Path) -> None:
+    """Open a file in the browser, where there is a screen to show it on."""
+    import webbrowser
+
+    if sys.platform in ("darwin", "win32") or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(file.resolve().as_uri())

@@ -1,0 +1,159 @@
+"""The exact geometry of robots and scenes: convex parts of links, solids, and what is checked against what.
+
+Covering spheres play no part here, so that they can be tested against it. A link with spheres but without
+meshes is taken as its spheres.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
+from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
+from robotdiffuse.core.transforms import transform
+
+
+class Check(NamedTuple):
+    """One thing to check: a link against the scene (`other` None), or two links against each other."""
+
+    link: str
+    other: str | None
+
+    def __str__(self) -> str:
+        return f"{self.link} against {self.other or 'the scene'}"
+
+
+class Part(NamedTuple):
+    """A convex part of a link, in the coordinates of the frame that the link is fixed to: the hull of
+    vertices, rounded."""
+
+    frame: int
+    vertices: Float[ndarray, "v 3"]
+    faces: Int[ndarray, "f 3"]
+    """None of a ball, which has one vertex."""
+    rounding: float
+    center: Float[ndarray, "3"]
+    """Of a ball around the part."""
+    radius: float
+
+
+class Solid(NamedTuple):
+    """A scene shape as the sum of a box, a disc around its z axis and a ball; or, with `bounds`, a surface or
+    a cloud of points within such a box."""
+
+    shape: Shape
+    T_base_box: Float[ndarray, "4 4"]
+    half: Float[ndarray, "3"]
+    disc: float
+    rounding: float
+    bounds: bool
+
+
+@once_per_robot
+def parts_of(robot: Robot) -> dict[str, tuple[Part, ...]]:
+    """Convex parts of every link that has geometry."""
+    parts: dict[str, tuple[Part, ...]] = {}
+    for link in robot.link_names:
+        frame, T = robot.link_frame(link), robot.T_frame_link(link)
+        found: list[Part] = []
+        for mesh in robot.meshes.get(link, ()):
+            vertices = mesh.vertices @ T[:3, :3].T + T[:3, 3]
+            center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+            radius = float(np.linalg.norm(vertices - center, axis=1).max())
+            found.append(Part(frame, vertices, mesh.faces, 0.0, center, radius))
+        if not found:
+            for x, y, z, radius in robot.spheres.get(link, np.zeros((0, 4))).tolist():
+                center = T[:3, :3] @ np.array([x, y, z]) + T[:3, 3]
+                found.append(Part(frame, center[None], np.zeros((0, 3), int), radius, center, radius))
+        if found:
+            parts[link] = tuple(found)
+    return parts
+
+
+@once_per_robot
+def checks_of(robot: Robot) -> tuple[Check, ...]:
+    """The moving links against the scene, then the pairs of links that may not collide."""
+    links = list(parts_of(robot))
+    moving = (Check(link, None) for link in links if robot.link_frame(link) > 0)
+    pairs = (
+        Check(a, b)
+        for i, a in enumerate(links)
+        for b in links[i + 1 :]
+        if robot.link_frame(a) != robot.link_frame(b) and frozenset((a, b)) not in robot.allowed_collisions
+    )
+    return (*moving, *pairs)
+
+
+@once_per_robot
+def hulls_of(robot: Robot) -> tuple[Hulls, dict[str, range]]:
+    """What compiled code reads of the parts, and which of them are each link's."""
+    of_links, every = {}, list[Part]()
+    for link, parts in parts_of(robot).items():
+        of_links[link] = range(len(every), len(every) + len(parts))
+        every += parts
+    vertices = np.concatenate([part.vertices for part in every]) if every else np.zeros((0, 3))
+    hulls = Hulls(
+        np.ascontiguousarray(vertices.T),
+        np.cumsum([0] + [len(part.vertices) for part in every]),
+        np.array([part.frame for part in every], np.int64),
+        np.array([[*part.center, part.radius] for part in every]).reshape(-1, 4),
+        np.array([part.rounding for part in every], np.float64),
+    )
+    return hulls, of_links
+
+
+@lru_cache(maxsize=16)
+def solids_of(scene: Scene) -> tuple[Solid, ...]:
+    """The obstacles of a scene; an empty point cloud is none."""
+    return tuple(solid for solid in map(_solid, scene.shapes) if solid is not None)
+
+
+def solid_arrays(solids: tuple[Solid, ...]) -> Solids:
+    """What compiled code reads of them."""
+    T = np.array([solid.T_base_box for solid in solids]).reshape(-1, 4, 4)
+    return Solids(
+        np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),
+        np.ascontiguousarray(T[:, :3, 3]),
+        np.array([solid.half for solid in solids], np.float64).reshape(-1, 3),
+        np.array([solid.disc for solid in solids], np.float64),
+        np.array([solid.rounding for solid in solids], np.float64),
+        np.array([solid.bounds for solid in solids], np.bool_),
+    )
+
+
+def _solid(shape: Shape) -> Solid | None:
+    match shape:
+        case Sphere():
+            return Solid(shape, transform(shape.center), np.zeros(3), 0.0, shape.radius, False)
+        case Box():
+            return Solid(shape, pose(shape), shape.size / 2, 0.0, 0.0, False)
+        case Cylinder():
+            half = np.array([0.0, 0.0, shape.height / 2])
+            return Solid(shape, pose(shape), half, shape.radius, 0.0, False)
+        case Capsule():
+            half = np.array([0.0, 0.0, shape.height / 2])
+            return Solid(shape, pose(shape), half, 0.0, shape.radius, False)
+        case Triangulated():
+            return _bounded(shape, shape.mesh.world_vertices, 0.0)
+        case PointCloud():
+            return _bounded(shape, shape.points, shape.point_radius) if len(shape.points) else None
+        case _:
+            raise TypeError(f"no collision geometry for a {type(shape).__name__}")
+
+
+def _bounded(shape: Shape, points: Float[ndarray, "n 3"], inflation: float) -> Solid:
+    low, high = points.min(axis=0), points.max(axis=0)
+    return Solid(shape, transform((low + high) / 2), (high - low) / 2, 0.0, inflation, True)
+
+
+def describe_contact(link: str, other: str, depth: float, itself: bool) -> str:
+    """'panda_link5 is 3.2 cm inside sphere_2', or for two links of the robot (`itself`) 'overlap by'."""
+    length = f"{depth * 100:.1f} cm" if depth >= 0.01 else f"{depth * 1000:.1f} mm"
+    if depth < 5e-5:
+        return f"{link} touches {other}"
+    return f"{link} and {other} overlap by {length}" if itself else f"{link} is {length} inside {other}"

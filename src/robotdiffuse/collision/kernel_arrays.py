@@ -1,0 +1,331 @@
+"""Robot and scene as flat float32 arrays: the one form that both compiled kernels read.
+
+The arrays of a scene have the same types whatever the scene holds, so that no obstacle causes a compilation.
+"""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from numpy import ndarray
+
+from robotdiffuse.collision.kernels.simd import W, by_sixteen
+from robotdiffuse.collision.sphere_pair_tables import no_tables, tabulate
+from robotdiffuse.collision.point_cloud_grid import EMPTY, PointGrid, build_grid, cover, thin
+from robotdiffuse.core.deadline import check_time
+from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated
+
+ROUNDING = 4e-7
+"""Obstacles grow by this share of their coordinates: more than float32 rounds off."""
+
+BOX_SLACK = 1e-6
+"""Boxes around obstacles grow by this, absolutely and relatively: more than rounding does."""
+
+NO_BOX = np.repeat([[1e18, -1e18]], 3, axis=1)
+"""Lower and upper corner of a box that is far from everything [m]."""
+
+
+class RobotArrays(NamedTuple):
+    """Frames, spheres and pairs of a robot; groups are links with spheres, those of the fixed base first."""
+
+    offsets: ndarray
+    """[dof, 13] rotation (row-major) and translation of `Robot.frame_offsets`; 1 where the joint slides."""
+    spheres: ndarray
+    """[n, 4] x y z radius in the frame of the group."""
+    first: ndarray
+    """[groups + 1] first sphere of each group."""
+    rows: ndarray
+    """[rows, 4 * 16] the spheres of each group by sixteen: x of all, y, z, radius; the
+    last one fills up."""
+    row_bounds: ndarray
+    """[rows, 4] a sphere around all spheres of the row."""
+    row_sizes: ndarray
+    """[rows] spheres in the row, without what fills it up."""
+    first_row: ndarray
+    """[groups + 1] first row of each group."""
+    frame: ndarray
+    """[groups] frame index, 0 for the fixed base."""
+    bounds: ndarray
+    """[groups, 4] a sphere around all spheres of the group."""
+    pairs: ndarray
+    """[pairs, 4] groups that are checked against each other, a row of `near` or -1, and a bit there."""
+    near: ndarray
+    """[tables, ...] where pairs close to each other along the arm may touch: see `near_pairs.py`."""
+    parents: ndarray | None
+    """[dof] `Robot.parents`; None of a chain, for which code is compiled apart."""
+
+
+class SceneArrays(NamedTuple):
+    """Obstacles by type. Oriented shapes: centre, world-to-shape rotation (row-major), three dimensions."""
+
+    spheres: ndarray
+    """[n, 4] centre, radius."""
+    boxes: ndarray
+    """[n, 15] ..., half edges."""
+    cylinders: ndarray
+    """[n, 15] ..., radius, half height, 0."""
+    capsules: ndarray
+    """[n, 15] ..., radius, half height, 0."""
+    solids: ndarray
+    """[n, 17] all of these in one form: centre, rotation, half edges, a radius around, 1 if it is round about
+    its z axis between flat ends. The row of a cylinder has its radius for the first two half edges."""
+    around: ndarray
+    """[rows, 6 * 16] boxes around the solids by sixteen: low x of all, y, z, high x, y, z."""
+    points: ndarray
+    """[n, 4] centre, radius; sorted by cell."""
+    point_rows: ndarray
+    """[rows, 4 * 16] the points by sixteen: x of all, y, z, radius; the
+    last one fills up."""
+    cell_first: ndarray
+    """[cells + 1] first point of each cell."""
+    grid: ndarray
+    """[nx * ny * nz] distance from each voxel's centre to the nearest point's; beyond the band a bound."""
+    nearest: ndarray
+    """[nx * ny * nz] the point that is nearest to each voxel's centre, -1 beyond the band."""
+    grid_frame: ndarray
+    """[14] origin x y z, edges of voxel and cell, largest and least radius of a point, band; nx, ny, nz; the
+    numbers of cells."""
+
+
+def robot_groups(robot: Robot) -> tuple[str, ...]:
+    """Links with spheres: fixed ones first, then in tree order."""
+    links = [link for link in robot.link_names if len(robot.spheres.get(link, ()))]
+    return tuple(sorted(links, key=lambda link: robot.link_frame(link) > 0))
+
+
+@once_per_robot
+def compile_robot(robot: Robot) -> RobotArrays:
+    """The arrays of a robot with its joints locked as they are."""
+    groups = robot_groups(robot)
+    placed = [_placed_groups(robot)[link] for link in groups]
+    spheres, clusters = [group.spheres for group in placed], [group.rows for group in placed]
+    rows = [row for of_group in clusters for row in of_group]
+    index = {link: i for i, link in enumerate(groups)}
+    T = robot.frame_offsets
+    slides = np.array(robot.prismatic, np.float64)
+    offsets = np.column_stack([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3], slides])
+    pairs = [(index[a], index[b]) for a, b in robot.checked_pairs() if a in index and b in index]
+    arrays = RobotArrays(
+        offsets=np.ascontiguousarray(offsets, np.float32),
+        spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
+        first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
+        rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [EMPTY, *rows]]),
+        row_bounds=np.array([row for group in placed for row in group.row_bounds], np.float32).reshape(-1, 4),
+        row_sizes=np.array([len(row) for row in rows], np.int64),
+        first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
+        frame=np.array([robot.link_frame(link) for link in groups], np.int32),
+        bounds=np.array([group.bounds for group in placed], np.float32).reshape(-1, 4),
+        pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
+        near=no_tables(),
+        parents=robot.branching,
+    )
+    if not pairs:
+        return arrays
+    rows = [link for link in robot.link_names if link in robot.spheres]
+    levers = motion_radii(robot)[[rows.index(link) for link in groups]]
+    found, near = tabulate(arrays, robot.lower, robot.upper, levers, _known_tables(robot, pairs, groups))
+    return arrays._replace(pairs=found, near=near)
+
+
+def _known_tables(
+    robot: Robot, pairs: list[tuple[int, int]], groups: tuple[str, ...]
+) -> dict[int, JointTable]:
+    """The robot's tables by the number of their pair, of pairs that still have those joints between them."""
+    number = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}
+    found = {}
+    for table in robot.tables:
+        between = tuple(robot.joint_names[joint] for joint in robot.joints_between(*table.links))
+        if frozenset(table.links) in number and between == table.joints:
+            found[number[frozenset(table.links)]] = table
+    return found
+
+
+class _Group(NamedTuple):
+    """The spheres of a link in its frame, whole and in rows, and spheres around them."""
+
+    spheres: ndarray
+    rows: list[ndarray]
+    bounds: ndarray
+    row_bounds: list[ndarray]
+
+
+@once_per_robot
+def _placed_groups(robot: Robot) -> dict[str, _Group]:
+    """By link; of a robot that holds something, the arm's own are those of the arm."""
+    placed = {} if robot.bare is None else dict(_placed_groups(robot.bare))
+    links = [link for link in robot_groups(robot) if link not in placed]
+    whole, parts = [], []
+    for link in links:
+        T, local = robot.T_frame_link(link), np.asarray(robot.spheres[link], np.float64)
+        centres = local[:, :3] @ T[:3, :3].T + T[:3, 3]
+        whole.append(np.column_stack([centres, local[:, 3]]))
+        parts.append(_clusters(whole[-1]))
+    bounds = _bounding_spheres([*whole, *(part for of_link in parts for part in of_link)])
+    of_parts = iter(bounds[len(whole) :])
+    for link, spheres, rows, around in zip(links, whole, parts, bounds, strict=False):
+        placed[link] = _Group(spheres, rows, around, list(islice(of_parts, len(rows))))
+    return placed
+
+
+@once_per_robot
+def reach_bound(robot: Robot) -> float:
+    """What the distance of any sphere's surface from the base's origin never exceeds [m]."""
+    lengths = np.linalg.norm(robot.frame_offsets[:, :3, 3], axis=1)
+    slides = np.where(robot.prismatic, np.maximum(np.abs(robot.lower), np.abs(robot.upper)), 0.0)
+    arrays = compile_robot(robot)
+    extent = np.linalg.norm(arrays.bounds[:, :3], axis=1) + arrays.bounds[:, 3]
+    farthest = (robot.moved_by @ (lengths + slides)).max()
+    return float(farthest + extent.max(initial=0.0))
+
+
+def _clusters(spheres: ndarray) -> list[ndarray]:
+    """Spheres in parts of at most sixteen: halves along the direction in which they extend most."""
+    if len(spheres) <= W:
+        return [spheres]
+    centred = spheres[:, :3] - spheres[:, :3].mean(axis=0)
+    order = np.argsort(centred @ np.linalg.svd(centred, full_matrices=False)[2][0], kind="stable")
+    half = len(spheres) // 2
+    return _clusters(spheres[order[:half]]) + _clusters(spheres[order[half:]])
+
+
+def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
+    """A small sphere around each set of spheres: its centre moves towards the farthest one (Badoiu and
+    Clarkson)."""
+    if not sets:
+        return []
+    most, each = max(map(len, sets)), np.arange(len(sets))
+    spheres = np.full((len(sets), most, 4), -np.inf)
+    for padded, real in zip(spheres, sets, strict=True):
+        padded[: len(real)], padded[len(real) :, :3] = real, 0.0
+    centres = np.array([real[:, :3].mean(axis=0) for real in sets])
+    for i in range(1, 200):
+        reach = np.linalg.norm(spheres[..., :3] - centres[:, None], axis=-1) + spheres[..., 3]
+        centres = centres + (spheres[each, reach.argmax(axis=1), :3] - centres) / (i + 1)
+    reach = np.linalg.norm(spheres[..., :3] - centres[:, None], axis=-1) + spheres[..., 3]
+    return list(np.column_stack([centres, reach.max(axis=1) + 1e-6]))
+
+
+GRID_SECONDS = 7e-7
+"""That a point of meshes and clouds takes, about [s]."""
+
+
+@lru_cache(maxsize=8)
+def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
+    """The arrays of a scene as far as the robot can get near it; those of the last few scenes are kept, since
+    a search and the judge ask for the same."""
+    largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
+    return compile_scene(scene, reach_bound(robot), largest)
+
+
+def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> SceneArrays:
+    """The arrays of a scene around a robot that reaches so far from its base's origin [m].
+
+    Points well beyond are left out. `radius` is that of the robot's largest sphere [m].
+    """
+    spheres, boxes, cylinders, capsules, points = [], [], [], [], []
+    for shape in scene.shapes:
+        match shape:
+            case Sphere():
+                spheres.append(shape)
+            case Box():
+                boxes.append(shape)
+            case Cylinder():
+                cylinders.append(shape)
+            case Capsule():
+                capsules.append(shape)
+            case PointCloud() | Triangulated():
+                points.append(shape)
+    balls = np.array([[*shape.center, shape.radius] for shape in spheres]).reshape(-1, 4)
+    edges = np.array([shape.size for shape in boxes]).reshape(-1, 3)
+    by_type = (
+        _grown(balls, slice(3, 4)).astype(np.float32),
+        _oriented(boxes, edges / 2, (0, 1, 2), reach),
+        _round(cylinders, reach),
+        _round(capsules, reach),
+    )
+    return SceneArrays(*by_type, *_solids(*by_type), *_grid_around(tuple(points), reach, radius))
+
+
+def _solids(
+    spheres: ndarray, boxes: ndarray, cylinders: ndarray, capsules: ndarray
+) -> tuple[ndarray, ndarray]:
+    """Fields of SceneArrays."""
+    rows = np.zeros((len(spheres) + len(boxes) + len(cylinders) + len(capsules), 17), np.float32)
+    a, b, c = np.cumsum([len(spheres), len(boxes), len(cylinders)]).tolist()
+    rows[:a, :3], rows[:a, 3:12:4], rows[:a, 15] = spheres[:, :3], 1, spheres[:, 3]
+    rows[a:b, :15] = boxes
+    rows[b:c, :13], rows[b:c, 13], rows[b:c, 14], rows[b:c, 16] = (
+        cylinders[:, :13],
+        cylinders[:, 12],
+        cylinders[:, 13],
+        1,
+    )
+    rows[c:, :12], rows[c:, 15], rows[c:, 14] = capsules[:, :12], capsules[:, 12], capsules[:, 13]
+    middle, rotation, half = rows[:, :3], np.abs(rows[:, 3:12].reshape(-1, 3, 3)), rows[:, 12:15]
+    extent = np.einsum("nij,ni->nj", rotation, half) + rows[:, 15:16]
+    extent += BOX_SLACK * (1 + np.abs(middle) + extent)
+    return rows, by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), NO_BOX)
+
+
+@lru_cache(maxsize=8)
+def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, radius: float) -> PointGrid:
+    """The grid of point clouds and meshes; the same ones in another scene have the same."""
+    clouds: list[ndarray] = []
+    for i, shape in enumerate(shapes):
+        points = sum(map(len, clouds))
+        check_time(f"{len(shapes) - i} of {len(shapes)} meshes and clouds after {points:,} points")
+        if isinstance(shape, PointCloud):
+            clouds.append(thin(shape.points, shape.point_radius, reach))
+        else:
+            clouds.append(cover(shape.mesh.world_vertices[shape.mesh.faces], reach))
+    cloud = np.concatenate(clouds) if clouds else EMPTY
+    check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS * len(cloud))
+    return build_grid(cloud, radius)
+
+
+def _round(shapes: Sequence[Cylinder | Capsule], reach: float) -> ndarray:
+    """The rows of shapes about their z axes."""
+    half = np.array([[shape.radius, shape.radius, shape.height / 2] for shape in shapes]).reshape(-1, 3)
+    return np.ascontiguousarray(_oriented(shapes, half, (2,), reach)[:, [*range(13), 14, 11]])
+
+
+def _oriented(
+    shapes: Sequence[Box | Cylinder | Capsule], half: ndarray, axes: tuple[int, ...], reach: float
+) -> ndarray:
+    """Centre, world-to-shape rotation and half extents, cropped along some axes to what the robot gets near.
+
+    A point within reach is as far from the rest of the shape as from all of it, and a floor of 1 km keeps its
+    precision in float32.
+    """
+    if not shapes:
+        return np.zeros((0, 15), np.float32)
+    origin = np.array([shape.center for shape in shapes])
+    R_base_shape = np.array([shape.rotation for shape in shapes])
+    R_shape_base = R_base_shape.transpose(0, 2, 1)
+    middle, far = (-R_shape_base @ origin[:, :, None])[:, :, 0], 2 * reach + 1
+    centre = np.zeros_like(origin)
+    for axis in axes:
+        low, high = (
+            np.maximum(-half[:, axis], middle[:, axis] - far),
+            np.minimum(half[:, axis], middle[:, axis] + far),
+        )
+        kept = low < high
+        centre[kept, axis] = ((low + high) / 2)[kept]
+        half[kept, axis] = ((high - low) / 2)[kept]
+    centre = (R_base_shape @ centre[:, :, None])[:, :, 0] + origin
+    rows = np.concatenate([centre, R_shape_base.reshape(-1, 9), half], axis=1)
+    return _grown(rows, slice(12, 15)).astype(np.float32)
+
+
+def _grown(rows: ndarray, sizes: slice) -> ndarray:
+    """The rows with their sizes larger by what rounding to float32 may take away."""
+    rows[:, sizes] += (
+        ROUNDING * (np.abs(rows[:, :3]).max(axis=1) + np.abs(rows[:, sizes]).max(axis=1))[:, None]
+    )
+    return rows

@@ -1,0 +1,310 @@
+"""The compiled part of the certificate in time; see `collision/moving_obstacles.py`.
+
+A task is an interval of a timed motion and the pairs of a link and an obstacle that are open there. A pair is
+settled when its clearance in the middle exceeds, by what is asked for, how far the link's points and the
+obstacle's can move from there until either end; otherwise the interval is halved. Clearances are those of the
+covering spheres. Where these touch, the pair is left to the exact meshes.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.collision.kernels.compiled import parent_of
+from robotdiffuse.collision.kernels.frames import placed, step
+
+CAP = 1.0
+"""Clearances beyond this [m] are reported as this."""
+DEEPEST = 48
+"""An interval is halved so often at most."""
+
+
+class Links(NamedTuple):
+    """The moving links of a robot and the spheres that cover them."""
+
+    offsets: np.ndarray
+    """[dof, 4, 4] `Robot.frame_offsets`"""
+    parents: np.ndarray | None
+    """[dof] `Robot.parents`; None of a chain."""
+    slides: np.ndarray
+    """[dof] whether the joint is prismatic."""
+    frame: np.ndarray
+    """[links]"""
+    bounds: np.ndarray
+    """[links, 4] a ball around all spheres of the link, in its frame."""
+    first: np.ndarray
+    """[links + 1] first sphere of each link."""
+    spheres: np.ndarray
+    """[n, 4] x y z radius in the frame of the link."""
+    levers: np.ndarray
+    """[links, dof] motion bounds per unit of joint motion."""
+
+
+class Tracks(NamedTuple):
+    """Obstacles that move: each the sum of a box, a disc about its z axis and a ball (`hulls.Solid`)."""
+
+    first: np.ndarray
+    """[obstacles + 1] first pose of each."""
+    times: np.ndarray
+    """[k] of the poses [s]"""
+    xyz: np.ndarray
+    """[k, 3] of the poses of the obstacles' frames."""
+    wxyz: np.ndarray
+    """[k, 4] each on the same side as the one before."""
+    speeds: np.ndarray
+    """[k] bound on the speed of the obstacle's points until the next pose; 0 for its last."""
+    growth: np.ndarray
+    """[obstacles] what is added to it per second since time 0 [m/s]."""
+    centre: np.ndarray
+    """[obstacles, 3] of the box, in the obstacle's frame."""
+    half: np.ndarray
+    """[obstacles, 3]"""
+    disc: np.ndarray
+    rounding: np.ndarray
+
+
+class Tasks(NamedTuple):
+    start: np.ndarray
+    """[n] of the interval [s]"""
+    stop: np.ndarray
+    pairs: np.ndarray
+    """[n, links, obstacles] which ones are open."""
+
+
+@njit(cache=True)
+def pose_at(tracks, o, time, rotation, xyz):
+    """Where an obstacle is: fills R_base_obstacle [3, 3] and its origin [3]."""
+    low, high = tracks.first[o], tracks.first[o + 1] - 1
+    share = 0.0
+    if time >= tracks.times[high]:
+        low = high
+    elif time > tracks.times[low]:
+        low += np.searchsorted(tracks.times[low : high + 1], time, side="right") - 1
+        share = (time - tracks.times[low]) / (tracks.times[low + 1] - tracks.times[low])
+    high = min(low + 1, high)
+    dot = 0.0
+    for k in range(3):
+        xyz[k] = tracks.xyz[low, k] + share * (tracks.xyz[high, k] - tracks.xyz[low, k])
+    for k in range(4):
+        dot += tracks.wxyz[low, k] * tracks.wxyz[high, k]
+    angle = np.arccos(min(max(dot, -1.0), 1.0))
+    a, b = 1.0 - share, share
+    if angle > 1e-7:
+        a, b = np.sin((1.0 - share) * angle) / np.sin(angle), np.sin(share * angle) / np.sin(angle)
+    w = a * tracks.wxyz[low, 0] + b * tracks.wxyz[high, 0]
+    x = a * tracks.wxyz[low, 1] + b * tracks.wxyz[high, 1]
+    y = a * tracks.wxyz[low, 2] + b * tracks.wxyz[high, 2]
+    z = a * tracks.wxyz[low, 3] + b * tracks.wxyz[high, 3]
+    scale = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = w * scale, x * scale, y * scale, z * scale
+    rotation[0, 0], rotation[0, 1], rotation[0, 2] = (
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+    )
+    rotation[1, 0], rotation[1, 1], rotation[1, 2] = (
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+    )
+    rotation[2, 0], rotation[2, 1], rotation[2, 2] = (
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    )
+
+
+@njit(cache=True)
+def speed_between(tracks, o, start, stop):
+    """No point of an obstacle is faster than this at any time between these [m/s], without its growth."""
+    most = 0.0
+    for k in range(tracks.first[o], tracks.first[o + 1] - 1):
+        if tracks.times[k] < stop and tracks.times[k + 1] > start:
+            most = max(most, tracks.speeds[k])
+    return most
+
+
+@njit(cache=True)
+def _gap(tracks, o, rotation, xyz, x, y, z):
+    """Signed distance of a point to an obstacle that has not grown [m]; within, at most the true one."""
+    x, y, z = x - xyz[0], y - xyz[1], z - xyz[2]
+    u = abs(rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z - tracks.centre[o, 0])
+    v = abs(rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z - tracks.centre[o, 1])
+    w = abs(rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z - tracks.centre[o, 2])
+    w -= tracks.half[o, 2]
+    if tracks.disc[o] > 0:
+        a = np.sqrt(u * u + v * v) - tracks.disc[o]
+        outside, deepest = max(a, 0.0) ** 2, a
+    else:
+        a, b = u - tracks.half[o, 0], v - tracks.half[o, 1]
+        outside, deepest = max(a, 0.0) ** 2 + max(b, 0.0) ** 2, max(a, b)
+    outside += max(w, 0.0) ** 2
+    return np.sqrt(outside) + min(max(deepest, w), 0.0) - tracks.rounding[o]
+
+
+@njit(cache=True)
+def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
+    """Of the spheres of a link to an obstacle [m]; or, where it is more than `enough`, a lower bound that is
+    too."""
+    T = frames[links.frame[link]]
+    ball = links.bounds[link]
+    around = (
+        _gap(tracks, o, rotation, xyz, placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)) - ball[3]
+    )
+    if around > enough:
+        return around
+    least = np.inf
+    for s in range(links.first[link], links.first[link + 1]):
+        p = links.spheres[s]
+        gap = _gap(tracks, o, rotation, xyz, placed(T, p, 0), placed(T, p, 1), placed(T, p, 2)) - p[3]
+        least = min(least, gap)
+    return least
+
+
+@njit(cache=True)
+def _pose_arm(links, q, frames):
+    for j in range(len(q)):
+        step(frames[parent_of(links.parents, j)], links.offsets[j], links.slides[j], q[j], frames[j + 1])
+
+
+@njit(cache=True)
+def _row_at(times, time):
+    """The last row that is not later, and the share of the way from there to the next."""
+    low = min(max(np.searchsorted(times, time, side="right") - 1, 0), max(len(times) - 2, 0))
+    if low + 1 >= len(times):
+        return low, 0.0
+    return low, min(max((time - times[low]) / (times[low + 1] - times[low]), 0.0), 1.0)
+
+
+@njit(cache=True)
+def _mixed(rows, low, share, j):
+    high = min(low + 1, len(rows) - 1)
+    return rows[low, j] + share * (rows[high, j] - rows[low, j])
+
+
+@njit(cache=True)
+def ways_of(q):
+    """[n, dof] how far each joint has moved by each row, to and fro."""
+    ways = np.zeros_like(q)
+    for i in range(1, len(q)):
+        for j in range(q.shape[1]):
+            ways[i, j] = ways[i - 1, j] + abs(q[i, j] - q[i - 1, j])
+    return ways
+
+
+@njit(cache=True, nogil=True)
+def certify(links, tracks, times, q, tasks, least, tightness, best):
+    """Settle the tasks, in their order, as far as the spheres can.
+
+    The motion is on straight lines between the rows q[n, dof] at times[n], at rest before and after. A pair
+    is settled when its bound is at least `least` and the share `tightness` of the least clearance measured so
+    far, best[1], which is lowered. Returns the least bound that settled a pair, and the tasks that are left
+    to the exact meshes, of one pair each: their middles are where its spheres are within `least`.
+    """
+    dof, count, obstacles = q.shape[1], len(links.frame), len(tracks.growth)
+    ways = ways_of(q)
+    frames = np.zeros((dof + 1, 4, 4))
+    for i in range(dof + 1):
+        frames[i, 3, 3] = 1.0
+    for k in range(3):
+        frames[0, k, k] = 1.0
+    middle, moved = np.empty(dof), np.empty(dof)
+    rotation, xyz = np.empty((3, 3)), np.empty(3)
+    travel = np.empty(count)
+    starts, stops = np.empty(DEEPEST + 2), np.empty(DEEPEST + 2)
+    depths = np.empty(DEEPEST + 2, np.int64)
+    pairs = np.empty((DEEPEST + 2, count, obstacles), np.bool_)
+    left = [(0.0, 0.0, 0, 0) for _ in range(0)]
+    certified = CAP
+    for task in range(len(tasks.start)):
+        starts[0], stops[0], depths[0], size = tasks.start[task], tasks.stop[task], 0, 1
+        pairs[0] = tasks.pairs[task]
+        while size > 0:
+            size -= 1
+            start, stop, depth = starts[size], stops[size], depths[size]
+            time, half = 0.5 * (start + stop), 0.5 * (stop - start)
+            row, share = _row_at(times, time)
+            first, first_share = _row_at(times, start)
+            last, last_share = _row_at(times, stop)
+            for j in range(dof):
+                middle[j] = _mixed(q, row, share, j)
+                way = _mixed(ways, row, share, j)
+                before = way - _mixed(ways, first, first_share, j)
+                moved[j] = max(before, _mixed(ways, last, last_share, j) - way)
+            _pose_arm(links, middle, frames)
+            for link in range(count):
+                travel[link] = 0.0
+                for j in range(dof):
+                    travel[link] += links.levers[link, j] * moved[j]
+            again = False
+            for o in range(obstacles):
+                posed, speed = False, 0.0
+                for link in range(count):
+                    if not pairs[size, link, o]:
+                        continue
+                    if not posed:
+                        pose_at(tracks, o, time, rotation, xyz)
+                        speed, posed = speed_between(tracks, o, start, stop) * half, True
+                    grown = tracks.growth[o] * max(time, 0.0)
+                    lost = travel[link] + speed + tracks.growth[o] * half
+                    asked = max(least, tightness * best[0])
+                    enough = grown + lost + max(asked, best[0] if tightness > 0 else 0.0)
+                    clear = _clearance(links, frames, link, tracks, o, rotation, xyz, enough) - grown
+                    clear = min(clear, CAP + lost)
+                    if clear <= least or depth == DEEPEST:
+                        left.append((start, stop, link, o))
+                        pairs[size, link, o] = False
+                        continue
+                    best[0] = min(best[0], clear)
+                    if clear - lost >= max(least, tightness * best[0]):
+                        certified = min(certified, clear - lost)
+                        pairs[size, link, o] = False
+                    else:
+                        again = True
+            if again:
+                pairs[size + 1] = pairs[size]
+                starts[size + 1], stops[size + 1] = start, time
+                starts[size], stops[size] = time, stop
+                depths[size] = depths[size + 1] = depth + 1
+                size += 2
+    return certified, left
+
+
+@njit(cache=True, nogil=True)
+def free_over(links, tracks, q, times, least):
+    """[n, k] whether no link comes within `least` [m] of any obstacle, at each of q[n, dof] and each of the
+    increasing times[k]; by the covering spheres."""
+    dof, count, obstacles = q.shape[1], len(links.frame), len(tracks.growth)
+    frames = np.zeros((dof + 1, 4, 4))
+    for i in range(dof + 1):
+        frames[i, 3, 3] = 1.0
+    for k in range(3):
+        frames[0, k, k] = 1.0
+    out = np.ones((len(q), len(times)), np.bool_)
+    rotations, places = np.empty((obstacles, len(times), 3, 3)), np.empty((obstacles, len(times), 3))
+    speeds = np.empty(obstacles)
+    for o in range(obstacles):
+        speeds[o] = speed_between(tracks, o, times[0], times[-1]) + tracks.growth[o]
+        for k in range(len(times)):
+            pose_at(tracks, o, times[k], rotations[o, k], places[o, k])
+    for i in range(len(q)):
+        _pose_arm(links, q[i], frames)
+        for link in range(count):
+            for o in range(obstacles):
+                k = 0
+                while k < len(times):
+                    if not out[i, k]:
+                        k += 1
+                        continue
+                    asked = least + tracks.growth[o] * max(times[k], 0.0)
+                    spare = (
+                        _clearance(links, frames, link, tracks, o, rotations[o, k], places[o, k], asked)
+                        - asked
+                    )
+                    out[i, k] = spare >= 0
+                    until = times[k] + max(spare, 0.0) / max(speeds[o], 1e-9)
+                    k += 1  # nothing can be near before the obstacle has covered what is to spare
+                    while k < len(times) and times[k] < until:
+                        k += 1
+    return out

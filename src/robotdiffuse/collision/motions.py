@@ -1,0 +1,259 @@
+"""Collision of motions: the space that searches check them in, and the judge's certificate.
+
+The certificate says that a motion is free between its waypoints too, or where it first is not. A piece of
+the motion is free for a link if a lower bound of its clearance along the piece is positive; otherwise the
+piece is split. The bound comes from the clearance in the piece's middle, the velocity there towards what is
+near, and a bound on what the arm's curved way can add (`kernels/sweep.py`). Of two links, the further one is
+seen from the nearer one, so only the joints between them count. Clearances are those of the covering spheres,
+many configurations at once (`kernels/swept_spheres.py`); where the spheres are too coarse, of the convex
+meshes, by planes that part them (`kernels/hulls.py`). Coal says the distances to surfaces and clouds of
+points, and whether bodies touch.
+"""
+
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
+from robotdiffuse.collision.checker import CollisionChecker
+from robotdiffuse.collision.convex_geometry import Check, checks_of, hulls_of, solid_arrays, solids_of
+from robotdiffuse.collision.kernels import motion_certificate as kernel
+from robotdiffuse.collision.kernels.motions import Space
+from robotdiffuse.collision.kernels.motion_certificate import CAP, PAIR, SCENE, Arm, Checks, Motion, Pieces, Round
+from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.scenes.scene import Scene
+
+if TYPE_CHECKING:
+    from robotdiffuse.collision.exact_meshes import ExactCollision
+
+FINEST = 0.002
+"""Least distance between two checks of a motion that is searched with [m]."""
+FIRST_TRAVEL = 0.16
+"""Motion bound of the pieces that a motion is cut into at first [m]; half and twice are about as fast."""
+FIRST_CONTACT_TRAVEL = 1e-3
+"""The first contact is located to within this motion bound [m]."""
+EPISODE_TRAVEL, EPISODE_SAMPLES = 0.01, 64
+"""Step [m] and number of the configurations at which the depth of a contact is looked for."""
+
+
+def search_space(
+    checker: CollisionChecker,
+    resolution: float,
+    padding: float = 0.0,
+    near_ends: Float[ndarray, "m columns"] | None = None,
+) -> Space:
+    """What the compiled search needs; `resolution`, `padding` [m] and `near_ends` as in its docstring."""
+    robot = checker.robot
+    ends = np.zeros((0, robot.dof + 1)) if near_ends is None else near_ends.copy()
+    ends[:, -1] += checker.padding
+    return Space(
+        checker.robot_arrays,
+        checker.scene_arrays,
+        robot.lower.astype(np.float32),
+        robot.upper.astype(np.float32),
+        levers(robot),
+        np.float32(resolution),
+        checker.padding + np.float32(padding),
+        ends.astype(np.float32),
+    )
+
+
+def finer(resolution: float) -> float:
+    """For after a path that the judge refused: it found contact between two checks, so look twice as closely
+    [m]."""
+    return max(resolution / 2, FINEST)
+
+
+def levers(robot: Robot) -> Float[ndarray, "dof"]:
+    """Largest distance of any point of the arm from each joint's axis [m]."""
+    return motion_radii(robot).max(axis=0, initial=0.0).astype(np.float32)
+
+
+class Contact(NamedTuple):
+    """The first contact of a motion."""
+
+    check: Check
+    other: str
+    """The obstacle or the other link."""
+    at: float
+    """Waypoint index plus fraction."""
+    depth: float
+    """The greatest penetration found until the contact ends [m]; 0 for a touch."""
+
+
+class Sweep(NamedTuple):
+    """What is known of a motion."""
+
+    contact: Contact | None
+    scene_clearance: float
+    """A lower bound on all clearances to the scene along the motion [m], at most 1 m; 0 with a contact."""
+    self_clearance: float
+    """The same between links."""
+
+
+class ContinuousCollision:
+    """Judges whole motions of a robot in a scene. Not safe for use by several threads at once."""
+
+    def __init__(self, robot: Robot, scene: Scene, contact: float, tightness: float) -> None:
+        """Meshes nearer than `contact` [m] touch. Pieces are split until each certified clearance is at least
+        the share `tightness`, in (0, 1), of the least one measured of its kind: to the scene, or between
+        links."""
+        self.robot, self.scene, self.contact, self.tightness = robot, scene, contact, tightness
+        self.arm, self.checks = _arm(robot), _checks(robot)
+        self.scene_arrays = compile_scene_for(robot, scene)
+        self.solids = solid_arrays(solids_of(scene))
+
+    def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
+        """Judge the motion along straight joint-space lines through the waypoints (at least one)."""
+        q = np.ascontiguousarray(q, dtype=np.float64)
+        motion = Motion(q, kernel.way_along(q, self.checks.levers))
+        todo = kernel.first_pieces(motion, self.checks, FIRST_TRAVEL)
+        best, certified = np.full(2, CAP), np.full(2, CAP)
+        hit: tuple[float, int] | None = None
+        while len(todo.start):
+            found, rows, columns = kernel.rounds(
+                self.arm,
+                self.scene_arrays,
+                self.solids,
+                motion,
+                self.checks,
+                todo,
+                best,
+                certified,
+                self.tightness,
+                self.contact,
+            )
+            if not len(rows):
+                break
+            touched = self._ask(motion, found, rows, columns, best)
+            if touched is not None:
+                hit, found = touched
+            todo = kernel.settle(self.checks, found, best, certified, self.tightness)
+        if hit is not None:
+            return Sweep(self._contact(motion, *hit), 0.0, 0.0)
+        return Sweep(None, *certified.tolist())
+
+    def _ask(
+        self, motion: Motion, found: Round, rows: ndarray, columns: ndarray, best: ndarray
+    ) -> tuple[tuple[float, int], Round] | None:
+        """Ask Coal what the round leaves to it. With a contact: its place and check, and what remains of the
+        round, since what follows the contact matters no more; what precedes it does, closer and closer."""
+        todo, clearance, lower = found.pieces, found.clearance, found.lower
+        kinds = self.checks.kind[columns]
+        travel = found.travel[rows, columns]
+        middle = (todo.start + todo.stop) / 2
+        at = kernel.configurations(motion, middle[rows])
+        cutoffs = np.clip(travel + best[kinds], 2 * self.contact, CAP)
+        distances, _ = self._exact.nearest(at, columns, cutoffs, stop=self.contact)
+        asked = int(np.isfinite(distances).sum())
+        touched = distances[asked - 1] <= self.contact
+        asked -= int(touched)
+        cells = rows[:asked], columns[:asked]
+        clearance[cells] = distances[:asked]
+        lower[cells] = np.maximum(lower[cells], distances[:asked] - travel[:asked])
+        np.minimum.at(best, kinds[:asked], distances[:asked])
+        if not touched:
+            return None
+        row = int(rows[asked])
+        keep = row + int(todo.stop[row] - todo.start[row] > 2 * FIRST_CONTACT_TRAVEL)
+        todo.stop[row] = middle[row]
+        clearance[row:] = lower[row:] = -np.inf
+        parts = (todo.start, todo.stop, todo.undecided)
+        rest = Round(Pieces(*(part[:keep] for part in parts)), *(part[:keep] for part in found[1:]))
+        return (float(middle[row]), int(columns[asked])), rest
+
+    @cached_property
+    def _exact(self) -> "ExactCollision":
+        from robotdiffuse.collision.exact_meshes import ExactCollision  # and Coal, which most motions do not need
+
+        return ExactCollision(self.robot, self.scene)
+
+    def _contact(self, motion: Motion, at: float, check: int) -> Contact:
+        """The contact of a check at a place, with its depth until the check comes free of that obstacle."""
+        steps = at + EPISODE_TRAVEL * np.arange(EPISODE_SAMPLES)
+        steps = steps[steps <= max(motion.way[-1], at)]
+        checks, cutoffs = np.full(len(steps), check), np.full(len(steps), 2 * self.contact)
+        distances, names = self._exact.nearest(kernel.configurations(motion, steps), checks, cutoffs)
+        other = names[0]
+        left = [i for i, name in enumerate(names) if name != other or distances[i] > self.contact]
+        episode = distances[: left[0] if left else len(steps)]
+        depth = max(0.0, -float(episode.min(initial=0)))
+        low, share = kernel.segment_at(motion.way, at)
+        if share == 0.0:  # the first of waypoints that are the same
+            low = int(np.searchsorted(motion.way, at))
+        return Contact(checks_of(self.robot)[check], str(other), low + share, depth)
+
+
+@once_per_robot
+def _groups(robot: Robot) -> tuple[dict[str, int], dict[frozenset[str | None], int]]:
+    """Of the compiled arrays: the number of each link's group, and of each pair of links."""
+    groups = robot_groups(robot)
+    pairs = compile_robot(robot).pairs[:, :2].tolist()
+    return (
+        {link: i for i, link in enumerate(groups)},
+        {frozenset((groups[a], groups[b])): i for i, (a, b) in enumerate(pairs)},
+    )
+
+
+@once_per_robot
+def _arm(robot: Robot) -> Arm:
+    slides = np.array(robot.prismatic, np.bool_)
+    offsets = np.ascontiguousarray(robot.frame_offsets)
+    return Arm(compile_robot(robot), hulls_of(robot)[0], offsets, robot.branching, slides)
+
+
+@once_per_robot
+def _checks(robot: Robot) -> Checks:
+    """What compiled code reads of the checks. Levers are seen from where the chains of the links part: from
+    the nearer link, if both are on one."""
+    groups, pairs = _groups(robot)
+    whole, parts = covered(robot), hulls_of(robot)[1]
+    links = [link for link in whole.link_names if link in whole.spheres]
+    radii, checks = motion_radii(whole), checks_of(robot)
+    kind, where, of_parts, base, common, second = [], [], [], [], [], []
+    levers = np.zeros((len(checks), robot.dof))
+    for k, (link, other) in enumerate(checks):
+        kind.append(SCENE if other is None else PAIR)
+        known = groups.get(link, -1) if other is None else pairs.get(frozenset((link, other)), -1)
+        where.append(known)
+        nearer, further = sorted((other or robot.base, link), key=robot.link_frame)
+        low, high = robot.link_frame(nearer), robot.link_frame(further)
+        shared = robot.moved_by[low] & robot.moved_by[high]
+        for one, joints in (
+            (nearer, robot.moved_by[low] & ~shared),
+            (further, robot.moved_by[high] & ~shared),
+        ):
+            if joints.any():
+                levers[k, joints] = radii[links.index(one), joints]
+        base.append(low)
+        common.append(int(np.flatnonzero(shared).max(initial=-1)) + 1)
+        second.append(int(np.flatnonzero(robot.moved_by[high] & ~shared)[0]) if common[-1] != low else 0)
+        others = range(0) if other is None else parts[nearer]
+        of_parts.append((parts[further].start, parts[further].stop, others.start, others.stop))
+    return Checks(
+        np.array(kind, np.int64),
+        np.array(where, np.int64),
+        np.array(of_parts, np.int64).reshape(-1, 4),
+        np.array(base, np.int64),
+        np.array(common, np.int64),
+        np.array(second, np.int64),
+        levers,
+    )
+
+
+@once_per_robot
+def covered(robot: Robot) -> Robot:
+    """The robot, with one sphere about the meshes of each link that has meshes but no spheres."""
+    added = {}
+    for link, meshes in robot.meshes.items():
+        if len(meshes) and not len(robot.spheres.get(link, ())):
+            vertices = np.concatenate([mesh.vertices for mesh in meshes])
+            center = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+            radius = np.linalg.norm(vertices - center, axis=1).max()
+            added[link] = np.array([[*center, radius]])
+    return replace(robot, spheres=robot.spheres | added) if added else robot

@@ -1,0 +1,233 @@
+"""The certificate in time: a timed motion is free of obstacles that move, or where and when it first is not.
+
+An interval of time is proved for a link and an obstacle when their clearance in its middle exceeds what the
+link's points (`robots/motion_bounds.py`) and the obstacle's can move in half of it; otherwise it is halved. An
+obstacle of which only the greatest speed is known is taken to be anywhere that it can have got to since time
+0. Clearances are those of the covering spheres (`kernels/moving.py`); where these touch, Coal says those of
+the meshes. Nothing is sampled and hoped for.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision.kernel_arrays import robot_groups
+from robotdiffuse.collision.convex_geometry import Solid, solids_of
+from robotdiffuse.collision.kernels import moving_obstacles as kernel
+from robotdiffuse.collision.kernels.moving_obstacles import CAP, Links, Tasks, Tracks
+from robotdiffuse.collision.motions import covered
+from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.robot import Robot, once_per_robot
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle, track_speeds
+from robotdiffuse.scenes.shape_transforms import placed
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
+
+if TYPE_CHECKING:
+    from robotdiffuse.collision.exact_meshes import ExactCollision
+
+FIRST_CONTACT = 1e-3
+"""The first contact is located to within this time [s]."""
+SHORTEST = 1e-7
+"""Intervals are halved down to this [s]; what cannot be proved then counts as contact."""
+EPISODE, EPISODE_SAMPLES = 0.005, 200
+"""Step [s] and number of the times at which the depth of a contact is looked for."""
+
+
+class TimedContact(NamedTuple):
+    """The first contact of a timed motion with an obstacle that moves."""
+
+    link: str
+    obstacle: str
+    time: float
+    """[s]"""
+    depth: float
+    """The greatest penetration found until the contact ends [m]; 0 for a touch."""
+
+
+class TimedSweep(NamedTuple):
+    """What is known of a timed motion."""
+
+    contact: TimedContact | None
+    clearance: float
+    """A lower bound on all clearances to the obstacles [m], at most 1 m; 0 with a contact."""
+
+
+class MovingCollision:
+    """Judges timed motions of a robot among obstacles that move. Not safe for several threads at once."""
+
+    def __init__(
+        self, robot: Robot, moving: Sequence[MovingObstacle], contact: float, tightness: float
+    ) -> None:
+        """Meshes nearer than `contact` [m] touch. Intervals are halved until each bound is at least the share
+        `tightness`, in [0, 1), of the least clearance measured."""
+        self.robot, self.moving, self.contact, self.tightness = robot, tuple(moving), contact, tightness
+        self.link_names, self.links = links_of(robot)
+        self.tracks = tracks_of(self.moving)
+
+    def sweep(self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> TimedSweep:
+        """Judge the motion on straight lines between rows at increasing times."""
+        times, q = np.ascontiguousarray(times, np.float64), np.ascontiguousarray(q, np.float64)
+        best, certified = np.array([CAP]), CAP
+        every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
+        ends = times[[0, -1]]
+        tasks, hit = Tasks(ends[:1], ends[1:], every), None
+        while len(tasks.start):
+            bound, left = kernel.certify(
+                self.links, self.tracks, times, q, tasks, self.contact, self.tightness, best
+            )
+            certified = min(certified, bound)
+            halves = list[tuple[float, float, int, int]]()
+            for start, stop, link, o in left:
+                if hit is not None and start >= hit[0]:
+                    continue
+                time = (start + stop) / 2
+                distance = self._distance(link, o, times, q, time)
+                lost = self._lost(link, o, times, q, start, stop)
+                if distance <= self.contact or stop - start < SHORTEST:
+                    if hit is None or time < hit[0]:
+                        hit = time, link, o
+                    if stop - start > 2 * FIRST_CONTACT:
+                        halves.append((start, time, link, o))
+                    continue
+                best[0] = min(best[0], distance)
+                if distance - lost >= max(self.contact, self.tightness * best[0]):
+                    certified = min(certified, distance - lost)
+                else:
+                    halves += [(start, time, link, o), (time, stop, link, o)]
+            tasks = self._tasks([half for half in halves if hit is None or half[0] < hit[0]])
+        if hit is not None:
+            return TimedSweep(self._contact(times, q, *hit), 0.0)
+        return TimedSweep(None, float(certified))
+
+    def wider(self, by: Float[ndarray, "obstacles"]) -> "MovingCollision":
+        """The same with each obstacle larger by so much [m], for `covered_free`."""
+        other = copy(self)
+        other.tracks = self.tracks._replace(rounding=self.tracks.rounding + by)
+        return other
+
+    def covered_free(
+        self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"], least: float
+    ) -> float | None:
+        """The time [s] of the first place where the covering spheres are not proved to keep `least` [m], None
+        for a motion that is proved. Fast, for searches and loops: what spheres cannot settle is refused."""
+        every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
+        tasks = Tasks(times[:1], times[-1:], every)
+        left = kernel.certify(self.links, self.tracks, times, q, tasks, least, 0.0, np.array([CAP]))[1]
+        return min((start for start, *_ in left), default=None)
+
+    def _tasks(self, halves: list[tuple[float, float, int, int]]) -> Tasks:
+        pairs = np.zeros((len(halves), len(self.link_names), len(self.moving)), np.bool_)
+        for i, (_, _, link, o) in enumerate(halves):
+            pairs[i, link, o] = True
+        starts = np.array([half[0] for half in halves])
+        return Tasks(starts, np.array([half[1] for half in halves]), pairs)
+
+    def _distance(self, link: int, o: int, times: ndarray, q: ndarray, time: float) -> float:
+        """Signed distance of the meshes of a link to an obstacle at a time, less what that can have grown."""
+        obstacle = self.moving[o]
+        T_stands_moved = placed(obstacle.shape) @ inverse(obstacle.pose(time))
+        distance = self._exact[o].distance_seen_from(
+            self.link_names[link], _at(times, q, time), T_stands_moved
+        )
+        return distance - self.tracks.growth[o] * max(time, 0.0)
+
+    def _lost(self, link: int, o: int, times: ndarray, q: ndarray, start: float, stop: float) -> float:
+        """What the link's and the obstacle's points can move from the middle of an interval to an end."""
+        ways = kernel.ways_of(q)
+        a, m, b = (_at(times, ways, time) for time in (start, (start + stop) / 2, stop))
+        speed = kernel.speed_between(self.tracks, o, start, stop) + self.tracks.growth[o]
+        return float(self.links.levers[link] @ np.maximum(m - a, b - m)) + speed * (stop - start) / 2
+
+    @cached_property
+    def _exact(self) -> "tuple[ExactCollision, ...]":
+        from robotdiffuse.collision.exact_meshes import ExactCollision  # and Coal, which most motions do not need
+
+        return tuple(ExactCollision(self.robot, Scene([obstacle.shape])) for obstacle in self.moving)
+
+    def _contact(self, times: ndarray, q: ndarray, time: float, link: int, o: int) -> TimedContact:
+        """A contact with its depth until link and obstacle come apart."""
+        depth = 0.0
+        for k in range(EPISODE_SAMPLES):
+            at = time + EPISODE * k
+            distance = self._distance(link, o, times, q, at) if at <= times[-1] or k == 0 else np.inf
+            if k and distance > self.contact:
+                break
+            depth = max(depth, -distance)
+        return TimedContact(self.link_names[link], self.moving[o].name, time, float(depth))
+
+
+def _at(times: ndarray, rows: ndarray, time: float) -> Float[ndarray, "dof"]:
+    if len(times) == 1:
+        return rows[0]
+    i = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
+    share = float(np.clip((time - times[i]) / (times[i + 1] - times[i]), 0.0, 1.0))
+    return rows[i] + share * (rows[i + 1] - rows[i])
+
+
+@once_per_robot
+def links_of(robot: Robot) -> tuple[tuple[str, ...], Links]:
+    """The moving links with geometry, and what compiled code reads of them."""
+    whole = covered(robot)
+    names = tuple(link for link in robot_groups(whole) if whole.link_frame(link) > 0)
+    rows = [link for link in whole.link_names if link in whole.spheres]
+    spheres = []
+    for link in names:
+        T, local = whole.T_frame_link(link), np.asarray(whole.spheres[link], np.float64)
+        spheres.append(np.column_stack([local[:, :3] @ T[:3, :3].T + T[:3, 3], local[:, 3]]))
+    bounds = np.zeros((len(names), 4))
+    for i, of_link in enumerate(spheres):
+        low = (of_link[:, :3] - of_link[:, 3:]).min(axis=0)
+        high = (of_link[:, :3] + of_link[:, 3:]).max(axis=0)
+        bounds[i, :3] = (low + high) / 2
+        far = np.linalg.norm(of_link[:, :3] - bounds[i, :3], axis=1) + of_link[:, 3]
+        bounds[i, 3] = far.max()
+    links = Links(
+        np.ascontiguousarray(robot.frame_offsets, np.float64),
+        robot.branching,
+        np.array(robot.prismatic, np.bool_),
+        np.array([whole.link_frame(link) for link in names], np.int64),
+        bounds,
+        np.cumsum([0] + [len(of_link) for of_link in spheres]),
+        np.concatenate(spheres) if spheres else np.zeros((0, 4)),
+        np.ascontiguousarray(motion_radii(whole)[[rows.index(link) for link in names]]),
+    )
+    return names, links
+
+
+def tracks_of(moving: Sequence[MovingObstacle]) -> Tracks:
+    """What compiled code reads of obstacles; a mesh is the box around it."""
+    times, xyz, wxyz, speeds, solids = [], [], [], [], list[Solid]()
+    for obstacle in moving:
+        at, poses = obstacle.track
+        quaternions = np.stack([quaternion_from_rotation(T[:3, :3]) for T in poses])
+        for i in range(1, len(quaternions)):
+            quaternions[i] *= 1.0 if quaternions[i] @ quaternions[i - 1] >= 0 else -1.0
+        times.append(at)
+        xyz.append(poses[:, :3, 3])
+        wxyz.append(quaternions)
+        speeds.append(np.append(track_speeds(at, poses, obstacle.radius), 0.0))
+        solids += solids_of(Scene([obstacle.shape]))
+    boxes = [
+        inverse(placed(obstacle.shape)) @ solid.T_base_box
+        for obstacle, solid in zip(moving, solids, strict=True)
+    ]
+    # of a surface, the box stands along the axes of the base; in the obstacle's own frame it is turned
+    extents = [np.abs(T[:3, :3]) @ solid.half for T, solid in zip(boxes, solids, strict=True)]
+    return Tracks(
+        np.cumsum([0] + [len(at) for at in times]),
+        np.concatenate([np.zeros(0), *times]),
+        np.concatenate([np.zeros((0, 3)), *xyz]),
+        np.concatenate([np.zeros((0, 4)), *wxyz]),
+        np.concatenate([np.zeros(0), *speeds]),
+        np.array([obstacle.max_speed or 0.0 for obstacle in moving]),
+        np.array([T[:3, 3] for T in boxes]).reshape(-1, 3),
+        np.array(extents).reshape(-1, 3),
+        np.array([solid.disc for solid in solids], np.float64),
+        np.array([solid.rounding for solid in solids], np.float64),
+    )

@@ -1,0 +1,324 @@
+"""Files that others wrote, with bounds on what they may hold: JSON and YAML alike.
+
+Whatever a file or its name holds, these return a value or raise InputError, in time that grows with the size
+of the file: devices and pipes are not opened, nesting is measured before it is followed, and what aliases
+stand for is counted.
+"""
+
+import json
+import logging
+import os
+import re
+import stat
+import xml.etree.ElementTree as ET
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+import yaml
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+
+MEGABYTE = 2**20
+LARGEST_FILE = 256 * MEGABYTE
+MESH_FORMATS = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
+LARGEST_YAML = 16 * MEGABYTE
+"""Ten seconds of reading; JSON takes less than one."""
+DEEPEST = 64
+"""Lists and mappings within each other."""
+MOST_VALUES = 2_000_000
+"""Values that a YAML file may stand for, aliases followed."""
+LONGEST_NAME = 300
+"""Of a file, in messages."""
+LONGEST_INTEGER = 30
+"""Digits."""
+
+# trimesh logs the tracebacks of what it then raises, which without a handler go to standard error
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
+_STRING = re.compile(r'"(?:[^"\\]|\\.)*"?')
+_closed: ContextVar[bool] = ContextVar("closed", default=False)
+
+
+@contextmanager
+def no_files() -> Iterator[None]:
+    """No file is read while this lasts, nor said whether there is one: for data that came from elsewhere."""
+    before = _closed.set(True)
+    try:
+        yield
+    finally:
+        _closed.reset(before)
+
+
+def is_file(file: str | Path) -> bool:
+    """Whether there is a regular file of this name that may be looked at; False also for impossible names."""
+    try:
+        return not _closed.get() and stat.S_ISREG(os.stat(file).st_mode)
+    except (OSError, ValueError):
+        return False
+
+
+def input_file(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> Path:
+    """The path of a regular file of at most `largest` bytes; `what` stands before its name in messages.
+
+    Raises InputError for one that is missing, no regular file (a folder, a device, a pipe), too large, not
+    permitted, or whose name cannot be one.
+    """
+    text = str(file)
+    named = f"{what} {text if len(text) <= LONGEST_NAME else shortened(text)}".strip()
+    if _closed.get():
+        raise InputError(f"{named} is a file, and none is read here: give what it holds instead")
+    try:
+        found = os.stat(file)
+        permitted = os.access(file, os.R_OK)
+    except FileNotFoundError:
+        raise InputError(f"{named} does not exist") from None
+    except OSError as error:
+        raise InputError(f"{named} cannot be read: {error.strerror}") from None
+    except ValueError:  # a NUL or half a surrogate pair in the name
+        raise InputError(f"{named} cannot be read: no file can have this name") from None
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device or a pipe"
+        raise InputError(f"{named} cannot be read: it is {kind}; it must be a file")
+    if not permitted:
+        raise InputError(f"{named} cannot be read: permission denied")
+    if found.st_size > largest:
+        size = f"{found.st_size / MEGABYTE:.0f} MB"
+        raise InputError(f"{named} is too large: it has {size}; at most {largest // MEGABYTE} MB are read")
+    return Path(file)
+
+
+def read_bytes(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> bytes:
+    """The content of a file; InputError as `input_file`."""
+    path = input_file(file, what, largest)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{what} {path} cannot be read: {error.strerror}".strip()) from None
+
+
+def read_text(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> str:
+    """The content of a UTF-8 text file; InputError as `input_file`, and if it is not text."""
+    try:
+        return read_bytes(file, what, largest).decode("utf-8-sig").replace("\r\n", "\n")
+    except UnicodeDecodeError as error:
+        why = f"byte {error.start} is not UTF-8 text"
+        raise InputError(f"{what} {file} cannot be read: {why}".strip()) from None
+
+
+def read_triangles(file: str | Path, what: str = "mesh file", merge: bool = False) -> tuple[ndarray, ndarray]:
+    """Vertices [v, 3] and faces [f, 3] of a mesh file, in its own units; `merge` makes corners that are the
+    same one vertex. InputError as `input_file`, for other formats, and for one that is empty or damaged."""
+    import trimesh
+
+    path = input_file(file, what)
+    if path.suffix.lower() not in MESH_FORMATS:
+        raise unknown_name(f"mesh format of {file}:", path.suffix, MESH_FORMATS)
+    if path.stat().st_size == 0:
+        raise InputError(f"{what} {file} is empty")
+    try:
+        with np.errstate(all="ignore"):
+            mesh = trimesh.load_mesh(path, process=merge)
+    except Exception as error:  # trimesh raises whatever its parsers meet in a damaged file
+        raise InputError(f"{what} {file} cannot be read: {shortened(str(error))}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
+        raise InputError(f"{what} {file} holds no triangles")
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+
+
+def read_arrays(file: str | Path, what: str = "") -> dict[str, ndarray]:
+    """The arrays of an .npz file, or of an .npy file under the name "". InputError as `input_file`, for a
+    damaged file, and for an archive that unpacks to more than LARGEST_FILE."""
+    path = input_file(file, what)
+    try:
+        if path.suffix.lower() != ".npz":
+            return {"": np.load(path, allow_pickle=False)}
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size <= LARGEST_FILE:
+            with np.load(path, allow_pickle=False) as arrays:
+                return {name: arrays[name] for name in arrays.files}
+    except Exception as error:  # NumPy, zipfile and zlib raise whatever they meet in a damaged file
+        raise InputError(f"{what} {file} is damaged: {shortened(str(error))}".strip()) from None
+    most = LARGEST_FILE // MEGABYTE
+    raise InputError(f"{what} {file} unpacks to {size // MEGABYTE} MB; at most {most} MB are read".strip())
+
+
+def read_json(file: str | Path, what: str = "") -> Any:
+    """The content of a JSON file; InputError as `read_text` and `parse_json`."""
+    return parse_json(read_text(file, what), str(file))
+
+
+def parse_json(text: str, where: str) -> Any:
+    """The value in a JSON text; InputError, naming the place, for invalid, deep and endless ones."""
+    if text.count("[") + text.count("{") > DEEPEST:
+        marks = np.frombuffer(_STRING.sub("", text).encode("utf-8", "replace"), np.uint8)
+        opened = (marks == ord("[")) | (marks == ord("{"))
+        closed = (marks == ord("]")) | (marks == ord("}"))
+        if (np.cumsum(opened.astype(np.int64) - closed)).max(initial=0) > DEEPEST:
+            _too_deep(where)
+    try:
+        return json.loads(text, parse_int=lambda digits: _integer(digits, where))
+    except json.JSONDecodeError as error:
+        at = f"line {error.lineno}, column {error.colno}"
+        raise InputError(f"{where} is not valid JSON: {error.msg} at {at}") from None
+    except RecursionError:
+        _too_deep(where)
+
+
+def read_yaml(file: str | Path, what: str = "") -> Any:
+    """The content of a YAML (or JSON) file; InputError as `read_text` and `parse_yaml`."""
+    return parse_yaml(read_text(file, what, LARGEST_YAML), str(file))
+
+
+def parse_yaml(text: str, where: str) -> Any:
+    """The value of a YAML text: null, booleans, numbers, texts, lists, and mappings by texts.
+
+    Dates are texts. InputError, naming the place, for invalid, deep and endless ones, and for tags.
+    """
+    try:
+        loader = _Loader(text)
+        try:
+            return _Composer(loader, where).document()
+        finally:
+            loader.dispose()
+    except yaml.YAMLError as error:
+        raise InputError(f"{where} is not valid YAML: {_reason(error)}") from None
+    except UnicodeEncodeError:
+        raise InputError(f"{where} is not valid YAML: it holds half of a surrogate pair") from None
+
+
+def parse_xml(text: bytes, where: str) -> ET.Element:
+    """The root of an XML text; InputError, naming the place, for one that is not well-formed, too deep, or in
+    an encoding that is not known."""
+    depth, parser = 0, ET.XMLPullParser(("start", "end"))
+    try:
+        parser.feed(text)
+        parser.close()
+        events: list[Any] = list(parser.read_events())
+        for event, _ in events:
+            depth += 1 if event == "start" else -1
+            if depth > DEEPEST:
+                _too_deep(where)
+    except (ET.ParseError, ValueError, LookupError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{where} is not well-formed XML: {shortened(str(error))}") from None
+    return events[0][1]
+
+
+class _Loader(yaml.CSafeLoader):
+    """Reads 1e-3 and 2.5e3 as numbers, which YAML 1.1 takes for texts."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)[eE][-+]?[0-9]+$"),
+    list("-+.0123456789"),
+)
+
+
+class _Composer:
+    """Values from the events of a parser; libyaml's own composer recurses without bounds."""
+
+    def __init__(self, loader: _Loader, where: str) -> None:
+        self.loader, self.where, self.count = loader, where, 0
+        self.anchors: dict[str, tuple[Any, int]] = {}
+        """The value of each, and how many values it stands for."""
+
+    def document(self) -> Any:
+        loader, value = self.loader, None
+        loader.get_event()  # of the stream
+        if not loader.check_event(yaml.StreamEndEvent):
+            loader.get_event()
+            value = self._node(0)
+            loader.get_event()
+            if not loader.check_event(yaml.StreamEndEvent):
+                raise InputError(f"{self.where} is not valid YAML: it holds more than one document")
+        return value
+
+    def _node(self, depth: int) -> Any:
+        event: Any = self.loader.get_event()
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in self.anchors:
+                self._refuse(event, f"alias {shown(event.anchor)} has no anchor before it")
+            value, size = self.anchors[event.anchor]
+            self._add(size, event)
+            return value
+        if event.tag is not None:
+            self._refuse(event, f"tag {shown(event.tag)} is not supported")
+        begun = self.count
+        self._add(1, event)
+        if isinstance(event, yaml.ScalarEvent):
+            value = self._scalar(event)
+        elif depth >= DEEPEST:
+            _too_deep(self.where)
+        elif isinstance(event, yaml.SequenceStartEvent):
+            value = []
+            while not self.loader.check_event(yaml.SequenceEndEvent):
+                value.append(self._node(depth + 1))
+            self.loader.get_event()
+        else:
+            value = {}
+            while not self.loader.check_event(yaml.MappingEndEvent):
+                key: Any = self.loader.get_event()
+                if not isinstance(key, yaml.ScalarEvent) or key.tag is not None:
+                    self._refuse(key, "a key is no plain text")
+                if key.value in value:
+                    self._refuse(key, f"{key.value} stands twice")
+                value[key.value] = self._node(depth + 1)
+            self.loader.get_event()
+        if event.anchor is not None:
+            self.anchors[event.anchor] = value, self.count - begun
+        return value
+
+    def _scalar(self, event: yaml.ScalarEvent) -> Any:
+        text = event.value
+        if not event.implicit[0]:
+            return text
+        kind = self.loader.resolve(yaml.ScalarNode, text, event.implicit).rpartition(":")[2]
+        node = yaml.ScalarNode("", text)
+        if kind == "null":
+            return None
+        if kind == "bool":
+            return self.loader.construct_yaml_bool(node)
+        if kind == "float":
+            return self.loader.construct_yaml_float(node)
+        if kind == "int":
+            _check_digits(text, self.where)
+            return self.loader.construct_yaml_int(node)
+        return text
+
+    def _add(self, count: int, event: Any) -> None:
+        self.count += count
+        if self.count > MOST_VALUES:
+            self._refuse(event, f"it stands for more than {MOST_VALUES:,} values")
+
+    def _refuse(self, event: Any, why: str) -> NoReturn:
+        raise InputError(f"{self.where} is not valid YAML: {why} in line {event.start_mark.line + 1}")
+
+
+def _reason(error: yaml.YAMLError) -> str:
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark is not None:
+        mark = error.problem_mark
+        return f"{shortened(error.problem or '')} in line {mark.line + 1}, column {mark.column + 1}"
+    return shortened(str(error))
+
+
+def _integer(digits: str, where: str) -> int:
+    _check_digits(digits, where)
+    return int(digits)
+
+
+def _check_digits(text: str, where: str) -> None:
+    if len(text) > LONGEST_INTEGER:
+        raise InputError(f"{where} holds the integer {shortened(text)}; no number there can be so large")
+
+
+def _too_deep(where: str) -> NoReturn:
+    raise InputError(f"{where} is nested more than {DEEPEST} levels deep")

@@ -1,0 +1,253 @@
+"""What a planner answers, and its files: the only place that knows how results are written."""
+
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+
+from robotdiffuse.core.bounds import FASTEST, within
+from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.input_files import read_json
+from robotdiffuse.core.types import ROWS, Path, Status, Trajectory, Tree
+
+REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
+
+
+@dataclass(frozen=True, eq=False)
+class PlanResult:
+    """The answer of a planner. `path` is set if and only if `status` is SOLVED; then it passed `verify`."""
+
+    status: Status
+    reason: str
+    """A sentence that a person can act on; for SOLVED: what the solution came from."""
+    planner: str
+    robot: str
+    planning_time: float
+    """Wall time of plan() [s], with verification and without the timing of the trajectory."""
+    seed: int
+    stage: str = ""
+    """The part of the planner that produced the path, e.g. 'aorrtc', 'network', 'smooth_noise'."""
+    path: Path | None = None
+    trajectory: Trajectory | None = None
+    min_clearance: float | None = None
+    """A lower bound of all distances along the motion [m], the smaller of ..."""
+    scene_clearance: float | None = None
+    """... that of the distances to obstacles, and ..."""
+    self_clearance: float | None = None
+    """... that of those between links. Results of earlier versions lack the two."""
+    notes: tuple[str, ...] = field(default=())
+    """What was changed or ignored in the input, e.g. a start clamped to a limit."""
+    progress: tuple[tuple[float, float], ...] = ()
+    """When each shorter path was found [s since the call], and its joint-space length [rad]; the last pair is
+    the returned path's."""
+    refused: str = ""
+    """What was wrong with the last path that the judge refused, a `verify.Violation.kind`; "" if none was."""
+    rung: str = ""
+    """For a scene that cameras saw: which obstacles in unseen space the motion keeps clear of, e.g. "points
+    padded by 9 cm"; "as seen": of none. "" where no view was given."""
+    confidence: float | None = None
+    """For a scene that cameras saw: how likely the motion is free of what they did not see. `verified` says
+    that it is free of what they saw."""
+    swept_probability: float | None = None
+    """That the voxels it passes through are occupied, summed, where an imagination of unseen space was asked
+    for: what `confidence` is told from."""
+    unseen_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Least and greatest corner of a box, in the base frame, around the unseen space that the motion crosses
+    where that is likeliest to be occupied [m]; None where it crosses none."""
+    trees: tuple[Tree, ...] = field(default=(), repr=False)
+    """Of the search: from the start and from the goals, as they found the shortest path of the search, or
+    stood when time ran out. Only where the planner's settings say `keep_trees`; files do not hold them."""
+    problem: Any = field(default=None, repr=False)
+    """The `Problem` that was asked, for `rd.show`; None in results that were read from files."""
+
+    @property
+    def solved(self) -> bool:
+        return self.status is Status.SOLVED
+
+    @property
+    def path_length(self) -> float | None:
+        return None if self.path is None else self.path.length
+
+    def save(self, file: str | FilePath, problem: dict[str, Any] | None = None) -> None:
+        """Write .json (everything, and the problem as in a problem file) or .csv (the trajectory alone).
+
+        Raises InputError for another ending, a file that cannot be written, or .csv without a trajectory.
+        """
+        path = check_output(file, (".json", ".csv"))
+        if path.suffix.lower() == ".json":
+            write_atomically(path, json.dumps(self.record(problem), allow_nan=False) + "\n")
+        elif self.trajectory is None:
+            raise InputError(f"{path}: there is no trajectory to write ({self.status.value}); use .json")
+        else:
+            self.trajectory.save(path)
+
+    def record(self, problem: dict[str, Any] | None = None) -> dict[str, Any]:
+        """What a result file holds, for JSON; `problem` as in a problem file."""
+        return _record(self, problem)
+
+
+@dataclass(frozen=True, eq=False)
+class ResultFile:
+    """What a result file holds."""
+
+    result: PlanResult
+    problem: dict[str, Any] | None
+    """The problem as in a problem file, if it was saved along."""
+
+
+def load_result(file: str | FilePath) -> ResultFile:
+    """Read and check a result file (.json).
+
+    Raises InputError for a file that cannot be read and for fields that are missing, misshapen or not finite.
+    """
+    record = read_json(file)
+    if not isinstance(record, dict):
+        raise InputError(f"{file} is not a result file: it must hold one JSON object")
+    missing = [name for name in REQUIRED if name not in record]
+    if missing:
+        raise InputError(f"{file} is not a result file: {', '.join(missing)} missing")
+    try:
+        return ResultFile(_result(record), _optional(record, "problem", dict))
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+
+
+def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any]:
+    record: dict[str, Any] = {
+        "status": result.status.value,
+        "reason": result.reason,
+        "planner": result.planner,
+        "stage": result.stage,
+        "robot": result.robot,
+        "planning_time": result.planning_time,
+        "verified": result.solved,
+        "seed": result.seed,
+        "path_length": result.path_length,
+        "min_clearance": result.min_clearance,
+        "scene_clearance": result.scene_clearance,
+        "self_clearance": result.self_clearance,
+        "notes": list(result.notes),
+        "progress": [list(found) for found in result.progress],
+        "refused": result.refused,
+        "rung": result.rung,
+        "confidence": result.confidence,
+        "swept_probability": result.swept_probability,
+        "unseen_region": None if result.unseen_region is None else [list(at) for at in result.unseen_region],
+        "joint_names": [],
+        "waypoints": None if result.path is None else result.path.positions.tolist(),
+        "times": [],
+        "positions": [],
+        "velocities": [],
+        "accelerations": [],
+    }
+    if result.path is not None:
+        record["joint_names"] = list(result.path.joint_names)
+    if result.trajectory is not None:
+        record |= result.trajectory.record()
+    return record if problem is None else record | {"problem": problem}
+
+
+def _result(record: dict[str, Any]) -> PlanResult:
+    known = {status.value: status for status in Status}
+    if not isinstance(record["status"], str) or record["status"] not in known:
+        raise InputError(f"status is {shown(record['status'])}; known: {', '.join(known)}")
+    status = known[record["status"]]
+    names = _names(record, "joint_names")
+    solved = status is Status.SOLVED
+    if record["verified"] is not solved:
+        raise InputError(f"verified is {shown(record['verified'])}, but status is {shown(status.value)}")
+    path = Path(names, _rows(record, "waypoints", None, len(names))) if solved else None
+    trajectory = _trajectory(record, names) if solved and record.get("times") else None
+    return PlanResult(
+        status=status,
+        reason=_text(record, "reason"),
+        planner=_text(record, "planner"),
+        robot=_text(record, "robot"),
+        planning_time=_number(record, "planning_time"),
+        seed=int(_number(record, "seed")),
+        stage=_text(record, "stage") if "stage" in record else "",
+        path=path,
+        trajectory=trajectory,
+        min_clearance=_number_or_none(record, "min_clearance"),
+        scene_clearance=_number_or_none(record, "scene_clearance"),
+        self_clearance=_number_or_none(record, "self_clearance"),
+        notes=_names(record, "notes") if "notes" in record else (),
+        progress=_progress(record),
+        refused=_text(record, "refused") if "refused" in record else "",
+        rung=_text(record, "rung") if "rung" in record else "",
+        confidence=_number_or_none(record, "confidence"),
+        swept_probability=_number_or_none(record, "swept_probability"),
+        unseen_region=_box(record, "unseen_region"),
+    )
+
+
+def _box(record: dict[str, Any], name: str) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
+    if record.get(name) is None:
+        return None
+    low, high = _rows(record, name, 2, 3).tolist()
+    return tuple(low), tuple(high)
+
+
+def _progress(record: dict[str, Any]) -> tuple[tuple[float, float], ...]:
+    if not record.get("progress"):
+        return ()
+    return tuple((at, length) for at, length in _rows(record, "progress", None, 2).tolist())
+
+
+def _trajectory(record: dict[str, Any], names: tuple[str, ...]) -> Trajectory:
+    times = _rows(record, "times", None, None)
+    if (np.diff(times) <= 0).any() or times[0] != 0:
+        raise InputError("times must start at 0 and strictly increase")
+    return Trajectory(names, times, *(_rows(record, what, len(times), len(names)) for what in ROWS))
+
+
+def _optional(record: dict[str, Any], name: str, kind: type) -> Any:
+    value = record.get(name)
+    if value is not None and not isinstance(value, kind):
+        raise InputError(f"{name} is a {type(value).__name__}; it must be an object")
+    return value
+
+
+def _text(record: dict[str, Any], name: str) -> str:
+    if not isinstance(record[name], str):
+        raise InputError(f"{name} is {shown(record[name])}; it must be text")
+    return record[name]
+
+
+def _names(record: dict[str, Any], name: str) -> tuple[str, ...]:
+    value = record[name]
+    if not isinstance(value, list) or not all(isinstance(item, str) for item in value):
+        raise InputError(f"{name} is {shown(value)}; it must be a list of texts")
+    return tuple(value)
+
+
+def _number(record: dict[str, Any], name: str) -> float:
+    value = record[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise InputError(f"{name} is {shown(value)}; it must be a finite number")
+    return float(value)
+
+
+def _number_or_none(record: dict[str, Any], name: str) -> float | None:
+    return None if record.get(name) is None else _number(record, name)
+
+
+def _rows(record: dict[str, Any], name: str, rows: int | None, columns: int | None) -> np.ndarray:
+    """An array of finite numbers: a vector if `columns` is None; any number of rows if `rows` is None."""
+    try:
+        array = np.asarray(record.get(name), dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} must be {'a list' if columns is None else 'rows'} of numbers") from None
+    shape = "x".join(map(str, array.shape))
+    wanted = f"{rows or 'n'}" + ("" if columns is None else f"x{columns}")
+    if array.ndim != (1 if columns is None else 2) or len(array) == 0:
+        raise InputError(f"{name} has shape {shape or 'none'}; it must be {wanted}")
+    if (rows is not None and len(array) != rows) or (columns is not None and array.shape[1] != columns):
+        raise InputError(f"{name} has shape {shape}; it must be {wanted}")
+    if not within(array, FASTEST):
+        raise InputError(f"{name} holds numbers that are not finite, or not within ±{FASTEST:g}")
+    return array

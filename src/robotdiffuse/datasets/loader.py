@@ -1,0 +1,229 @@
+"""The one loader of data sets: `read_rows`, and for PyTorch `rd.RopDataset("rop")`."""
+
+from collections import deque
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from functools import partial
+from math import pi
+from pathlib import Path as FilePath
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Int8
+from numpy import ndarray
+from torch import Tensor
+from torch.utils.data import Dataset, get_worker_info
+
+from robotdiffuse.datasets.manifest import read_manifest
+from robotdiffuse.datasets.rows import read_rows
+from robotdiffuse.datasets.shards import (
+    SPLITS,
+)
+from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.robots.normalizer import JointNormalizer
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.surface_points import VisibleRegion
+from robotdiffuse.scenes.surface_clouds import surface_clouds
+
+VIEWS = ("full", "partial")
+BLOCK = 16
+"""Shards that are shuffled together: 16 of the usual 500 rows map 57 MB."""
+MAX_THREADS = 8
+"""Most threads that make batches ahead."""
+CAMERA_CENTER = (0.0, 0.0, 0.4)
+"""What the cameras of partial views look at, in the base frame [m]."""
+CAMERA_DISTANCE = (1.5, 2.5)
+"""From the centre [m]; obstacles may come as near as that, and a camera within one sees nothing of it."""
+CAMERA_ELEVATION = (0.1, 1.2)
+"""Above the horizontal [rad]."""
+ABOVE_FLOOR = VisibleRegion(floor=0.0, reach=10.0)
+"""What a camera can see: nothing below the plane that the robot stands on."""
+
+
+@dataclass(frozen=True, eq=False)
+class RopBatch:
+    """Rows of the data set, on its device."""
+
+    trajectories: Float32[Tensor, "n waypoints dof"]
+    """In [-1, 1]: the robot's limits are -1 and 1."""
+    start: Float32[Tensor, "n dof"]
+    """The first waypoint, scaled too."""
+    goal: Float32[Tensor, "n dof"]
+    """The goal that was reached: the last waypoint, scaled too."""
+    target_pose: Float32[Tensor, "n 7"]
+    """Of the robot's tip in the base frame, wxyz_xyz."""
+    obstacle_kinds: Int8[Tensor, "n slots"]
+    """As `PackedScenes` has them."""
+    obstacle_params: Float32[Tensor, "n slots 10"]
+    points: Float32[Tensor, "n points 3"]
+    """On the obstacles, in the base frame [m]."""
+
+    def __len__(self) -> int:
+        return len(self.trajectories)
+
+
+class RopDataset(Dataset[dict[str, Tensor]]):
+    """Trajectories with their scenes and fresh point clouds; trajectories stay on the disk, mapped to memory.
+
+    The fast way is `batches`. For a standard DataLoader an item is a dict of the tensors in RopBatch; there,
+    clouds are made in the workers, so keep `device="cpu"` with `num_workers > 0`.
+    """
+
+    def __init__(
+        self,
+        folder: str | FilePath,
+        split: str = "train",
+        points: int = 1400,
+        sort_points: bool = False,
+        view: str = "full",
+        device: str | torch.device = "cpu",
+        seed: int = 0,
+        robot: Robot | None = None,
+        waypoints: int | None = None,
+    ) -> None:
+        """split: train, validation or test; scenes of one are in no other. points: of each cloud.
+        sort_points: by x, then y, then z. view: "full", all around the obstacles, or "partial", what a camera
+        sees from a random place. seed: of clouds and order. robot: the one that you will use the data for.
+        waypoints: so many, evenly spaced along each path, held in memory; None: those that are stored.
+
+        Raises InputError for unknown names, a folder without data or with damaged shards, and data of
+        another robot.
+        """
+        if split not in SPLITS:
+            raise unknown_name("split", split, SPLITS)
+        if view not in VIEWS:
+            raise unknown_name("view", view, VIEWS)
+        if points < 1:
+            raise InputError(f"points is {points}; it must be at least 1")
+        if waypoints is not None and waypoints < 2:
+            raise InputError(f"waypoints is {waypoints}; it must be at least 2")
+        self._arguments = (folder, split, points, sort_points, view, device, seed, robot, waypoints)
+        self.manifest = read_manifest(folder)
+        self.waypoints = waypoints or self.manifest.waypoints
+        self.points, self.sort_points, self.view = points, sort_points, view
+        self.device, self.seed = torch.device(device), seed
+        self._generators: dict[int, torch.Generator] = {}
+        self.normalizer = JointNormalizer(np.array(self.manifest.lower), np.array(self.manifest.upper))
+        middle, half_range = (
+            a.astype(np.float32) for a in (self.normalizer.middle, self.normalizer.half_range)
+        )
+        # over whole trajectories: to broadcast along seven joints is slow
+        self._scale, self._shift = (
+            torch.from_numpy(np.tile(a, self.waypoints)).to(self.device)
+            for a in (1 / half_range, -middle / half_range)
+        )
+        self._trajectories: list[ndarray] = []
+        places, poses, scenes = [], [], []
+        for i, rows in enumerate(read_rows(folder, robot, waypoints)):
+            mine = np.flatnonzero(rows.split == SPLITS.index(split))
+            self._trajectories.append(rows.q)
+            places.append(np.stack([np.full(len(mine), i), mine], axis=1))
+            poses.append(rows.shard["target_pose"][mine])
+            scenes.append(rows.scenes[mine])
+        self._places = np.concatenate(places)
+        """Shard and row of each item."""
+        self._poses, self._scenes = np.concatenate(poses), PackedScenes.joined(scenes)
+
+    def __reduce__(self) -> tuple:
+        return RopDataset, self._arguments  # pickled maps would be copies of the files
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index is {index}; there are {len(self)} items")
+        return self.__getitems__([index % len(self)])[0]
+
+    def __getitems__(self, indices: list[int]) -> list[dict[str, Tensor]]:
+        """What a DataLoader asks for: clouds of all items at once."""
+        worker = get_worker_info()
+        number = -1 if worker is None else worker.id
+        if number not in self._generators:
+            # each worker draws numbers of its own, and others in every epoch
+            start = self.seed if worker is None else worker.seed % 2**63
+            self._generators[number] = torch.Generator(self.device).manual_seed(start)
+        batch = self._batch(np.array(indices), self._generators[number])
+        columns = {field.name: getattr(batch, field.name) for field in fields(batch)}
+        return [{name: column[i] for name, column in columns.items()} for i in range(len(indices))]
+
+    def batches(
+        self, batch_size: int, shuffle: bool = True, generator: torch.Generator | None = None
+    ) -> Iterator[RopBatch]:
+        """One epoch, made ahead by as many threads as PyTorch has; the last batch may be smaller.
+
+        Rows are shuffled within blocks of 16 shards, and shards among blocks, so that what is read lies
+        close together. The generator, on the CPU, draws order and clouds: from the same state come the same
+        batches, whatever the number of threads. None: one that is made from `seed`, so that every
+        call gives the same epoch.
+        """
+        if batch_size < 1:
+            raise InputError(f"batch_size is {batch_size}; it must be at least 1")
+        generator = generator or torch.Generator().manual_seed(self.seed)
+        order = self._shuffled(generator) if shuffle else np.arange(len(self))
+        starts = range(0, len(self), batch_size)
+        seeds = torch.randint(2**62, (len(starts),), generator=generator).tolist()
+        jobs = (
+            partial(self._seeded, order[i : i + batch_size], seed)
+            for i, seed in zip(starts, seeds, strict=True)
+        )
+        return self._run(jobs)
+
+    def _run(self, jobs: Iterator) -> Iterator[RopBatch]:
+        threads = min(MAX_THREADS, torch.get_num_threads()) if self.device.type == "cpu" else 1
+        # a batch is one thread's work: PyTorch's own threads wait for each other at every step
+        pool = ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,))
+        waiting: deque = deque()
+        try:
+            for job in jobs:
+                waiting.append(pool.submit(job))
+                if len(waiting) > threads:
+                    yield waiting.popleft().result()
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+    def _shuffled(self, generator: torch.Generator) -> ndarray:
+        shard = self._places[:, 0]
+        first = np.searchsorted(shard, np.arange(len(self._trajectories) + 1)).tolist()
+        shards = torch.randperm(len(self._trajectories), generator=generator).tolist()
+        blocks = [np.zeros(0, np.int64)]
+        for i in range(0, len(shards), BLOCK):
+            rows = np.concatenate([np.arange(first[s], first[s + 1]) for s in shards[i : i + BLOCK]])
+            blocks.append(rows[torch.randperm(len(rows), generator=generator).numpy()])
+        return np.concatenate(blocks)
+
+    def _seeded(self, indices: ndarray, seed: int) -> RopBatch:
+        return self._batch(indices, torch.Generator(self.device).manual_seed(seed))
+
+    def _batch(self, indices: ndarray, generator: torch.Generator) -> RopBatch:
+        shard, row = self._places[indices].T
+        waypoints, dof = self.waypoints, self.manifest.dof
+        q = np.empty((len(indices), waypoints, dof), np.float32)
+        for s in np.unique(shard):
+            mine = np.flatnonzero(shard == s)
+            q[mine] = self._trajectories[s][row[mine]]
+        raw = torch.from_numpy(q).to(self.device).view(-1, waypoints * dof)
+        scaled = torch.addcmul(self._shift, raw, self._scale).view(-1, waypoints, dof)
+        scenes = self._scenes[indices]
+        pose, kinds, params = (
+            torch.from_numpy(a).to(self.device) for a in (self._poses[indices], scenes.kinds, scenes.params)
+        )
+        seen = {}
+        if self.view == "partial":
+            seen = {"camera": _cameras(len(indices), generator), "region": ABOVE_FLOOR}
+        points = surface_clouds(scenes, self.points, generator, ordered=self.sort_points, **seen)
+        return RopBatch(scaled, scaled[:, 0], scaled[:, -1], pose, kinds, params, points)
+
+
+def _cameras(n: int, generator: torch.Generator) -> Float32[Tensor, "n 3"]:
+    """Random places from which the scene is seen [m]."""
+    a, b, c = torch.rand(3, n, generator=generator, device=generator.device)
+    turn = 2 * pi * a
+    up = CAMERA_ELEVATION[0] + (CAMERA_ELEVATION[1] - CAMERA_ELEVATION[0]) * b
+    far = CAMERA_DISTANCE[0] + (CAMERA_DISTANCE[1] - CAMERA_DISTANCE[0]) * c
+    place = torch.stack([up.cos() * turn.cos(), up.cos() * turn.sin(), up.sin()], -1) * far[:, None]
+    return place + place.new_tensor(CAMERA_CENTER)

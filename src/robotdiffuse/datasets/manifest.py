@@ -1,0 +1,141 @@
+"""What a data set is of: `manifest.json` in its folder."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path as FilePath
+from typing import Any
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.problems.families import load_family
+from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.shapes import Box
+
+FORMAT = 1
+MANIFEST = "manifest.json"
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a data set is of."""
+
+    robot: str
+    """A bundled name, or the path of a URDF."""
+    robot_fingerprint: str
+    joint_names: tuple[str, ...]
+    lower: tuple[float, ...]
+    """Limits [rad]."""
+    upper: tuple[float, ...]
+    waypoints: int
+    timing: str
+    """How waypoints are spaced: "arc", evenly in joint-space length, or "time"."""
+    families: dict[str, dict[str, Any]]
+    """Settings of the scenes by name, in the order of the numbers in `family`."""
+    floors: dict[str, dict[str, list[float]] | None]
+    """`center` and `size` of the box that the scenes of each family stand on [m]; None: of nothing."""
+    slots: int
+    """Most obstacles of a scene."""
+    goals: int
+    """Most goal configurations of a problem."""
+    trajectories: int
+    """Planned in all."""
+    shard: int
+    """Rows per shard."""
+    settings: dict[str, Any]
+    """All of the generation's."""
+    versions: dict[str, str]
+
+    def __post_init__(self) -> None:
+        if not len(self.joint_names) == len(self.lower) == len(self.upper) > 0:
+            raise InputError(
+                f"joint_names, lower and upper have {len(self.joint_names)}, {len(self.lower)} and "
+                f"{len(self.upper)} entries; they must have as many as there are joints"
+            )
+        if self.timing not in ("arc", "time"):
+            raise InputError(f"timing is {self.timing!r}; it must be arc or time")
+        if self.floors.keys() != self.families.keys():
+            raise InputError(f"floors are of {[*self.floors]}; they must be of {[*self.families]}")
+        for i in range(len(self.families)):
+            self.floor(i)
+
+    @property
+    def dof(self) -> int:
+        return len(self.joint_names)
+
+    def floor(self, family: int) -> Box | None:
+        """What the scenes of a family stand on."""
+        floor = list(self.floors.values())[family]
+        return None if floor is None else Box(**floor, name="floor")
+
+    def check_robot(self, robot: Robot) -> None:
+        """Raises InputError if the data were made with another robot."""
+        found = robot_fingerprint(robot)
+        if found != self.robot_fingerprint:
+            raise InputError(
+                f"the data are of the robot {self.robot} with fingerprint {self.robot_fingerprint}; "
+                f"{robot.name} has {found}; use the robot of the data"
+            )
+
+
+def floor_record(floor: Box | None) -> dict[str, list[float]] | None:
+    """A floor as `Manifest.floors` keeps it."""
+    return None if floor is None else {"center": floor.center.tolist(), "size": floor.size.tolist()}
+
+
+def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
+    """Write manifest.json, whole or not at all; makes the folder. Raises InputError if it cannot."""
+    data = {"format": FORMAT, "dof": manifest.dof} | asdict(manifest)
+    write_atomically(FilePath(folder) / MANIFEST, json.dumps(data, indent=1) + "\n", make_folder=True)
+
+
+def read_manifest(folder: str | FilePath) -> Manifest:
+    """Raises InputError if there is none, or it is damaged or of another version of the format."""
+    file = FilePath(folder) / MANIFEST
+    try:
+        data = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputError(
+            f"no data set: there is no {file}; make one with: robotdiffuse data generate"
+        ) from None
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror}") from None
+    except ValueError as error:
+        raise InputError(f"{file} is damaged: {error}") from None
+    if not isinstance(data, dict) or "format" not in data:
+        raise InputError(f"{file} is no manifest of a data set: it has no format")
+    check_format(file, data.pop("format"))
+    try:
+        data.pop("dof")
+        for name in ("joint_names", "lower", "upper"):
+            data[name] = tuple(data[name])
+        if "frames" in data:  # as waypoints were called once
+            data["waypoints"] = data.pop("frames")
+            data["settings"] = {"waypoints": data["waypoints"]} | data["settings"]
+        return Manifest(**_with_floors(data))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{file} is damaged: {error}") from None
+
+
+def _with_floors(data: dict[str, Any]) -> dict[str, Any]:
+    """Manifests once had no floors: they are those of the families in the table, unless settings say more."""
+    if "floors" in data:
+        return data
+    floors = {name: floor_record(_old_floor(name, of)) for name, of in data["families"].items()}
+    return data | {"floors": floors}
+
+
+def _old_floor(name: str, settings: dict[str, Any]) -> Box | None:
+    """ROP's floors had settings of their own once."""
+    if not settings.get("floor", True):
+        return None
+    if "floor_size" in settings:
+        size, thickness = settings["floor_size"], settings["floor_thickness"]
+        return Box((0.0, 0.0, -thickness / 2), (size, size, thickness))
+    return load_family(name).floor
+
+
+def check_format(file: FilePath, found: object) -> None:
+    """Raises InputError for another version of the format than this one's."""
+    if found != FORMAT:
+        raise InputError(f"{file}: format is {found}; this version reads {FORMAT}")

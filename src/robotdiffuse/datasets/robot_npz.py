@@ -1,0 +1,190 @@
+"""The layout of the paper's authors, robot.npz: data sets are written in it, and made of it.
+
+`x_train` [n, 254, 7]: joint values [rad]. `y_train` [n, 23]: start 7, goal that was reached 7, centres of two
+spheres 6, position of the target 3 [m]. The first 20 are what the authors' viewer sends; that the last three
+are the target's position is our reading of the 23. float32.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path as FilePath
+
+import numpy as np
+from jaxtyping import Float32
+from numpy import ndarray
+
+from robotdiffuse import __version__
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import motions_free
+from robotdiffuse.collision.motions import search_space
+from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
+from robotdiffuse.datasets.shards import Row, check_shapes, read_shard, row_of, shard_indices, write_shard
+from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.problems.families import load_family
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+
+WAYPOINTS, DOF, NUMBERS = 254, 7, 23
+ROWS = 500
+"""Of a shard."""
+RADIUS = 0.25
+"""Of the spheres [m]: what the authors' planner sees; their loader and viewer show 0.2, a margin of 5 cm."""
+SAME = 1e-4
+"""Start and goal may differ by this from the first and last waypoint [rad]."""
+RESOLUTION = 0.02
+"""No point of the arm moves further than this between two checks of the straight line [m]."""
+NAMES = ("trajectories", "start", "target_pose", "obstacle_kinds", "obstacle_params")
+
+
+def export_npz(folder: str | FilePath, file: str | FilePath) -> int:
+    """Write the trajectories of all scenes of exactly two spheres, whole or not at all; returns their number.
+
+    Raises InputError if there is no data set, it has no such scene or other waypoints or joints, or the file
+    cannot be written.
+    """
+    manifest, file = read_manifest(folder), FilePath(file)
+    if (manifest.waypoints, manifest.dof) != (WAYPOINTS, DOF):
+        raise InputError(
+            f"{folder} has {manifest.waypoints} waypoints of {manifest.dof} joints; "
+            f"robot.npz holds {WAYPOINTS} waypoints of {DOF} joints"
+        )
+    x, y = [np.zeros((0, WAYPOINTS, DOF), np.float32)], [np.zeros((0, NUMBERS), np.float32)]
+    for index in shard_indices(folder):
+        shard = read_shard(folder, index, NAMES)
+        check_shapes(folder, shard, manifest)
+        kinds = shard["obstacle_kinds"]
+        rows = np.flatnonzero(((kinds == SPHERE).sum(1) == 2) & ((kinds != NONE).sum(1) == 2))
+        q, kinds = shard["trajectories"][rows], kinds[rows]
+        centers = shard["obstacle_params"][rows][kinds == SPHERE, :3].reshape(-1, 6)
+        x.append(q)
+        y.append(np.concatenate([shard["start"][rows], q[:, -1], centers, shard["target_pose"][rows, 4:]], 1))
+    x_train, y_train = np.concatenate(x), np.concatenate(y)
+    if not len(x_train):
+        raise InputError(f"{folder} has no scene of exactly two spheres, all that robot.npz can hold")
+    fresh = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        with open(fresh, "wb") as stream:
+            np.savez(stream, x_train=x_train, y_train=y_train)
+        os.replace(fresh, file)
+    except OSError as error:
+        raise InputError(f"cannot write {file}: {error.strerror or error}") from None
+    finally:
+        fresh.unlink(missing_ok=True)
+    return len(x_train)
+
+
+def import_npz(
+    file: str | FilePath,
+    folder: str | FilePath,
+    robot: str = "panda",
+    radius: float = RADIUS,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> int:
+    """Make a data set of a robot.npz in an empty folder; returns the number of its motions.
+
+    The scenes are two spheres of this radius [m] on ROP's floor. Nothing is judged: that is for
+    `robotdiffuse data check`. What the file does not say is measured (clearances, lengths, whether the
+    straight line is free) or follows from the motion: the target is where the last waypoint has the robot's
+    tip, for the target in the file is that of the authors' arm, which has no hand. The safety distance is
+    not known, and 0. `progress` is called with the numbers of motions that are done and of all.
+
+    Raises InputError if the file is no such file, or the folder holds data or cannot be written.
+    """
+    arm, folder = load_robot(robot), FilePath(folder)
+    if arm.dof != DOF:
+        raise InputError(f"{arm.name} has {arm.dof} joints; robot.npz holds {DOF}")
+    if not radius > 0:
+        raise InputError(f"radius is {radius}; it must be positive")
+    q, centers = _read(file)
+    manifest = Manifest(
+        robot=robot,
+        robot_fingerprint=robot_fingerprint(arm),
+        joint_names=arm.joint_names,
+        lower=tuple(arm.lower.tolist()),
+        upper=tuple(arm.upper.tolist()),
+        waypoints=WAYPOINTS,
+        timing="arc",
+        families={"rop": {"kinds": ["sphere"], "sphere_radius": [radius, radius]}},
+        floors={"rop": floor_record(load_family("rop").floor)},
+        slots=2,
+        goals=1,
+        trajectories=len(q),
+        shard=ROWS,
+        settings={"imported": FilePath(file).name, "radius": radius},
+        versions={"robotdiffuse": __version__},
+    )
+    with alone_in(folder):
+        if (folder / MANIFEST).exists() or shard_indices(folder):
+            raise InputError(f"{folder} holds data already; import into another folder")
+        for index, first in enumerate(range(0, len(q), ROWS)):
+            rows = range(first, min(first + ROWS, len(q)))
+            made = [_row(arm, manifest, q[i], centers[i], radius, i) for i in rows]
+            arrays = {name: np.stack([row[name] for row in made]) for name in made[0]}
+            write_shard(folder, index, arrays, {"tried": len(made), "solved": len(made)})
+            progress(rows.stop, len(q))
+        write_manifest(folder, manifest)
+    return len(q)
+
+
+def _row(
+    robot: Robot,
+    manifest: Manifest,
+    q: Float32[ndarray, "waypoints dof"],
+    centers: Float32[ndarray, "2 3"],
+    radius: float,
+    number: int,
+) -> Row:
+    floor, ends = manifest.floor(0), q[[0, -1]]
+    assert floor is not None
+    scene = Scene([floor, *(Sphere(center, radius) for center in centers)])
+    checker = CollisionChecker(robot, scene)
+    line = motions_free(search_space(checker, RESOLUTION), ends)
+    cost = float(np.linalg.norm(np.diff(q.astype(np.float64), axis=0), axis=1).sum())
+    return row_of(
+        PackedScenes.pack([scene], manifest.slots, floor=True),
+        q,
+        checker.link_clearances(q).min(axis=1, initial=1.0),
+        goals=q[-1:],
+        goal_costs=np.array([cost]),
+        goal_index=0,
+        T_base_tip=link_pose(robot, q[-1].astype(np.float64), robot.tip),
+        family=0,
+        cost=cost,
+        safety_distance=0.0,
+        line_free=bool(line[0] and checker.free(ends[:1])[0]),
+        seed=number,
+        most_goals=1,
+    )
+
+
+def _read(file: str | FilePath) -> tuple[Float32[ndarray, "n 254 7"], Float32[ndarray, "n 2 3"]]:
+    """Motions, and centres of the two spheres of each."""
+    wanted = {"x_train": (WAYPOINTS, DOF), "y_train": (NUMBERS,)}
+    try:
+        with np.load(file, allow_pickle=False) as stored:
+            x, y = (np.asarray(stored[name], np.float32) for name in wanted)
+    except OSError as error:
+        raise InputError(f"cannot read {file}: {error.strerror or error}") from None
+    except Exception as error:  # NumPy, zipfile and Python's tokenizer raise whatever they meet
+        raise InputError(f"{file} is no robot.npz: {shortened(str(error))}") from None
+    for (name, row), array in zip(wanted.items(), (x, y), strict=True):
+        if array.shape != (len(x), *row) or not len(x):
+            shape = " x ".join(map(str, ("n", *row)))
+            raise InputError(f"{file}: {name} has shape {array.shape}; it must be {shape}, with n at least 1")
+        if not np.isfinite(array).all():
+            raise InputError(f"{file}: {name} holds numbers that are not finite")
+    for name, said, found in (("start", y[:, :DOF], x[:, 0]), ("goal", y[:, DOF : 2 * DOF], x[:, -1])):
+        off = np.abs(said - found).max(axis=1)
+        if off.max() > SAME:
+            end = "first" if name == "start" else "last"
+            raise InputError(
+                f"{file}: row {off.argmax()} has a {name} that differs from its {end} waypoint by "
+                f"{off.max():.3g} rad; they must be the same"
+            )
+    return x, y[:, 2 * DOF : 2 * DOF + 6].reshape(-1, 2, 3)

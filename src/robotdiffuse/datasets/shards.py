@@ -1,0 +1,420 @@
+"""The rows of a data set: their schema, their shards on disk, and the way from a motion to a row and back.
+
+    FOLDER/manifest.json             what the data are of, see `manifest.py`
+    FOLDER/shard_00000.zarr/         a Zarr v3 group, one chunk per array
+
+A shard is written beside its place and renamed, so what has its name is whole. The same arrays give the same
+files, byte for byte. `trajectories` is not compressed: its chunk is a file that can be mapped into memory.
+"""
+
+import hashlib
+import json
+import re
+import shutil
+import tempfile
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Int, Int8
+from numpy import ndarray
+
+from robotdiffuse.datasets.manifest import FORMAT, MANIFEST, Manifest, check_format
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene_arrays import PackedScenes, floor_row
+from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.types import Path, Trajectory
+
+COMPRESSION = 3
+"""Zstandard's level."""
+
+SPLITS = ("train", "validation", "test")
+SPLIT_PERCENT = (90, 5, 5)
+
+ARRAYS: dict[str, tuple[str, tuple[str | int, ...]]] = {
+    "trajectories": ("<f4", ("waypoints", "dof")),
+    "times": ("<f4", ("waypoints",)),
+    "start": ("<f4", ("dof",)),
+    "goals": ("<f4", ("goals", "dof")),
+    "goal_costs": ("<f4", ("goals",)),
+    "goal_index": ("|i1", ()),
+    "target_pose": ("<f4", (7,)),
+    "obstacle_kinds": ("|i1", ("slots",)),
+    "obstacle_params": ("<f4", ("slots", 10)),
+    "family": ("|i1", ()),
+    "cost": ("<f4", ()),
+    "clearance": ("<f4", ()),
+    "end_clearance": ("<f4", (2,)),
+    "safety_distance": ("<f4", ()),
+    "line_free": ("|b1", ()),
+    "detour": ("<f4", ()),
+    "seed": ("<u8", ()),
+}
+"""By name: type, and shape of a row in fields of the manifest. `times` only where `timing` is "time".
+
+Joint values [rad], times [s], lengths [m]. `trajectories` begin at `start` and end at `goals[goal_index]`,
+exactly. Rows of `goals` beyond those that a problem has are NaN, and so are their `goal_costs`; the cost of a
+goal that was not reached is inf. `target_pose` is wxyz_xyz of the tip in the base frame. Obstacles are as
+`PackedScenes` has them, without the floor. `cost` is the joint-space length of the path [rad], `clearance` a
+lower bound of its distance to obstacles [m], `end_clearance` that of start and reached goal alone,
+`safety_distance` the distance that the search kept but near ends that are closer themselves [m],
+`line_free` whether the straight line would have done, `detour` the cost in units of the straight line's,
+`seed` the number of the problem.
+"""
+UNBOUNDED = {"goals", "goal_costs"}
+"""Arrays that may hold NaN or inf."""
+
+_SHARD_NAME = re.compile(r"shard_(\d{5,})\.zarr")
+
+
+@dataclass(frozen=True, eq=False)
+class Shard:
+    """Arrays of one shard, or some of them."""
+
+    index: int
+    fingerprint: str
+    counts: dict[str, int]
+    """How many problems were tried, solved, unsolved, thinned, refused, ..."""
+    arrays: dict[str, ndarray]
+    """By the names in ARRAYS."""
+
+    def __getitem__(self, name: str) -> ndarray:
+        return self.arrays[name]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.arrays.values())))
+
+
+def shard_path(folder: str | FilePath, index: int) -> FilePath:
+    return FilePath(folder) / f"shard_{index:05d}.zarr"
+
+
+def shard_indices(folder: str | FilePath) -> list[int]:
+    """Numbers of the shards that a folder has, rising."""
+    matches = (_SHARD_NAME.fullmatch(path.name) for path in FilePath(folder).glob("shard_*.zarr"))
+    return sorted(int(match[1]) for match in matches if match)
+
+
+def existing_shards(folder: str | FilePath) -> list[int]:
+    """`shard_indices`, of which there must be some. Raises InputError if there are none."""
+    indices = shard_indices(folder)
+    if not indices:
+        raise InputError(
+            f"{folder} holds no shards; make some with: robotdiffuse data generate --out {folder}"
+        )
+    return indices
+
+
+def remove_leftovers(folder: str | FilePath) -> None:
+    """Remove what killed runs left half-written. Only while nobody writes to the folder."""
+    for path in FilePath(folder).glob(".shard_*.zarr.*"):
+        shutil.rmtree(path, ignore_errors=True)
+    for path in FilePath(folder).glob(f".{MANIFEST}.*"):
+        path.unlink(missing_ok=True)
+
+
+def _zarr() -> ModuleType:
+    try:
+        import zarr
+    except ImportError:
+        raise InputError(
+            'data sets need zarr, which is not installed: pip install "robotdiffuse[data]"'
+        ) from None
+    return zarr
+
+
+def write_shard(
+    folder: str | FilePath, index: int, arrays: dict[str, ndarray], counts: dict[str, int]
+) -> None:
+    """Write a shard, whole or not at all, in the place of one of the same number.
+
+    `arrays` are all of ARRAYS, but for `times` where the timing is "arc". Raises InputError if the arrays do
+    not fit each other, or the shard cannot be written, as when the disk is full.
+    """
+    zarr, target = _zarr(), shard_path(folder, index)
+    wrong = {*arrays, "times"} ^ ARRAYS.keys()
+    rows = {name: len(array) for name, array in arrays.items()}
+    if wrong or len(set(rows.values())) != 1:
+        raise InputError(f"shard {index}: missing or unknown arrays {sorted(wrong)}, or unequal rows: {rows}")
+    ready = {
+        name: np.ascontiguousarray(arrays[name], ARRAYS[name][0]).reshape(arrays[name].shape)
+        for name in sorted(arrays)
+    }
+    prints = {name: _array_fingerprint(array) for name, array in ready.items()}
+    attributes = {
+        "format": FORMAT,
+        "index": index,
+        "fingerprint": _shard_fingerprint(prints),
+        "counts": {name: int(counts[name]) for name in sorted(counts)},
+    }
+    beside: str | None = None
+    try:
+        FilePath(folder).mkdir(parents=True, exist_ok=True)
+        beside = tempfile.mkdtemp(prefix=f".{target.name}.", dir=folder)
+        fresh, old = FilePath(beside, "new"), FilePath(beside, "old")
+        group = zarr.open_group(fresh, mode="w", zarr_format=3, attributes=attributes)
+        for name, array in ready.items():
+            group.create_array(
+                name,
+                data=array,
+                chunks=tuple(max(1, size) for size in array.shape),
+                compressors=None if name == "trajectories" else zarr.codecs.ZstdCodec(level=COMPRESSION),
+                filters=None,
+                attributes={"fingerprint": prints[name]},
+                # a chunk of zeros is a file too: a file that is not there is damage
+                config={"write_empty_chunks": True},
+            )
+        if target.exists():
+            target.rename(old)
+        fresh.rename(target)
+    except OSError as error:
+        raise InputError(f"cannot write {target}: {error.strerror or error}") from None
+    finally:
+        if beside is not None:
+            shutil.rmtree(beside, ignore_errors=True)
+
+
+def _array_fingerprint(array: ndarray) -> str:
+    digest = hashlib.sha256(f"{array.dtype.str} {array.shape}".encode())
+    digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
+    return digest.hexdigest()[:16]
+
+
+def _shard_fingerprint(prints: dict[str, str]) -> str:
+    """Of the fingerprints of all arrays, in the order of their names."""
+    text = json.dumps([(name, prints[name]) for name in sorted(prints)])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def read_shard(folder: str | FilePath, index: int, names: tuple[str, ...] | None = None) -> Shard:
+    """The arrays of a shard, or those named; `trajectories` mapped from the disk, read-only.
+
+    Raises InputError, naming shard and array, where something is missing or cut short. Values are not
+    checked; see `check_shard`.
+    """
+    path = shard_path(folder, index)
+    group = _open(path)
+    attributes = dict(group.attrs)
+    check_format(path, attributes.get("format"))
+    if attributes.get("index") != index or not isinstance(attributes.get("counts"), dict):
+        raise InputError(f"shard {path} is damaged: its attributes are not those of shard {index}")
+    if names is None:
+        names = tuple(name for name in ARRAYS if name != "times" or (path / name).exists())
+    arrays = {name: _read_array(path, group, name) for name in names}
+    rows = {name: len(array) for name, array in arrays.items()}
+    if len(set(rows.values())) > 1:
+        raise InputError(f"shard {path} is damaged: its arrays have unequal numbers of rows: {rows}")
+    return Shard(index, str(attributes.get("fingerprint")), attributes["counts"], arrays)
+
+
+_DAMAGE = (OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError)
+"""What zarr and its codecs raise for files that are not as they should be."""
+
+
+def _open(path: FilePath) -> Any:
+    zarr = _zarr()
+    if not path.is_dir():
+        raise InputError(f"there is no shard {path}")
+    try:
+        return zarr.open_group(path, mode="r", zarr_format=3)
+    except _DAMAGE as error:
+        raise InputError(f"shard {path} is damaged: {_line(error)}") from None
+
+
+def _read_array(path: FilePath, group: Any, name: str) -> ndarray:
+    dtype, row = ARRAYS[name]
+    where = f"shard {path}, array {name}"
+    if not (path / name).is_dir():
+        raise InputError(f"{where}: missing")
+    try:
+        array = group[name]
+        found, ndim = array.dtype.str, len(array.shape)
+        whole = array.nchunks_initialized == array.nchunks
+    except _DAMAGE as error:
+        raise InputError(f"{where} is damaged: {_line(error)}") from None
+    if found != dtype or ndim != 1 + len(row):
+        raise InputError(f"{where} is {found} with {ndim} axes; it must be {dtype} with {1 + len(row)}")
+    if not whole:
+        raise InputError(f"{where} is damaged: a chunk is missing")
+    try:
+        if name == "trajectories" and _is_one_plain_chunk(array):
+            return _map(path / name, array)
+        return array[...]
+    except _DAMAGE as error:
+        raise InputError(f"{where} is damaged: {_line(error)}") from None
+
+
+def _line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def _is_one_plain_chunk(array: Any) -> bool:
+    """Whether the array lies in one file as it would in memory."""
+    codecs = [codec.to_dict() for codec in array.metadata.codecs]
+    plain = len(codecs) == 1 and codecs[0]["name"] == "bytes"
+    return plain and codecs[0]["configuration"] == {"endian": "little"} and array.chunks == array.shape
+
+
+def _map(path: FilePath, array: Any) -> ndarray:
+    file = path / array.metadata.encode_chunk_key((0,) * array.ndim)
+    size, wanted = file.stat().st_size, array.dtype.itemsize * array.size
+    if size != wanted:
+        raise ValueError(f"its chunk has {size:,} bytes; it must have {wanted:,}")
+    return np.memmap(file, array.dtype, "r", shape=array.shape)
+
+
+def check_shapes(folder: str | FilePath, shard: Shard, manifest: Manifest) -> None:
+    """Raises InputError, naming shard and array, if rows are not of the shapes that the manifest says."""
+    for name, array in shard.arrays.items():
+        row = tuple(getattr(manifest, s) if isinstance(s, str) else s for s in ARRAYS[name][1])
+        if array.shape[1:] != row:
+            where = f"shard {shard_path(folder, shard.index)}, array {name}"
+            raise InputError(f"{where} has rows of shape {array.shape[1:]}; the manifest says {row}")
+
+
+def check_shard(folder: str | FilePath, index: int, manifest: Manifest) -> Shard:
+    """Read a shard and check everything that needs no robot: shapes, types, numbers and fingerprints.
+
+    Raises InputError, naming shard and array, for the first thing that is wrong.
+    """
+    shard, path = read_shard(folder, index), shard_path(folder, index)
+    if ("times" in shard.arrays) != (manifest.timing == "time"):
+        raise InputError(f"shard {path}, array times: it must be there only where timing is time")
+    check_shapes(folder, shard, manifest)
+    group, prints = _open(path), {}
+    for name, array in shard.arrays.items():
+        where = f"shard {path}, array {name}"
+        prints[name] = _array_fingerprint(array)
+        if prints[name] != group[name].attrs.get("fingerprint"):
+            raise InputError(f"{where} is damaged: its fingerprint is not the one that was written")
+        if name not in UNBOUNDED and not np.isfinite(array).all():
+            raise InputError(f"{where} holds numbers that are not finite")
+    if _shard_fingerprint(prints) != shard.fingerprint:
+        raise InputError(f"shard {path} is damaged: its fingerprint is not that of its arrays")
+    return shard
+
+
+def split_of(scenes: PackedScenes) -> Int8[ndarray, "n"]:
+    """The split of each row, as an index into SPLITS: by a hash of its scene, so that no scene is in two."""
+    ends = np.cumsum(SPLIT_PERCENT)
+    rows = zip(scenes.kinds, scenes.params, strict=True)
+    hashes = [zlib.crc32(params.tobytes(), zlib.crc32(kinds.tobytes())) for kinds, params in rows]
+    return np.searchsorted(ends, np.array(hashes, np.int64) % 100, side="right").astype(np.int8)
+
+
+Row = dict[str, ndarray | np.generic]
+"""A row of each of ARRAYS."""
+
+
+def row_of(
+    scene: PackedScenes,
+    q: Float32[ndarray, "waypoints dof"],
+    clearances: Float[ndarray, "waypoints"],
+    goals: Float[ndarray, "k dof"],
+    goal_costs: Float[ndarray, "k"],
+    goal_index: int,
+    T_base_tip: Float[ndarray, "4 4"],
+    family: int,
+    cost: float,
+    safety_distance: float,
+    line_free: bool,
+    seed: int,
+    most_goals: int,
+    times: Float[ndarray, "waypoints"] | None = None,
+) -> Row:
+    """The row of a motion q in a packed scene of its own, with these `clearances` at its waypoints [m].
+
+    T_base_tip: the target. most_goals: rows for goals. The others are as the columns of their names, ARRAYS.
+    """
+    missing = [(0, most_goals - len(goals)), (0, 0)]
+    straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))
+    wxyz = quaternion_from_rotation(T_base_tip[:3, :3])
+    row: Row = {
+        "trajectories": q,
+        "start": q[0],
+        "goals": np.pad(goals.astype(np.float32), missing, constant_values=np.nan),
+        "goal_costs": np.pad(goal_costs.astype(np.float32), missing[0], constant_values=np.nan),
+        "goal_index": np.int8(goal_index),
+        "target_pose": np.concatenate([wxyz, T_base_tip[:3, 3]]).astype(np.float32),
+        "obstacle_kinds": scene.kinds[0],
+        "obstacle_params": scene.params[0],
+        "family": np.int8(family),
+        "cost": np.float32(cost),
+        "clearance": np.float32(clearances.min()),
+        "end_clearance": clearances[[0, -1]].astype(np.float32),
+        "safety_distance": np.float32(safety_distance),
+        "line_free": np.bool_(line_free),
+        "detour": np.float32(cost / max(straight, 1e-9)),
+        "seed": np.uint64(seed),
+    }
+    if times is not None:
+        row["times"] = times.astype(np.float32)
+    return row
+
+
+def scenes_of(manifest: Manifest, shard: Shard, rows: slice = slice(None)) -> PackedScenes:
+    """The scenes of some rows, with the floors of their families.
+
+    Raises InputError if the manifest has no such family.
+    """
+    family, names = shard["family"][rows], list(manifest.families)
+    if len(family) and not 0 <= family.min() <= family.max() < len(names):
+        wrong = family[(family < 0) | (family >= len(names))][0]
+        raise InputError(f"family is {wrong}; the manifest has {len(names)}: {', '.join(names)}")
+    floors = np.array([floor_row(manifest.floor(i)) for i in range(len(names))]).reshape(-1, 6)
+    return PackedScenes(shard["obstacle_kinds"][rows], shard["obstacle_params"][rows], floors[family])
+
+
+def problem_of(manifest: Manifest, robot: Robot, shard: Shard, row: int) -> Problem:
+    """The problem that a row solves, with all its goal configurations.
+
+    Raises InputError if the row makes no problem, such as a start out of limits.
+    """
+    goals = np.asarray(shard["goals"][row], np.float64)
+    goals = goals[~np.isnan(goals).any(axis=1)]
+    start = np.asarray(shard["start"][row], np.float64)
+    scene = scenes_of(manifest, shard, slice(row, row + 1)).scene(0)
+    return Problem(robot, scene, start, JointGoal(goals))
+
+
+def path_of(robot: Robot, shard: Shard, row: int) -> Path:
+    """The waypoints of a row as a path."""
+    return Path(robot.joint_names, np.asarray(shard["trajectories"][row], np.float64))
+
+
+def motion_of(robot: Robot, shard: Shard, row: int) -> Path | Trajectory:
+    """The waypoints of a row as they move: timed, with rates by differences, where the data have times."""
+    path = path_of(robot, shard, row)
+    times = np.asarray(shard.arrays.get("times", ()), np.float64)
+    if not len(times) or not (np.diff(times[row]) > 0).all():
+        return path
+    velocities = np.gradient(path.positions, times[row], axis=0)
+    accelerations = np.gradient(velocities, times[row], axis=0)
+    return Trajectory(robot.joint_names, times[row], path.positions, velocities, accelerations)
+
+
+def pick_rows(sizes: dict[int, int], count: int | None, seed: int) -> dict[int, Int[ndarray, "n"]]:
+    """Random rows without repetition, all where `count` is None, from shards of these sizes by number."""
+    total, first, picked = sum(sizes.values()), 0, {}
+    if count is None or count >= total:
+        rows = np.arange(total)
+    else:
+        rows = np.sort(np.random.default_rng(seed).choice(total, count, replace=False))
+    for index, size in sizes.items():
+        picked[index] = rows[(rows >= first) & (rows < first + size)] - first
+        first += size
+    return picked
+
+
+def random_rows(folder: str | FilePath, count: int, seed: int) -> Iterator[tuple[Shard, Int[ndarray, "n"]]]:
+    """The shards that random rows are from, with these rows. Raises InputError for a damaged shard."""
+    sizes = {index: len(read_shard(folder, index, ("family",))) for index in shard_indices(folder)}
+    for index, rows in pick_rows(sizes, count, seed).items():
+        if len(rows):
+            yield read_shard(folder, index), rows

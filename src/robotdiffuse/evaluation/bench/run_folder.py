@@ -1,0 +1,94 @@
+"""What `bench run` left in a folder: its runs, and the records of every planner."""
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path as FilePath
+from typing import Any
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation.records import RESTARTED, Record, read_records, recorded
+from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """What `bench run` left in a folder."""
+
+    folder: FilePath
+    runs: tuple[dict[str, Any], ...]
+    """What each run noted of itself."""
+    records: dict[str, list[Record]]
+    """By planner, in the order of PLANNERS; those that were restarted behind their plain ones."""
+
+    @property
+    def reference(self) -> str:
+        """The planner that the others are compared with: at equal time, where it was restarted."""
+        plain = DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
+        return plain + RESTARTED if plain + RESTARTED in self.records else plain
+
+    def run_of(self, record: Record) -> frozenset[str]:
+        """The numbers of the runs, from 1, that a call may be of: one, where the call was noted with it."""
+        return frozenset(
+            str(i)
+            for i, run in enumerate(self.runs, start=1)
+            if (
+                run.get("run") == record.run
+                if record.run
+                else plain_name(record.planner) in run["planners"]
+                and record.problem_set in run["problems"]
+                and record.time_limit == run["time_limit"]
+            )
+        )
+
+    @property
+    def problem_sets(self) -> list[str]:
+        return list(dict.fromkeys(r.problem_set for records in self.records.values() for r in records))
+
+
+def plain_name(planner: str) -> str:
+    """Without restarts."""
+    return planner.removesuffix(RESTARTED)
+
+
+def base_name(planner: str) -> str:
+    """In PLANNERS: without weights, settings and restarts."""
+    return re.split("[@:+]", planner, maxsplit=1)[0]
+
+
+def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench:
+    """The records of all planners of a run, or of some, those with restarts among them.
+
+    Raises InputError for a folder that `bench run` did not fill, damaged files and planners without records.
+    """
+    if planners is not None:
+        again = [name + RESTARTED for name in planners]
+        planners = [*planners, *(name for name in again if name in recorded(folder))]
+    found = read_records(folder, planners)
+    order = {name: i for i, name in enumerate(PLANNERS)}
+    names = sorted(
+        found, key=lambda n: (order.get(base_name(n), len(order)), plain_name(n), n.endswith(RESTARTED))
+    )
+    records = {name: found[name] for name in names}
+    for name in names:
+        if name.endswith(RESTARTED):
+            # the calls that had no time left for another are those of the plain planner
+            known = {record.key for record in records[name]}
+            there = [record for record in records.get(plain_name(name), ()) if record.key not in known]
+            records[name] = records[name] + [replace(record, planner=name) for record in there]
+    if not any(records.values()):
+        raise InputError(f"{folder} holds no records yet; go on with `robotdiffuse bench run`")
+    return Bench(folder, _read_runs(folder / "runs.jsonl"), records)
+
+
+def _read_runs(file: FilePath) -> tuple[dict[str, Any], ...]:
+    try:
+        lines = file.read_text().splitlines() if file.is_file() else []
+        runs = tuple(json.loads(line) for line in lines)
+        for name in ("date", "versions", "planners", "problems", "time_limit", "seeds", "count"):
+            if not all(name in run for run in runs):
+                raise ValueError(f"a run without {name}")
+        return runs
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{file} is damaged: {error}; results cannot be read without it") from None

@@ -1,0 +1,315 @@
+"""Checks of a data set: every shard whole, its motions judged anew, by our judge and by PyBullet on meshes.
+
+Nothing of what the factory said is taken on trust: a problem is rebuilt from its row alone.
+"""
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.datasets.manifest import Manifest, read_manifest
+from robotdiffuse.datasets.shards import (
+    Shard,
+    check_shard,
+    existing_shards,
+    path_of,
+    pick_rows,
+    problem_of,
+    read_shard,
+    scenes_of,
+)
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.evaluation.tables import Column, Table
+from robotdiffuse.core.processes import Workers, in_order
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.core.types import Path
+from robotdiffuse.validation.validator import Verifier, VerifySettings
+
+KINDS: dict[str, str] = {
+    "damaged": "shards damaged",
+    "ends": "start or goal not exact",
+    "limits": "joint limits exceeded",
+    "collision": "collisions found by the judge",
+    "pybullet": "collisions found by PyBullet",
+    "motion": "otherwise refused by the judge",
+    "cost": "length or detour not as recorded",
+    "clearance": "clearance not as recorded",
+}
+"""What can be wrong, and how it is called."""
+EXAMPLES = 5
+"""Of each kind, this many are named."""
+
+LIMIT_SLACK = 1e-6
+"""Limits are held up to this, for waypoints are in single precision [rad]."""
+CLEARANCE_TOLERANCE = 1e-4
+"""The recorded clearance may differ by this from the least one of the waypoints by covering spheres [m]."""
+COST_TOLERANCE = 0.05
+"""Waypoints cut corners, timed ones more: they may be shorter than the recorded length by this share ..."""
+ROUNDING = 1e-4
+"""... and longer by this; the detour must be as recorded up to this."""
+PYBULLET_STEP = 0.01
+"""PyBullet looks at every waypoint, and between waypoints that are further apart at places no further apart
+than this [rad, joint-space L2]."""
+PYBULLET_TOLERANCE = 0.001
+"""Contacts of less depth are Bullet's rounding [m]."""
+CHUNK = 100
+"""Motions of a shard that a process checks at once."""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong."""
+
+    kind: str
+    """One of KINDS."""
+    shard: int
+    row: int | None
+    """None: the whole shard."""
+    message: str
+
+    @property
+    def where(self) -> str:
+        return f"shard {self.shard}" + ("" if self.row is None else f", row {self.row}")
+
+
+@dataclass(frozen=True)
+class DataCheck:
+    """What was checked and what was found."""
+
+    robot: str
+    shards: int
+    """Shards that were found, whole or damaged."""
+    motions: int
+    """Motions in whole shards."""
+    planned: int
+    """Motions that the manifest announces."""
+    checked: int
+    """Motions that were judged."""
+    pybullet: bool
+    """Whether PyBullet judged too."""
+    counts: dict[str, int]
+    """Findings by kind, for all of KINDS."""
+    examples: tuple[Finding, ...]
+    """The first few of each kind, by shard and row."""
+    least_clearance: float
+    """The least recorded distance between arm and obstacles of the judged motions [m]; nan if none."""
+    seconds: float
+    """Wall time."""
+
+    @property
+    def clean(self) -> bool:
+        return not any(self.counts.values())
+
+    @property
+    def tables(self) -> list[Table]:
+        """What was found, with the first examples of each kind below."""
+        planned = f" of {self.planned:,} planned" if self.motions < self.planned else ""
+        rate = self.checked / max(self.seconds, 1e-9)
+        asked = {kind: kind != "pybullet" or self.pybullet for kind in KINDS}
+        rows = [
+            ("shards, motions", f"{self.shards:,}, {self.motions:,}{planned}"),
+            ("judged", f"{self.checked:,} in {self.seconds:.1f} s ({rate:.0f}/s)"),
+            *(
+                (name, f"{self.counts[kind]:,}" if asked[kind] else "not asked")
+                for kind, name in KINDS.items()
+            ),
+            ("least clearance recorded", f"{1e3 * self.least_clearance + 0.0:.3f} mm"),
+        ]
+        found = [Table.pairs(f"{self.robot}: {'clean' if self.clean else 'violations found'}", rows)]
+        if self.examples:
+            columns = "first examples", Column("where", left=True), Column("what", left=True)
+            found.append(Table.of("", columns, [(f.kind, f.where, f.message) for f in self.examples]))
+        return found
+
+
+def check_data(
+    folder: str | FilePath,
+    robot: Robot | None = None,
+    count: int | None = None,
+    seed: int = 0,
+    workers: int = 1,
+    pybullet: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> DataCheck:
+    """Check the structure of every shard, and `count` random motions (all by default).
+
+    Each motion is judged on a problem that is rebuilt from its row: ends, limits, collision by the judge, and
+    by PyBullet on meshes at and between the waypoints; and what is recorded of it is compared with what is
+    measured. `robot`: that of the data, by default found by the name in the manifest. The motions and the
+    findings do not depend on `workers` (processes). `progress` is called with the numbers of judged motions
+    and of all.
+    Raises InputError if there is no data set, for another robot than that of the data, and if PyBullet is
+    wanted but not installed.
+    """
+    began = time.perf_counter()
+    manifest = read_manifest(folder)
+    robot = load_robot(manifest.robot) if robot is None else robot
+    manifest.check_robot(robot)
+    if pybullet:
+        _need_pybullet()
+    indices = existing_shards(folder)
+    task = _Task(str(folder), manifest, robot, pybullet)
+    with Workers(workers if workers > 1 else 0) as processes:
+        sizes = dict(zip(indices, in_order(processes.each(task.size, [(i,) for i in indices])), strict=True))
+        found = [Finding("damaged", i, None, size) for i, size in sizes.items() if isinstance(size, str)]
+        rows = {i: size for i, size in sizes.items() if isinstance(size, int)}
+        chosen = [
+            (index, picked[i : i + CHUNK])
+            for index, picked in pick_rows(rows, count, seed).items()
+            for i in range(0, len(picked), CHUNK)
+        ]
+        total, done, least = sum(len(part) for _, part in chosen), 0, np.inf
+        for part in in_order(processes.each(task.judge, [(some,) for some in chosen])):
+            found += part.findings
+            done, least = done + part.motions, min(least, part.least_clearance)
+            if progress is not None:
+                progress(done, total)
+    return DataCheck(
+        robot=robot.name,
+        shards=len(indices),
+        motions=sum(rows.values()),
+        planned=manifest.trajectories,
+        checked=done,
+        pybullet=pybullet,
+        counts={kind: sum(f.kind == kind for f in found) for kind in KINDS},
+        examples=tuple(f for kind in KINDS for f in [f for f in found if f.kind == kind][:EXAMPLES]),
+        least_clearance=least if done else float("nan"),
+        seconds=time.perf_counter() - began,
+    )
+
+
+def _need_pybullet() -> None:
+    try:
+        import robotdiffuse.simulation.validator  # noqa: F401
+    except ModuleNotFoundError as error:
+        if error.name != "pybullet":
+            raise
+        raise InputError(
+            "the second judge needs PyBullet, whose wheels stop at Python 3.11: pip install "
+            "'robotdiffuse[sim]', or leave it out by --no-pybullet (pybullet=False)"
+        ) from None
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """What came out of some rows of a shard."""
+
+    motions: int
+    findings: list[Finding]
+    least_clearance: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What a process does; it travels to it whole."""
+
+    folder: str
+    manifest: Manifest
+    robot: Robot
+    pybullet: bool
+
+    def size(self, index: int) -> int | str:
+        """Rows of a shard, or what is wrong with it."""
+        try:
+            return len(check_shard(self.folder, index, self.manifest))
+        except InputError as error:
+            return str(error)
+
+    def judge(self, part: tuple[int, Int[ndarray, "n"]]) -> _Judged:
+        """Judge some rows of a shard."""
+        index, rows = part
+        shard = read_shard(self.folder, index)
+        findings: list[Finding] = []
+        for row in rows.tolist():
+            findings += [Finding(kind, index, row, text) for kind, text in _wrong(self, shard, row)]
+        if self.pybullet:
+            findings += self._second_opinion(shard, rows)
+        least = float(shard["clearance"][rows].min(initial=np.inf))
+        return _Judged(len(rows), sorted(findings, key=lambda f: f.row or 0), least)
+
+    def _second_opinion(self, shard: Shard, rows: Int[ndarray, "n"]) -> Iterator[Finding]:
+        from robotdiffuse.simulation.validator import PyBulletOracle
+
+        with PyBulletOracle(self.robot, Scene([])) as oracle:
+            for row in rows.tolist():
+                try:
+                    oracle.set_scene(scenes_of(self.manifest, shard, slice(row, row + 1)).scene(0))
+                except InputError:
+                    continue  # found already
+                path = path_of(self.robot, shard, row)
+                contact = oracle.check_path(path, PYBULLET_STEP, PYBULLET_TOLERANCE)
+                if contact is not None:
+                    depth, at = -1e3 * contact.distance, contact.at
+                    text = f"{contact.link} is {depth:.1f} mm inside {contact.other} at waypoint {at:.2f}"
+                    yield Finding("pybullet", shard.index, row, text)
+
+
+def _wrong(task: _Task, shard: Shard, row: int) -> Iterator[tuple[str, str]]:
+    """Kind and message of everything that is wrong with a motion but for PyBullet's opinion."""
+    robot, path = task.robot, path_of(task.robot, shard, row)
+    yield from _ends(shard, row)
+    yield from _limits(robot, path.positions)
+    yield from _lengths(shard, row, path)
+    try:
+        problem = problem_of(task.manifest, robot, shard, row)
+    except InputError as error:
+        yield "motion", f"makes no problem: {error}"
+        return
+    violation = Verifier(problem, VerifySettings()).path(path).violation
+    if violation is not None and violation.kind.endswith("collision"):
+        yield "collision", f"{violation.message} at waypoint {violation.time:.2f}"
+    elif violation is not None and violation.kind not in ("limits", "start"):
+        yield "motion", violation.message
+    checker = CollisionChecker(robot, problem.scene)
+    clearances = checker.link_clearances(path.positions).min(axis=1, initial=1.0)
+    measured = float(clearances.min())
+    recorded = float(shard["clearance"][row])
+    if abs(measured - recorded) > CLEARANCE_TOLERANCE:
+        yield "clearance", f"clearance is {1e3 * recorded:.2f} mm; measured: {1e3 * measured:.2f} mm"
+    worst = int(np.abs(shard["end_clearance"][row] - clearances[[0, -1]]).argmax())
+    end, at_end = float(shard["end_clearance"][row, worst]), float(clearances[[0, -1]][worst])
+    if abs(end - at_end) > CLEARANCE_TOLERANCE:
+        yield "clearance", f"end_clearance is {1e3 * end:.2f} mm; measured: {1e3 * at_end:.2f} mm"
+
+
+def _ends(shard: Shard, row: int) -> Iterator[tuple[str, str]]:
+    q, goals, goal = shard["trajectories"][row], shard["goals"][row], int(shard["goal_index"][row])
+    if not np.array_equal(q[0], shard["start"][row]):
+        off = np.abs(q[0] - shard["start"][row]).max()
+        yield "ends", f"the first waypoint differs from the start by {off:.3g}"
+    if not 0 <= goal < len(goals) or np.isnan(goals[goal]).any():
+        yield "ends", f"goal_index is {goal}; there is no such goal"
+    elif not np.array_equal(q[-1], goals[goal]):
+        off = np.abs(q[-1] - goals[goal]).max()
+        yield "ends", f"the last waypoint differs from goal {goal} by {off:.3g}"
+
+
+def _limits(robot: Robot, q: Float[ndarray, "n dof"]) -> Iterator[tuple[str, str]]:
+    excess = np.maximum(robot.lower - q, q - robot.upper)
+    if excess.max() > LIMIT_SLACK:
+        i, j = np.unravel_index(excess.argmax(), excess.shape)
+        low, high = robot.lower[j], robot.upper[j]
+        message = (
+            f"{robot.joint_names[j]} is {q[i, j]:.6g} at waypoint {i}; its limits are {low:.6g} to {high:.6g}"
+        )
+        yield "limits", message
+
+
+def _lengths(shard: Shard, row: int, path: Path) -> Iterator[tuple[str, str]]:
+    cost, detour = float(shard["cost"][row]), float(shard["detour"][row])
+    if not cost * (1 - COST_TOLERANCE) - ROUNDING <= path.length <= cost * (1 + ROUNDING) + ROUNDING:
+        yield "cost", f"cost is {cost:.4f} rad; the waypoints are {path.length:.4f} rad long"
+    straight = float(np.linalg.norm(path.positions[-1] - path.positions[0]))
+    if abs(detour * straight - cost) > ROUNDING * max(cost, 1.0):
+        yield (
+            "cost",
+            f"detour is {detour:.4f}; cost over the straight distance is {cost / max(straight, 1e-9):.4f}",
+        )

@@ -1,0 +1,19 @@
+"""What solves the problems of a data set, by name."""
+
+from robotdiffuse.core.registry import Entry, Registry
+
+SEARCHES = Registry(
+    "planner of data",
+    {
+        "shared_tree_rrt_star": Entry(
+            "robotdiffuse.planning.search.shared_tree.planner:SharedTreeSearch",
+            "the paper's: one tree towards all goals of a target; the cost of each",
+            "SharedTreeSettings",
+        ),
+        "aorrtc": Entry(
+            "robotdiffuse.generation.aorrtc_solver:AORRTCSearch",
+            "shorter paths in less time, as far from obstacles; the cost of one goal",
+            "AORRTCSearchSettings",
+        ),
+    },
+)

@@ -1,0 +1,256 @@
+"""MCAP: a file that Foxglove opens as a scene, with the motion as ROS 2 messages; and those of others.
+
+/scene and /tf are Foxglove's own messages: the obstacles, the arm as triangles fixed to its links, and where
+the links are. /robot_description is the URDF, if the robot was read from one, beside it as an attachment with
+the problem; /joint_trajectory and /joint_states are ROS 2's.
+"""
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.interop import missing
+from robotdiffuse.interop.ros_messages import motion_in
+from robotdiffuse.interop.recorded_motion import Recorded
+from robotdiffuse.interop.plain_messages import joint_trajectory
+from robotdiffuse.interop.ros_types import (
+    DISPLAY_TRAJECTORY,
+    JOINT_STATE,
+    JOINT_TRAJECTORY,
+    TEXT,
+    chosen,
+    display_trajectory,
+    message,
+    typestore,
+)
+from robotdiffuse.interop.scene_primitives import (
+    OBSTACLE,
+    Ball,
+    Brick,
+    Can,
+    Drawn,
+    Points,
+    Triangles,
+    arm,
+    obstacles,
+)
+from robotdiffuse.problems.files import problem_from_record, problem_record
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.core.input_files import input_file, parse_json
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.types import Trajectory
+
+try:
+    from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+    from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+    from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+    from mcap.reader import make_reader
+    from mcap.writer import Writer
+    from mcap_protobuf.schema import register_schema
+    from rosbags.typesys import get_types_from_msg
+except ImportError:
+    raise missing("mcap, mcap-protobuf-support, foxglove-schemas-protobuf and rosbags", "ros") from None
+
+FLOAT32 = 7
+"""foxglove.PackedElementField.FLOAT32"""
+PROBLEM = "problem.json"
+"""Name of the attachment."""
+
+
+class _File:
+    """Messages of both encodings in one MCAP file."""
+
+    def __init__(self, stream: io.BytesIO) -> None:
+        self.writer = Writer(stream)
+        self.writer.start(profile="", library="robotdiffuse")
+        self._channels: dict[str, int] = {}
+
+    def protobuf(self, topic: str, content: Any, at: int) -> None:
+        if topic not in self._channels:
+            schema = register_schema(self.writer, type(content))
+            self._channels[topic] = self.writer.register_channel(topic, "protobuf", schema)
+        self._add(topic, content.SerializeToString(), at)
+
+    def ros(self, topic: str, kind: str, content: dict[str, Any], at: int) -> None:
+        if topic not in self._channels:
+            text, _ = typestore().generate_msgdef(kind, ros_version=2)
+            schema = self.writer.register_schema(kind, "ros2msg", text.encode())
+            self._channels[topic] = self.writer.register_channel(topic, "cdr", schema)
+        self._add(topic, bytes(typestore().serialize_cdr(message(kind, content), kind)), at)
+
+    def _add(self, topic: str, data: bytes, at: int) -> None:
+        self.writer.add_message(self._channels[topic], log_time=at, data=data, publish_time=at)
+
+
+def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
+    """See the head of this file, and `interop.write_motion`."""
+    robot, stream = problem.robot, io.BytesIO()
+    out = _File(stream)
+    out.protobuf("/scene", _scene(problem), 0)
+    for cloud in _clouds(problem):
+        out.protobuf(f"/points/{cloud[0]}", cloud[1], 0)
+    record = joint_trajectory(trajectory.joint_names, trajectory)
+    out.ros("/joint_trajectory", JOINT_TRAJECTORY, record, 0)
+    out.ros("/display_planned_path", DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record), 0)
+    urdf = _urdf(robot.source)
+    if urdf is not None:
+        out.ros("/robot_description", TEXT, {"data": urdf.decode("utf-8", "replace")}, 0)
+        out.writer.add_attachment(0, 0, "robot.urdf", "application/xml", urdf)
+    try:
+        content = json.dumps(problem_record(problem)).encode()
+        out.writer.add_attachment(0, 0, PROBLEM, "application/json", content)
+    except InputError:
+        pass  # a robot that only this program has
+    names = [*trajectory.joint_names, *robot.locked]
+    for i, t in enumerate(trajectory.times.tolist()):
+        at = round(1e9 * t)
+        out.protobuf("/tf", _transforms(problem, trajectory.positions[i], at), at)
+        stamp = {"sec": at // 10**9, "nanosec": at % 10**9}
+        values = [*trajectory.positions[i].tolist(), *robot.locked.values()]
+        rates = [*trajectory.velocities[i].tolist(), *(0.0 for _ in robot.locked)]
+        state = {"header": {"stamp": stamp}, "name": names, "position": values, "velocity": rates}
+        out.ros("/joint_states", JOINT_STATE, state, at)
+    out.writer.finish()
+    write_atomically(file, stream.getvalue())
+
+
+def _urdf(source: str | None) -> bytes | None:
+    """The robot's URDF, if it was read from one that is still there."""
+    if source is None or not source.endswith(".urdf"):
+        return None
+    try:
+        return input_file(source).read_bytes()
+    except (InputError, OSError):
+        return None
+
+
+def _place(pose: Any, T: Float[ndarray, "4 4"]) -> None:
+    pose.position.x, pose.position.y, pose.position.z = T[:3, 3].tolist()
+    w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
+    pose.orientation.w, pose.orientation.x, pose.orientation.y, pose.orientation.z = w, x, y, z
+
+
+def _scene(problem: Problem) -> SceneUpdate:
+    update = SceneUpdate()
+    for name, frame, drawn in (*obstacles(problem), *arm(problem.robot)):
+        if isinstance(drawn, Points):
+            continue
+        entity = update.entities.add()
+        entity.id, entity.frame_id, entity.frame_locked = name, frame, True
+        _add(entity, drawn)
+    return update
+
+
+def _add(entity: Any, drawn: Drawn) -> None:
+    match drawn:
+        case Brick(T, size, color):
+            primitive = entity.cubes.add()
+            primitive.size.x, primitive.size.y, primitive.size.z = size.tolist()
+        case Ball(T, radius, color):
+            primitive = entity.spheres.add()
+            primitive.size.x = primitive.size.y = primitive.size.z = 2 * radius
+        case Can(T, radius, height, color):
+            primitive = entity.cylinders.add()
+            primitive.size.x = primitive.size.y = 2 * radius
+            primitive.size.z = height
+            primitive.bottom_scale = primitive.top_scale = 1.0
+        case Triangles(T, vertices, faces, color):
+            primitive = entity.triangles.add()
+            for x, y, z in vertices.tolist():
+                primitive.points.add(x=x, y=y, z=z)
+            primitive.indices.extend(faces.ravel().tolist())
+        case _:
+            raise TypeError(f"no primitive for {type(drawn).__name__}")
+    _place(primitive.pose, T)
+    primitive.color.r, primitive.color.g, primitive.color.b = (part / 255 for part in color)
+    primitive.color.a = 0.8 if color == OBSTACLE else 1.0
+
+
+def _clouds(problem: Problem) -> Iterator[tuple[str, PointCloud]]:
+    for name, frame, drawn in obstacles(problem):
+        if isinstance(drawn, Points):
+            cloud = PointCloud(frame_id=frame, point_stride=12)
+            cloud.pose.orientation.w = 1.0
+            for k, axis in enumerate("xyz"):
+                cloud.fields.add(name=axis, offset=4 * k, type=FLOAT32)
+            cloud.data = drawn.points.astype("<f4").tobytes()
+            yield name, cloud
+
+
+def _transforms(problem: Problem, q: Float[ndarray, "dof"], at: int) -> FrameTransforms:
+    update, robot = FrameTransforms(), problem.robot
+    frames = {
+        link: (robot.base, link_pose(robot, q, link)) for link in robot.link_names if link != robot.base
+    }
+    if problem.T_world_base is not None:
+        frames[robot.base] = ("world", problem.T_world_base)
+    for link, (parent, T) in frames.items():
+        transform = update.transforms.add(parent_frame_id=parent, child_frame_id=link)
+        transform.timestamp.FromNanoseconds(at)
+        transform.translation.x, transform.translation.y, transform.translation.z = T[:3, 3].tolist()
+        w, x, y, z = quaternion_from_rotation(T[:3, :3]).tolist()
+        turn = transform.rotation
+        turn.w, turn.x, turn.y, turn.z = w, x, y, z
+    return update
+
+
+def problem_in(file: Path) -> Problem | None:
+    """The problem that `write` put along; None if there is none."""
+    path = input_file(file)
+    try:
+        with path.open("rb") as stream:
+            attached = {found.name: found.data for found in make_reader(stream).iter_attachments()}
+        if PROBLEM not in attached:
+            return None
+        record = parse_json(attached[PROBLEM].decode(), f"{file}, {PROBLEM}")
+    except InputError:
+        raise
+    except Exception as error:  # mcap and zstandard raise whatever they meet in a damaged file
+        raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
+    return problem_from_record(record)
+
+
+def read(file: Path, topic: str | None = None) -> Recorded:
+    """The motion on a topic with ROS 2 messages; see `ros_types.chosen`."""
+    path = input_file(file)
+    try:
+        with path.open("rb") as stream:
+            reader = make_reader(stream)
+            summary = reader.get_summary()
+            if summary is None:
+                raise InputError(f"{file} is damaged: it ends before its summary")
+            ros = {
+                channel.topic: summary.schemas[channel.schema_id]
+                for channel in summary.channels.values()
+                if channel.message_encoding == "cdr" and channel.schema_id in summary.schemas
+            }
+            name = chosen({topic: schema.name for topic, schema in ros.items()}, topic, str(file))
+            store = _typestore(ros[name])
+            messages = [
+                (found.log_time, store.deserialize_cdr(found.data, ros[name].name))
+                for _, _, found in reader.iter_messages(topics=[name])
+            ]
+        return motion_in(ros[name].name, messages, f"{file}, {name}")
+    except InputError:
+        raise
+    except Exception as error:  # mcap, zstandard and rosbags raise whatever they meet in a damaged file
+        raise InputError(f"{file} is damaged: {shortened(str(error) or type(error).__name__)}") from None
+
+
+def _typestore(schema: Any) -> Any:
+    """With the types as the file defines them."""
+    from rosbags.typesys import Stores, get_typestore
+
+    if schema.encoding != "ros2msg":
+        return typestore()
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema.data.decode(), schema.name))
+    return store

@@ -1,0 +1,82 @@
+"""Rerun: a recording (.rrd) of the scene, the arm and its joints, for the Rerun viewer."""
+
+from pathlib import Path
+
+import numpy as np
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.interop import missing
+from robotdiffuse.interop.scene_primitives import Ball, Brick, Can, Drawn, Points, Triangles, arm, obstacles
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.types import Trajectory
+
+try:
+    import rerun as rr
+except ImportError:
+    raise missing("rerun-sdk", "rerun") from None
+
+TIMELINE = "time"
+FPS = 60.0
+"""Most poses of a link a second: what can be seen."""
+
+
+def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
+    """Entities: scene/NAME, robot/LINK with its meshes, joints/NAME/position and velocity over time; see
+    `interop.write_motion`."""
+    part = file.with_name(f".{file.name}.part")
+    robot, recording = problem.robot, rr.RecordingStream("robotdiffuse", recording_id=file.stem)
+    try:
+        part.touch()
+        recording.save(part)
+        recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for name, _, drawn in obstacles(problem):
+            recording.log(f"scene/{rr.escape_entity_path_part(name)}", *_archetypes(drawn), static=True)
+        for name, link, drawn in arm(robot):
+            recording.log(f"robot/{link}/{name.partition('/')[2]}", *_archetypes(drawn), static=True)
+        _motion(recording, problem, trajectory)
+        recording.flush()
+        recording.disconnect()
+        part.replace(file)
+    except OSError as error:
+        raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _motion(recording: rr.RecordingStream, problem: Problem, trajectory: Trajectory) -> None:
+    robot, times = problem.robot, trajectory.times
+    frames = max(int(np.ceil(times[-1] * FPS)), 1) + 1
+    shown = np.unique(np.searchsorted(times, np.linspace(0, times[-1], frames)).clip(0, len(times) - 1))
+    at = rr.TimeColumn(TIMELINE, duration=times[shown])
+    for link in robot.link_names:
+        poses = [link_pose(robot, trajectory.positions[i], link) for i in shown]
+        turns = [quaternion_from_rotation(T[:3, :3])[[1, 2, 3, 0]] for T in poses]
+        columns = rr.Transform3D.columns(translation=[T[:3, 3] for T in poses], quaternion=turns)
+        recording.send_columns(f"robot/{link}", [at], columns)
+    every = rr.TimeColumn(TIMELINE, duration=times)
+    for j, name in enumerate(trajectory.joint_names):
+        for what in ("positions", "velocities"):
+            columns = rr.Scalars.columns(scalars=getattr(trajectory, what)[:, j])
+            recording.send_columns(f"joints/{name}/{what}", [every], columns)
+
+
+def _archetypes(drawn: Drawn) -> tuple[rr.AsComponents, ...]:
+    if isinstance(drawn, Points):
+        return (rr.Points3D(drawn.points, radii=drawn.radius, colors=[drawn.color]),)
+    x, y, z = drawn.T[:3, 3].tolist()
+    turn = rr.Quaternion(xyzw=quaternion_from_rotation(drawn.T[:3, :3])[[1, 2, 3, 0]])
+    placed = {"centers": [[x, y, z]], "quaternions": [turn], "colors": [drawn.color]}
+    solid = rr.components.FillMode.Solid
+    match drawn:
+        case Brick(_, size, _):
+            return (rr.Boxes3D(half_sizes=[size / 2], fill_mode=solid, **placed),)
+        case Ball(_, radius, _):
+            return (rr.Ellipsoids3D(half_sizes=[[radius] * 3], fill_mode=solid, **placed),)
+        case Can(_, radius, height, _):
+            return (rr.Cylinders3D(radii=[radius], lengths=[height], fill_mode=solid, **placed),)
+        case Triangles(T, vertices, faces, color):
+            points = vertices @ T[:3, :3].T + T[:3, 3]
+            return (rr.Mesh3D(vertex_positions=points, triangle_indices=faces, albedo_factor=color),)
+    raise TypeError(f"no archetype for {type(drawn).__name__}")

@@ -1,0 +1,77 @@
+"""ROS 2 bags, without ROS: folders with metadata.yaml and a database."""
+
+import shutil
+from pathlib import Path
+
+from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.interop.ros_messages import motion_in
+from robotdiffuse.interop.recorded_motion import Recorded
+from robotdiffuse.interop.plain_messages import joint_trajectory
+from robotdiffuse.interop.ros_types import (
+    DISPLAY_TRAJECTORY,
+    JOINT_TRAJECTORY,
+    chosen,
+    display_trajectory,
+    message,
+    typestore,
+)
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.core.types import Trajectory
+
+try:
+    from rosbags.highlevel import AnyReader
+    from rosbags.rosbag2 import Writer
+except ImportError:
+    from robotdiffuse.interop import missing
+
+    raise missing("rosbags", "ros") from None
+
+VERSION = 9
+"""Of the bag's metadata; ROS 2 Humble reads what it knows of it."""
+
+
+def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
+    """A JointTrajectory on /joint_trajectory and a DisplayTrajectory on /display_planned_path, which RViz's
+    MoveIt plugin shows. A bag that is there is replaced; see `interop.write_motion`."""
+    if file.exists() and not (file / "metadata.yaml").is_file():
+        raise InputError(f"{file} cannot be written: it exists and is no ROS 2 bag")
+    record = joint_trajectory(trajectory.joint_names, trajectory)
+    topics = {
+        "/joint_trajectory": (JOINT_TRAJECTORY, record),
+        "/display_planned_path": (DISPLAY_TRAJECTORY, display_trajectory(problem, trajectory, record)),
+    }
+    part = file.with_name(f".{file.name}.part")
+    try:
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        with Writer(part / file.name, version=VERSION) as writer:  # which names the database after the folder
+            for topic, (kind, content) in topics.items():
+                connection = writer.add_connection(topic, kind, typestore=typestore())
+                writer.write(connection, 0, typestore().serialize_cdr(message(kind, content), kind))
+        shutil.rmtree(file, ignore_errors=True)
+        (part / file.name).replace(file)
+    except OSError as error:
+        raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def read(file: Path, topic: str | None = None) -> Recorded:
+    """The motion on a topic; see `ros_types.chosen`."""
+    if not (file / "metadata.yaml").is_file():
+        raise InputError(f"{file} is no ROS 2 bag: it has no metadata.yaml")
+    try:
+        with AnyReader([file], default_typestore=typestore()) as reader:
+            topics = {connection.topic: connection.msgtype for connection in reader.connections}
+            name = chosen(topics, topic, str(file))
+            messages = [
+                (at, reader.deserialize(raw, connection.msgtype))
+                for connection, at, raw in reader.messages(
+                    [connection for connection in reader.connections if connection.topic == name]
+                )
+            ]
+            return motion_in(topics[name], messages, f"{file}, {name}")
+    except InputError:
+        raise
+    except Exception as error:  # rosbags, SQLite and YAML raise whatever they meet in a damaged bag
+        raise InputError(f"{file} is damaged: {shortened(str(error))}") from None

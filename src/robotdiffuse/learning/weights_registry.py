@@ -1,0 +1,58 @@
+"""Which weights there are, told without loading them or PyTorch."""
+
+import json
+from functools import lru_cache
+from pathlib import Path as FilePath
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.networks import NETWORKS
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.robots.user_data_dir import user_robots
+from robotdiffuse.robots.robot import Robot
+
+BUNDLED = FilePath(__file__).parent / "weights"
+"""Weights that come with the package, one folder per robot."""
+
+
+def user_weights(robot: Robot) -> FilePath:
+    """The folder for weights that were trained here for a robot: beside the user's robots, by its name."""
+    return user_robots() / robot.name / "weights"
+
+
+def weights_for(name: str, robot: Robot) -> FilePath | None:
+    """The folder with weights of a network, as NETWORKS names it, for this very robot; None if there is none.
+
+    Those that were trained here come before those of the package. Raises InputError, naming the file, for a
+    description that is damaged.
+    """
+    for place in (user_weights(robot), BUNDLED / robot.name):
+        file = place / f"{name}.json"
+        try:
+            changed = file.stat().st_mtime_ns
+        except OSError:
+            continue
+        if not _identity(file, changed).difference(robot):
+            return place
+    return None
+
+
+@lru_cache
+def _identity(file: FilePath, _changed: int) -> RobotIdentity:
+    try:
+        about = json.loads(file.read_text(encoding="utf-8"))["robot"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise InputError(f"{file} is damaged: {type(error).__name__}: {error}") from None
+    return RobotIdentity.from_json(about, f"{file}: robot")
+
+
+def check_weights(name: str, folder: str | FilePath | None) -> None:
+    """Raises InputError if a folder is given that holds no weights of this network."""
+    NETWORKS.entry(name)
+    if folder is not None and not (FilePath(folder) / f"{name}.json").is_file():
+        raise untrained(name, f"{folder} holds no {name}")
+
+
+def untrained(name: str, what: str) -> InputError:
+    """What to do where there are no weights."""
+    how = NETWORKS[name].kind or f"baseline {name} --data FOLDER --out FOLDER"
+    return InputError(f"{what}; train them: robotdiffuse train {how}")

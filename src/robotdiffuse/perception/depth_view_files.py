@@ -1,0 +1,166 @@
+"""Depth views in problem files: images and clouds that are read, and entries that name them.
+
+- {depth: shelf.png, scale: 0.001, intrinsics: [fx, fy, cx, cy], camera: {xyz: [...], wxyz: [...]}}
+- {cloud: shelf.ply, camera: {...}, configuration: [...]}
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
+from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
+from robotdiffuse.core.input_files import input_file, read_arrays
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.scenes.files import check_fields, name_from
+from robotdiffuse.scenes.point_cloud import read_points
+from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
+
+DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
+MILLIMETRE = 0.001
+"""The unit of depth images of whole numbers, unless a scale is given [m]."""
+
+
+def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "h w"]:
+    """A depth image [m]: a 16 bit .png, an array in .npy or .npz (named depth, or the only one), or .exr.
+
+    `scale`: metres per unit; None: 0.001 for whole numbers, 1 for others. Raises InputError for a file that
+    is missing or holds something else.
+    """
+    file = Path(file)
+    if file.suffix.lower() not in DEPTH_FORMATS:
+        raise unknown_name(f"depth image format of {file}:", file.suffix, DEPTH_FORMATS)
+    input_file(file, "depth image")
+    try:
+        image = _READERS[file.suffix.lower()](file)
+    except InputError:
+        raise
+    except Exception as error:  # the readers raise whatever their library does about a damaged file
+        raise InputError(f"depth image {file} cannot be read: {shortened(str(error))}") from None
+    if image.ndim != 2 or image.dtype.kind not in "uif":
+        form = " x ".join(map(str, image.shape))
+        raise InputError(
+            f"depth image {file} holds {image.dtype} of {form}; it must be numbers, height x width"
+        )
+    if scale is None:
+        scale = MILLIMETRE if image.dtype.kind in "ui" else 1.0
+    return image.astype(np.float64) * scale
+
+
+def _read_png(file: Path) -> ndarray:
+    from PIL import Image
+
+    with Image.open(file) as image:
+        if image.mode not in ("I;16", "I;16B", "I"):
+            raise InputError(f"depth image {file} is of mode {image.mode}; it must be grey with 16 bits")
+        return np.asarray(image).astype(np.int64)
+
+
+def _read_npz(file: Path) -> ndarray:
+    arrays = read_arrays(file)
+    if "depth" not in arrays and len(arrays) != 1:
+        raise InputError(f"depth image {file} holds {shown([*arrays])}; one must be named depth")
+    return arrays.get("depth", next(iter(arrays.values())))
+
+
+def _read_exr(file: Path) -> ndarray:
+    try:
+        import OpenEXR
+    except ImportError:
+        raise InputError(
+            f"depth image {file} needs the package OpenEXR: pip install 'robotdiffuse[exr]'"
+        ) from None
+    channels = OpenEXR.File(str(file)).channels()
+    for name in ("Z", "Y", "depth", "R"):
+        if name in channels:
+            return np.asarray(channels[name].pixels)
+    if len(channels) == 1:
+        return np.asarray(next(iter(channels.values())).pixels)
+    raise InputError(f"depth image {file} has the channels {', '.join(channels)}; one must be named Z")
+
+
+_READERS = {
+    ".png": _read_png,
+    ".npy": lambda file: read_arrays(file)[""],
+    ".npz": _read_npz,
+    ".exr": _read_exr,
+}
+
+
+def read_views(entries: object, folder: Path) -> tuple[tuple[DepthView, ...], tuple[str, ...]]:
+    """The views of a problem file, and notes on what was left out of them; files are looked up from `folder`.
+
+    Raises InputError for unknown and missing fields, values of the wrong kind and files that cannot be read;
+    the message starts with the place, e.g. views[1].
+    """
+    if not isinstance(entries, list):
+        raise InputError(f"views is {shown(entries)}; it must be a list of views, each with depth or cloud")
+    views: list[DepthView] = []
+    notes: list[str] = []
+    for i, entry in enumerate(entries):
+        try:
+            views.append(_view(f"views[{i}]", entry, folder, notes))
+        except InputError as error:
+            where = "" if str(error).startswith(f"views[{i}]") else f"views[{i}]: "
+            raise InputError(f"{where}{error}") from None
+    return tuple(views), tuple(notes)
+
+
+def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthView:
+    source: dict[str, str | float] | None = None
+    cloud = isinstance(entry, dict) and "cloud" in entry
+    required = ("cloud", "camera") if cloud else ("depth", "intrinsics", "camera")
+    values = check_fields(where, entry, required, ("configuration",) if cloud else ("scale", "configuration"))
+    camera = check_fields(f"{where}.camera", values["camera"], ("xyz", "wxyz"))
+    rotation = rotation_from_quaternion(unit_quaternion("camera", camera["wxyz"]))
+    T_base_camera, configuration = transform(vector("camera", "xyz", camera["xyz"], 3), rotation), None
+    if values.get("configuration") is not None:
+        configuration = np.asarray(values["configuration"])
+    if cloud:
+        points = values["cloud"]
+        if isinstance(points, str):
+            file = str(folder / points)
+            points, more = read_points(file)
+            notes.extend(more)
+            source = {"cloud": file}
+        return DepthView.from_cloud(_rows(where, points), T_base_camera, configuration, source)
+    image = values["depth"]
+    scale = positive("view", "scale", values["scale"]) if "scale" in values else None
+    if isinstance(image, str):
+        file = str(folder / image)
+        image, source = read_depth(file, scale), {"depth": file} | ({} if scale is None else {"scale": scale})
+    elif scale is not None:
+        raise InputError("view.scale is for images that are read from files; give numbers in metres")
+    return DepthView(image, values["intrinsics"], T_base_camera, configuration, source=source)
+
+
+def _rows(where: str, points: Any) -> Float[ndarray, "n 3"]:
+    array = numbers(points)
+    if array is None or array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"{where}.cloud is {shown(points)}; it must be the name of a file or n x 3 numbers")
+    return array
+
+
+def view_entry(view: DepthView, folder: Path | None) -> dict[str, Any]:
+    """The view as `read_views` takes it; what was read from a file is written as its name."""
+    entry: dict[str, Any] = {}
+    if view.source is not None:
+        entry |= {
+            name: name_from(folder, Path(value)) if isinstance(value, str) else value
+            for name, value in view.source.items()
+        }
+    elif view.cloud is not None:
+        entry["cloud"] = view.cloud.tolist()
+    else:
+        # what is no number would be no JSON; a pixel that saw nothing however far keeps that, as 1e9
+        image = np.nan_to_num(view.depth, nan=0.0, posinf=1e9, neginf=0.0)
+        entry["depth"] = image.tolist()
+    if view.cloud is None:
+        entry["intrinsics"] = list(view.intrinsics)
+    entry["camera"] = pose_entry(view.T_base_camera)
+    if view.configuration is not None:
+        entry["configuration"] = view.configuration.tolist()
+    return entry

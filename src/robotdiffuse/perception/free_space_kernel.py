@@ -1,0 +1,229 @@
+"""What one depth image tells of a grid of voxels, by compiled code: see `observed_volume`.
+
+Projective: each voxel is looked up in the image, and not each ray followed through the voxels.
+"""
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.perception.ray_kernel import rectangle
+
+HIDDEN, FREE, BEHIND, SHADOW, OUT = 0, 1, 2, 3, 4
+"""What a view says of a voxel: nothing, all of it seen free, behind a surface, behind the arm, not in the
+image."""
+NOTHING = np.float32(-1.0)
+"""Depth of a pixel that returned nothing."""
+FAR = np.float32(1e6)
+"""Depth of a pixel that saw nothing within its range, and of what is not known [m]."""
+FOCAL = 250.0
+"""Images are pooled while their focal length stays above this [pixels]: a voxel of 4 cm is 5 pixels wide then
+at a distance of 2 m."""
+RETURNED = np.float32(0.5)
+"""Share of a voxel's pixels that must have returned something for it to be seen free."""
+SOLID = np.float32(0.03)
+"""Share of a voxel's pixels that must lie in it for it to be seen occupied: stray ones do not count."""
+FLYING = np.float32(0.03)
+"""A pixel so much nearer than one neighbour and farther than the opposite one belongs to neither [m]..."""
+FLYING_PIXELS = np.float32(4.0)
+"""... or, if that is more, so many times the width of a pixel at its distance."""
+FAST = {"contract", "reassoc", "arcp", "nsz"}
+"""All of fastmath but what assumes that nothing is infinite or not a number."""
+_HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
+
+
+@njit(cache=True, fastmath=FAST)
+def _cleaned(depth, focal):
+    """Depths, FAR where the ray met nothing, NOTHING where it returned nothing or between two surfaces."""
+    h, w = depth.shape
+    out = np.empty((h, w), np.float32)
+    for v in range(h):
+        for u in range(w):
+            d = depth[v, u]
+            out[v, u] = min(d, FAR) if d > _ZERO else NOTHING
+    flying = np.zeros((h, w), np.bool_)
+    for v in range(1, h - 1):
+        for u in range(1, w - 1):
+            d = out[v, u]
+            step = max(FLYING, FLYING_PIXELS * d / focal)
+            a, b, c, e = out[v, u - 1], out[v, u + 1], out[v - 1, u], out[v + 1, u]
+            across = (a > _ZERO) & (b > _ZERO) & (min(a, b) < d - step) & (max(a, b) > d + step)
+            along = (c > _ZERO) & (e > _ZERO) & (min(c, e) < d - step) & (max(c, e) > d + step)
+            flying[v, u] = across | along
+    for v in range(h):
+        for u in range(w):
+            if flying[v, u]:
+                out[v, u] = NOTHING
+    return out
+
+
+@njit(cache=True, fastmath=FAST)
+def _arm(depth, intrinsics, spheres):
+    """Which pixels lie in the spheres, [n, 4] x y z radius in the camera's frame."""
+    h, w = depth.shape
+    fx, fy, cx, cy = intrinsics
+    mask = np.zeros((h, w), np.bool_)
+    for s in range(len(spheres)):
+        x, y, z, r = spheres[s]
+        v0, v1, u0, u1 = rectangle(x, y, z, r, intrinsics, h, w)
+        for v in range(v0, v1 + 1):
+            ry = (np.float32(v) - cy) / fy
+            for u in range(u0, u1 + 1):
+                d = depth[v, u]
+                dx, dy, dz = (np.float32(u) - cx) / fx * d - x, ry * d - y, d - z
+                if dx * dx + dy * dy + dz * dz < r * r:
+                    mask[v, u] = True
+    return mask
+
+
+@njit(cache=True, fastmath=FAST)
+def _pooled(depth, factor):
+    """Least depth of blocks of pixels, and how many of them returned nothing, summed from the upper left."""
+    h, w = (depth.shape[0] + factor - 1) // factor, (depth.shape[1] + factor - 1) // factor
+    least = np.full((h, w), FAR, np.float32)
+    missing = np.zeros((h + 1, w + 1), np.int32)
+    nearest, lost = np.empty(depth.shape[1], np.float32), np.empty(depth.shape[1], np.int32)
+    for block in range(h):
+        nearest[:], lost[:] = FAR, 0
+        for v in range(block * factor, min((block + 1) * factor, depth.shape[0])):
+            row = depth[v]
+            for u in range(depth.shape[1]):
+                known = row[u] > _ZERO
+                nearest[u] = min(nearest[u], row[u] if known else FAR)
+                lost[u] += np.int32(0) if known else np.int32(1)
+        total = np.int32(0)
+        for u in range(depth.shape[1]):
+            cell = u // factor
+            least[block, cell] = min(least[block, cell], nearest[u])
+            total += lost[u]
+            missing[block + 1, cell + 1] = missing[block, cell + 1] + total
+    return least, missing
+
+
+@njit(cache=True, fastmath=FAST)
+def _windows(least, levels):
+    """Least depth of the square of 2^k cells below and right of each cell, for each k: a sparse table."""
+    h, w = least.shape
+    table = np.empty((levels, h, w), np.float32)
+    table[0] = least
+    for k in range(1, levels):
+        step = 1 << (k - 1)
+        before, now = table[k - 1], table[k]
+        for v in range(h):
+            a, b = before[v], before[min(v + step, h - 1)]
+            for u in range(w - step):
+                now[v, u] = min(min(a[u], a[u + step]), min(b[u], b[u + step]))
+            for u in range(w - step, w):
+                now[v, u] = min(a[u], b[u])
+    return table
+
+
+@njit(cache=True, fastmath=FAST)
+def _least(table, v0, v1, u0, u1):
+    """Least depth of the cells of a rectangle, ends included."""
+    k = 0
+    while 2 << k <= min(v1 - v0, u1 - u0) + 1 and k + 1 < len(table):
+        k += 1
+    step, least = 1 << k, FAR
+    for v in range(v0, v1 + step, step):
+        row = table[k, max(v0, min(v, v1 - step + 1))]
+        for u in range(u0, u1 + step, step):
+            least = min(least, row[max(u0, min(u, u1 - step + 1))])
+    return least
+
+
+@njit(cache=True, fastmath=FAST)
+def _count(depth, arm, intrinsics, T, low, voxel, counts):
+    """Adds up the points, those of the arm left out, that lie in each voxel."""
+    fx, fy, cx, cy = intrinsics
+    h, w = depth.shape
+    nx, ny, nz = counts.shape
+    flat = counts.ravel()
+    fnx, fny, fnz = np.float32(nx), np.float32(ny), np.float32(nz)
+    scale = _ONE / voxel
+    ox, oy, oz = (T[0, 3] - low[0]) * scale, (T[1, 3] - low[1]) * scale, (T[2, 3] - low[2]) * scale
+    at = np.empty(w, np.int32)
+    for v in range(h):
+        b = (np.float32(v) - cy) / fy
+        rx, ry, rz = T[0, 1] * b + T[0, 2], T[1, 1] * b + T[1, 2], T[2, 1] * b + T[2, 2]
+        row, hidden = depth[v], arm[v]
+        for u in range(w):
+            a, d = (np.float32(u) - cx) / fx, row[u] * scale
+            x, y, z = ox + (rx + T[0, 0] * a) * d, oy + (ry + T[1, 0] * a) * d, oz + (rz + T[2, 0] * a) * d
+            inside = (x >= _ZERO) & (y >= _ZERO) & (z >= _ZERO) & (x < fnx) & (y < fny) & (z < fnz)
+            inside &= (d > _ZERO) & ~hidden[u]
+            x, y, z = min(max(x, _ZERO), fnx), min(max(y, _ZERO), fny), min(max(z, _ZERO), fnz)
+            index = (np.int32(x) * np.int32(ny) + np.int32(y)) * np.int32(nz) + np.int32(z)
+            at[u] = index if inside else np.int32(-1)
+        for u in range(w):
+            if at[u] >= 0:
+                flat[at[u]] += 1
+
+
+@njit(cache=True, fastmath=FAST)
+def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
+    """What a view says of each voxel, in state [nx ny nz], and how far behind a surface it is [m].
+
+    intrinsics fx, fy, cx, cy; T = T_base_camera [4 4]; spheres of the arm in the camera's frame; low: corner
+    of the grid; counts: points in each voxel, more than the stray ones, 0 elsewhere. All of float32 but for
+    state, uint8, and counts, int32.
+    """
+    fx, fy, cx, cy = intrinsics
+    nx, ny, nz = state.shape
+    raw = _cleaned(depth, fx)
+    arm = _arm(raw, intrinsics, spheres)
+    counts[:] = 0
+    _count(raw, arm, intrinsics, T, low, voxel, counts)
+    factor = max(1, int(fx / FOCAL))
+    least, missing = _pooled(raw, factor)
+    h, w = least.shape
+    table = _windows(least, 6)
+    share = _ONE / np.float32(factor)
+    half = _HALF * voxel
+    ez = half * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
+    for i in range(nx):
+        px = low[0] + (np.float32(i) + _HALF) * voxel - T[0, 3]
+        for j in range(ny):
+            py = low[1] + (np.float32(j) + _HALF) * voxel - T[1, 3]
+            for k in range(nz):
+                pz = low[2] + (np.float32(k) + _HALF) * voxel - T[2, 3]
+                z = T[0, 2] * px + T[1, 2] * py + T[2, 2] * pz
+                behind[i, j, k] = _ZERO
+                state[i, j, k] = OUT
+                if z <= ez:
+                    continue
+                x, y = T[0, 0] * px + T[1, 0] * py + T[2, 0] * pz, T[0, 1] * px + T[1, 1] * py + T[2, 1] * pz
+                x, y = x / z, y / z
+                u, v = fx * x + cx, fy * y + cy
+                column, row = int(np.floor(u + _HALF)), int(np.floor(v + _HALF))
+                if column < 0 or row < 0 or column >= depth.shape[1] or row >= depth.shape[0]:
+                    continue
+                if counts[i, j, k] > 0:
+                    pixels = fx * fy * (voxel / z) ** 2
+                    counts[i, j, k] = max(0, counts[i, j, k] - int(SOLID * pixels))
+                front = raw[row, column]
+                if front > z + ez or front <= _ZERO:
+                    # half the width and height of what the voxel's corners span in the image
+                    du, dv = _ZERO, _ZERO
+                    for c in range(3):
+                        du += abs(T[c, 0] - x * T[c, 2])
+                        dv += abs(T[c, 1] - y * T[c, 2])
+                    du, dv = fx * half * du / (z - ez), fy * half * dv / (z - ez)
+                    u0, u1 = int((u - du + _HALF) * share), int((u + du + _HALF) * share)
+                    v0, v1 = int((v - dv + _HALF) * share), int((v + dv + _HALF) * share)
+                    inside = u - du >= -_HALF and v - dv >= -_HALF and u1 < w and v1 < h
+                    u0, v0, u1, v1 = max(0, u0), max(0, v0), min(w - 1, u1), min(h - 1, v1)
+                    lost = (
+                        missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]
+                    )
+                    pixels = np.float32((v1 + 1 - v0) * (u1 + 1 - u0) * factor * factor)
+                    nearest = _least(table, v0, v1, u0, u1)
+                    if inside and nearest > z + ez and np.float32(lost) <= (_ONE - RETURNED) * pixels:
+                        state[i, j, k] = FREE
+                        continue
+                    front = nearest if front <= _ZERO else front
+                state[i, j, k] = HIDDEN
+                if arm[row, column]:
+                    state[i, j, k] = SHADOW
+                elif front < z:
+                    state[i, j, k] = BEHIND
+                    behind[i, j, k] = z - front

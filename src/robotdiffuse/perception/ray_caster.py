@@ -1,0 +1,140 @@
+"""What an ideal depth camera sees of a scene, in milliseconds; and what a real one makes of that."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int64
+from numpy import ndarray
+from numpy.random import Generator
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.ray_kernel import BOX, CAPSULE, CYLINDER, SPHERE, draw
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
+from robotdiffuse.perception.voxel_kernel import fill
+from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
+from robotdiffuse.core.transforms import transform
+
+FAR = 4.0
+"""Nothing farther than this is seen [m]."""
+ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
+
+
+def looking_at(
+    position: Float[ndarray, "3"], target: Float[ndarray, "3"], roll: float = 0.0
+) -> Float[ndarray, "4 4"]:
+    """T_base_camera of a camera that has `target` in the middle of its image, upright but for `roll` [rad].
+
+    x is to the right in the image, y down, z ahead. Straight down, the image's upper side is towards +x.
+    """
+    z = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
+    right = np.array([z[1], -z[0], 0.0])
+    x = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([0.0, -1.0, 0.0])
+    y = np.cross(z, x)
+    c, s = np.cos(roll), np.sin(roll)
+    return transform(np.asarray(position, np.float64), np.stack([c * x + s * y, c * y - s * x, z], axis=1))
+
+
+def ray_cast(
+    scene: Scene,
+    T_base_camera: Float[ndarray, "4 4"],
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],
+    robot: Robot | None = None,
+    configuration: Float[ndarray, "dof"] | None = None,
+) -> DepthView:
+    """What a camera of this pose sees of a scene, and of a robot, as its covering spheres, if one is given.
+
+    size: width and height [pixels]; intrinsics: see DepthView. Where nothing is within FAR, depth is
+    infinite. Raises InputError for shapes other than spheres, boxes, cylinders and capsules.
+    """
+    kinds, rows = _rows(scene)
+    if robot is not None and configuration is not None:
+        spheres = [_sphere_row(sphere) for sphere in placed_spheres(robot, configuration)]
+        kinds = np.append(kinds, np.full(len(spheres), SPHERE))
+        rows = np.concatenate([rows, np.array(spheres, np.float32).reshape(-1, 16)])
+    depth = np.full((size[1], size[0]), FAR, np.float32)
+    draw(kinds, rows, np.array(intrinsics, np.float32), np.asarray(T_base_camera, np.float32), depth)
+    depth[depth >= FAR] = np.inf
+    return DepthView(depth, intrinsics, T_base_camera, configuration)
+
+
+def voxels_within(
+    scene: Scene,
+    low: tuple[float, float, float],
+    voxel: float,
+    shape: tuple[int, int, int],
+    margin: float = 0.005,
+) -> Bool[ndarray, "nx ny nz"]:
+    """Which voxels of a grid hold obstacles: their centre is in a shape, or at most `margin` [m] from it.
+
+    With half a centimetre, walls that are half as thick as a voxel of 2 cm is wide have no holes. Raises
+    InputError for shapes other than spheres, boxes, cylinders and capsules.
+    """
+    out = np.zeros(shape, np.bool_)
+    fill(*_rows(scene), np.array(low, np.float32), np.float32(voxel), np.float32(margin), out)
+    return out
+
+
+def _rows(scene: Scene) -> tuple[Int64[ndarray, "n"], Float32[ndarray, "n 16"]]:
+    """Kinds and rows of the shapes as compiled code has them."""
+    kinds = np.array([_kind(shape) for shape in scene.shapes], np.int64)
+    return kinds, np.array([_row(shape) for shape in scene.shapes], np.float32).reshape(-1, 16)
+
+
+def _kind(shape: Shape) -> int:
+    kind = {Sphere: SPHERE, Box: BOX, Cylinder: CYLINDER, Capsule: CAPSULE}.get(type(shape))
+    if kind is None:
+        raise InputError(
+            f"{shape.name} is a {shape.kind}; only spheres, boxes, cylinders and capsules can be seen by rays"
+        )
+    return kind
+
+
+def _row(shape: Shape) -> ndarray:
+    if isinstance(shape, Sphere):
+        return _sphere_row(np.append(shape.center, shape.radius))
+    assert isinstance(shape, Box | Cylinder | Capsule)  # by _kind
+    if isinstance(shape, Box):
+        half, around = shape.size / 2, float(np.linalg.norm(shape.size)) / 2
+    else:
+        half = np.array([shape.radius, shape.height / 2, 0.0])
+        around = float(np.hypot(*half[:2]) if isinstance(shape, Cylinder) else half[:2].sum())
+    return np.concatenate([shape.center, shape.rotation.T.ravel(), half, [around]])
+
+
+def _sphere_row(sphere: Float[ndarray, "4"]) -> ndarray:
+    return np.concatenate([sphere[:3], np.eye(3).ravel(), [sphere[3], 0.0, 0.0, sphere[3]]])
+
+
+@dataclass(frozen=True)
+class DepthNoise(Settings, name="depth_noise"):
+    """What a real depth camera does to depth; the defaults are about those of a stereo camera."""
+
+    spread: NotNegative = 0.002
+    """Standard deviation of depth at a distance of 1 m [m]; it grows with the square of the distance."""
+    missing: ShareBelowOne = 0.02
+    """Share of the pixels that return nothing."""
+    flying: ShareBelowOne = 0.3
+    """Share of the pixels at edges whose depth is somewhere between the two surfaces."""
+    edge: Positive = 0.05
+    """Neighbouring pixels that differ by more than this are at an edge [m]."""
+
+    def applied(self, view: DepthView, rng: Generator) -> DepthView:
+        """The same view as such a camera would have taken it."""
+        clean, depth = view.depth, view.depth.astype(np.float64)
+        for axis in (0, 1):
+            # of two neighbours with an edge between them, the first flies
+            other = clean.take(np.arange(1, clean.shape[axis] + 1), axis, mode="clip")
+            both = np.isfinite(clean) & np.isfinite(other)
+            apart = np.where(both, other, 0.0) - np.where(both, clean, 0.0)
+            flies = (np.abs(apart) > self.edge) & (rng.random(clean.shape) < self.flying)
+            depth[flies] = clean[flies] + rng.random(int(flies.sum())) * apart[flies]
+        seen = np.isfinite(depth)
+        depth[seen] += self.spread * depth[seen] ** 2 * rng.standard_normal(int(seen.sum()))
+        depth[rng.random(depth.shape) < self.missing] = 0.0
+        return DepthView(depth, view.intrinsics, view.T_base_camera, view.configuration)

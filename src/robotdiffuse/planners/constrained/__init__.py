@@ -1,1 +1,0 @@
-"""Search under path constraints."""

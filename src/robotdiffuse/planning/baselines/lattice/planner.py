@@ -1,0 +1,412 @@
+"""A* and D* Lite on a lattice of configurations: the classical graph searches, as baselines.
+
+A*: P. Hart, N. Nilsson and B. Raphael, "A formal basis for the heuristic determination of minimum cost
+paths", IEEE Trans. SSC 1968. D* Lite: S. Koenig and M. Likhachev, "D* Lite", AAAI 2002, optimized version.
+
+The lattice: nodes lie whole numbers of steps of `spacing` from the start in each planned joint, edges change
+one joint by a step (or several, `joints_per_move`), cost is joint-space length [rad], and the corners of the
+cell that a goal lies in are joined to it by exact last edges. Nodes and edges come into being, and are
+checked, when a search gets to them. What is found is the path along the lattice, with no shortcuts.
+
+Where this fails, with seven joints. A node has 14 neighbours, 2,186 if all joints may move at once, and a
+spacing of 0.3 rad makes 10^9 nodes. The heuristic knows nothing of obstacles: before the search turns away
+from one, it fills the whole pocket in front of it, whose size grows with the seventh power of its width.
+With inflation 1 it must also expand every node whose straight-line estimate is below the cost, and all
+orders in which the joints can make the same steps are ties. So optimal search ends in good time only where
+the way is nearly straight; inflation buys speed with length. Passages narrower than a step are not seen at
+all: no path on the lattice does not mean no path. And a path of single-joint steps is a staircase, up to
+sqrt(dof) times as long as the straight line that it stands for.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from itertools import combinations, product
+from math import ceil, comb, sqrt
+from typing import Annotated, NamedTuple, TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.motions import FINEST, levers, search_space
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning.planner import Planner, ever_finer
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.baselines.lattice import graph as lattice_graph
+from robotdiffuse.planning.baselines.lattice import kernel
+from robotdiffuse.planning.baselines.lattice import table as table
+from robotdiffuse.planning.baselines.lattice.graph import UNITS, Lattice
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
+from robotdiffuse.core.types import Status
+
+SLICE = 4000
+"""Edges that are met between two looks at the clock, about: some take 10 microseconds."""
+MOST_MOVES = 100_000
+"""Edges that a node may have."""
+MOST_KEYS = 2**62
+"""Nodes that can be told apart."""
+ROUNDING = 1e-4
+"""What single precision may be wrong by [m]; far more than it is."""
+INSIDE = 1e-9
+"""The lattice keeps this much away from the joint limits [steps]."""
+
+
+@dataclass(frozen=True)
+class LatticeSettings(Settings):
+    spacing: Positive = 0.4
+    """Step of the lattice [rad], [m] for prismatic joints."""
+    joints_per_move: Count = 1
+    """Most joints that an edge moves, each by one step."""
+    max_nodes: Annotated[int, Bound(least=1.0, below=2.0**31 - 1)] = 2_000_000
+    """Most nodes that are kept; some 60 to 80 bytes each, and more with `joints_per_move`."""
+    resolution: Positive = 0.05
+    """No point of the arm moves further than this between two checks of an edge [m]; a path that the judge
+    refuses is searched again at half the distance."""
+    clearance: NotNegative = 0.002
+    """Distance to obstacles that paths keep where start and goal allow it [m]."""
+
+
+@dataclass(frozen=True)
+class AStarSettings(LatticeSettings, name="a_star"):
+    joints_per_move: Count = 2
+    """See LatticeSettings. More make paths shorter (2.1, 1.6, 1.35 and 1.2 times the straight line with 1, 2,
+    3 and 7 on ROP problems) and the search slower: an expansion checks up to 14, 98, 378 and 2,186 edges."""
+    inflation: Annotated[float, Bound(least=1.0, most=1000.0)] = 1.5
+    """Factor on the heuristic (weighted A*): paths are at most this much longer than the shortest of the
+    lattice; 1 finds the shortest, with seven joints often not in time."""
+
+
+@dataclass(frozen=True)
+class DStarLiteSettings(LatticeSettings, name="d_star_lite"):
+    """No inflation: repairs are right only with a consistent heuristic."""
+
+
+Own = TypeVar("Own", bound=LatticeSettings)
+
+
+class Outcome(Enum):
+    """How far a search is."""
+
+    GOING = kernel.GOING
+    """It was stopped, and can go on."""
+    FOUND = kernel.FOUND
+    EXHAUSTED = kernel.EXHAUSTED
+    """No path on the lattice."""
+    FULL = kernel.FULL
+    """`max_nodes` are in use."""
+
+
+class _Graph(NamedTuple):
+    lattice: Lattice
+    lowest: Float[ndarray, "dof"]
+    highest: Float[ndarray, "dof"]
+    """The joint limits."""
+    start_key: int
+
+    def configurations(self, keys: Int[ndarray, "n"]) -> Float[ndarray, "n dof"]:
+        """The nodes' joint positions."""
+        at = keys[:, None] // self.lattice.strides % self.lattice.counts
+        return np.clip(self.lattice.origin + self.lattice.spacing * at, self.lowest, self.highest)
+
+
+def _make_graph(
+    robot: Robot, start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], settings: LatticeSettings
+) -> _Graph:
+    spacing, lower, upper = settings.spacing, robot.lower.astype(float), robot.upper.astype(float)
+    start = start.astype(np.float64)
+    below = np.maximum(np.floor((start - lower) / spacing - INSIDE), 0).astype(np.int64)
+    above = np.maximum(np.floor((upper - start) / spacing - INSIDE), 0).astype(np.int64)
+    counts = below + above + 1
+    if (total := np.prod(counts.astype(float))) >= MOST_KEYS:
+        raise InputError(
+            f"{settings.settings_name}.spacing is {spacing:g}; on {robot.name} that makes {total:.0e} nodes, "
+            f"which must be below {MOST_KEYS:.0e}: a spacing of "
+            f"{spacing * (total / MOST_KEYS) ** (1 / robot.dof) * 1.1:.2g} does it"
+        )
+    edges = [comb(robot.dof, k) * 2**k for k in range(1, robot.dof + 1)]
+    if sum(edges[: settings.joints_per_move]) > MOST_MOVES:
+        most = int(np.searchsorted(np.cumsum(edges), MOST_MOVES, side="right"))
+        raise InputError(
+            f"{settings.settings_name}.joints_per_move is {settings.joints_per_move}; on {robot.name} that "
+            f"makes {sum(edges[: settings.joints_per_move])} edges of a node; it must be at most {most}"
+        )
+    strides = np.concatenate([[1], np.cumprod(counts[:-1])]).astype(np.int64)
+    origin = start - spacing * below
+    half = _moves(robot.dof, settings.joints_per_move)
+    moves = np.concatenate([half, -half])
+    goals_at = (goals.astype(np.float64) - origin) / spacing
+    lattice = Lattice(
+        origin,
+        float(spacing),
+        counts,
+        strides,
+        moves,
+        np.ceil(UNITS * np.sqrt(np.abs(moves).sum(axis=1))).astype(np.int64),
+        1 / sqrt(min(settings.joints_per_move, robot.dof)),
+        np.ascontiguousarray(goals, np.float32),
+        goals_at,
+        np.floor(goals_at).astype(np.int64),
+    )
+    return _Graph(lattice, lower, upper, int(below @ strides))
+
+
+def _moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
+    """One of each pair of opposite moves: the first joint that moves, moves up. Few joints first."""
+    if joints == 1:
+        return np.eye(dof, dtype=np.int64)
+    moves = []
+    for count in range(1, min(joints, dof) + 1):
+        signs = [(1, *others) for others in product((1, -1), repeat=count - 1)]
+        rows = np.zeros((comb(dof, count), len(signs), dof), np.int64)
+        for row, moving in zip(rows, combinations(range(dof), count), strict=True):
+            row[:, moving] = signs
+        moves += sorted(rows.reshape(-1, dof).tolist(), key=lambda move: [step % 3 for step in move])
+    return np.array(moves, np.int64)
+
+
+class _Search:
+    """What both searches share: the graph, the table of nodes, and the path along it."""
+
+    def __init__(
+        self,
+        checker: CollisionChecker,
+        start: Float[ndarray, "dof"],
+        goals: Float[ndarray, "k dof"],
+        settings: LatticeSettings,
+        padding: float,
+        incremental: bool,
+    ) -> None:
+        self.checker, self.settings, self.padding = checker, settings, padding
+        self.goals = goals
+        self._graph = _make_graph(checker.robot, start, goals, settings)
+        self._expansions = max(SLICE // len(self._graph.lattice.moves), 1)
+        self._table = table.make_table(self._graph.lattice, settings.max_nodes, incremental)
+        self._space = search_space(checker, settings.resolution, padding)
+
+    @property
+    def expansions(self) -> int:
+        """Nodes expanded so far; one that is expanded again counts again."""
+        return int(self._table.count[table.EXPANSIONS])
+
+    @property
+    def nodes(self) -> int:
+        """Nodes in memory."""
+        return int(self._table.count[table.NODES]) - 1
+
+    def _radians(self, units: int) -> float:
+        return float("inf") if units >= table.INFINITE else units * self.settings.spacing / UNITS
+
+    def _waypoints(self, keys: Int[ndarray, "n"]) -> Float[ndarray, "m dof"]:
+        """The nodes at which the path turns, and the goal."""
+        lattice = self._graph.lattice
+        at = keys[:, None] // lattice.strides % lattice.counts
+        turns = np.ones(len(keys), np.bool_)
+        turns[1:-1] = (np.diff(at, 2, axis=0) != 0).any(axis=1)
+        goal = self.goals[self._table.count[table.GOAL]].astype(np.float64)
+        return np.concatenate([self._graph.configurations(keys[turns]), goal[None]])
+
+
+class AStarSearch(_Search):
+    """One search from the start. `start` and at least one of the goals should be free of collision."""
+
+    def __init__(
+        self,
+        checker: CollisionChecker,
+        start: Float[ndarray, "dof"],
+        goals: Float[ndarray, "k dof"],
+        settings: AStarSettings,
+        padding: float = 0.0,
+    ) -> None:
+        """`padding` [m] is a distance to obstacles that is kept."""
+        super().__init__(checker, start, goals, settings, padding, incremental=False)
+        self._inflation = float(settings.inflation)
+        kernel.begin_a_star(self._graph.lattice, self._table, self._graph.start_key, self._inflation)
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
+        """Search on until there is a path, none, no more room, or `stop` says so."""
+        while True:
+            code = kernel.a_star(
+                self._space, self._graph.lattice, self._table, self._inflation, self._expansions
+            )
+            if code != kernel.GOING or stop():
+                return Outcome(code)
+
+    @property
+    def cost(self) -> float:
+        """Length of the best path so far [rad]; infinite if there is none."""
+        return self._radians(int(self._table.g[table.AT_GOAL]))
+
+    def path(self) -> Float[ndarray, "n dof"] | None:
+        """Waypoints from the start to a goal; None if there is none yet."""
+        node = int(self._table.parent[table.AT_GOAL])
+        if self._table.g[table.AT_GOAL] >= table.INFINITE:
+            return None
+        keys = []
+        while node >= 0:
+            keys.append(self._table.keys[node])
+            node = int(self._table.parent[node])
+        return self._waypoints(np.array(keys[::-1]))
+
+
+class DStarLiteSearch(_Search):
+    """A search from the goals that can be repaired when obstacles move and when the arm does."""
+
+    def __init__(
+        self,
+        checker: CollisionChecker,
+        start: Float[ndarray, "dof"],
+        goals: Float[ndarray, "k dof"],
+        settings: DStarLiteSettings,
+        padding: float = 0.0,
+    ) -> None:
+        """`padding` [m] is a distance to obstacles that is kept. Memory for 2^dof edges to each goal."""
+        super().__init__(checker, start, goals, settings, padding, incremental=True)
+        self._last = np.zeros((len(goals), 2 ** len(start)), np.uint8)
+        moves = np.abs(self._graph.lattice.moves[: len(self._graph.lattice.moves) // 2])
+        self._reaches = (0.5 * settings.spacing * moves @ levers(checker.robot)).astype(np.float32)
+        """How far any point of the arm gets by half of each move [m]."""
+        self._offset = 0
+        self._start = int(table.find_or_add(self._table, self._graph.start_key))
+        self._has_room = self._update(np.full(len(self._table.keys), np.inf, np.float32))
+
+    def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
+        """Search on until there is a path, none, no more room, or `stop` says so."""
+        if self._table.state[self._start] == table.BLOCKED:
+            return Outcome.EXHAUSTED
+        if not self._has_room:
+            return Outcome.FULL
+        while True:
+            code = kernel.d_star_lite(
+                self._space,
+                self._graph.lattice,
+                self._table,
+                self._last,
+                self._start,
+                self._offset,
+                self._expansions,
+            )
+            if code != kernel.GOING or stop():
+                return Outcome(code)
+
+    @property
+    def cost(self) -> float:
+        """Length of the path that `run` found [rad]; infinite if it found none."""
+        return self._radians(int(self._table.rhs[self._start]))
+
+    def path(self) -> Float[ndarray, "n dof"] | None:
+        """Waypoints from the start to a goal, after `run` came back with FOUND; None if there are none."""
+        if self._table.rhs[self._start] >= table.INFINITE:
+            return None
+        return self._waypoints(kernel.path_from(self._graph.lattice, self._table, self._last, self._start))
+
+    def update(self, checker: CollisionChecker, start: Float[ndarray, "dof"] | None = None) -> None:
+        """The scene changed, and the arm may stand at another node of the lattice; `run` then repairs.
+
+        Shapes that are the same objects in both scenes are taken to be unchanged. Only nodes and known edges
+        that are within reach of the others are checked again. Raises InputError for another robot or a start
+        that is no node.
+        """
+        if checker.robot is not self.checker.robot:
+            raise InputError(
+                f"checker is of the robot {checker.robot.name}; it must be of the one that the search began "
+                f"with, {self.checker.robot.name}"
+            )
+        if start is not None:
+            self._move_start(start)
+        near = self._distances_to_changes(checker)
+        self.checker = checker
+        self._space = search_space(checker, self.settings.resolution, self.padding)
+        self._has_room = self._update(near)
+
+    def _distances_to_changes(self, checker: CollisionChecker) -> Float[ndarray, "capacity"]:
+        """How far the arm is, at each node, from all shapes that came, went or moved [m], at most."""
+        near = np.full(len(self._table.keys), np.inf, np.float32)
+        before, after = self.checker.scene.shapes, checker.scene.shapes
+        kept = {id(shape) for shape in before} & {id(shape) for shape in after}
+        moved = [shape for shape in (*before, *after) if id(shape) not in kept]
+        known = slice(1, self.nodes + 1)
+        if checker.padding != self.checker.padding:
+            near[known] = -np.inf
+        elif moved:
+            margin = float(self._space.padding) + ROUNDING
+            changes = CollisionChecker(checker.robot, Scene(moved))
+            q = self._graph.configurations(self._table.keys[known])
+            clearances = changes.link_clearances(q, limit=float(self._reaches.max()) + 2 * margin)
+            near[known] = clearances.min(axis=1, initial=np.inf) - margin
+        return near
+
+    def _move_start(self, start: Float[ndarray, "dof"]) -> None:
+        lattice = self._graph.lattice
+        at = (np.asarray(start, np.float64) - lattice.origin) / lattice.spacing
+        whole = np.round(at).astype(np.int64)
+        if np.abs(at - whole).max() > 1e-3 or (whole < 0).any() or (whole >= lattice.counts).any():
+            raise InputError(f"start is {np.round(start, 4)}; it must be a node of the lattice")
+        before = self._table.keys[self._start] // lattice.strides % lattice.counts
+        node = int(table.find_or_add(self._table, int(whole @ lattice.strides)))
+        if node < 0:
+            raise InputError(f"start is {np.round(start, 4)}; the search never saw it and has no room for it")
+        steps = np.abs(whole - before)
+        way = max(float(np.linalg.norm(steps)), float(steps.sum()) * lattice.slope)
+        # rounded up: what is queued must stay below its true key
+        self._offset += ceil(UNITS * way + lattice_graph.ROUNDING) if way else 0
+        self._start = node
+
+    def _update(self, near: Float[ndarray, "capacity"]) -> bool:
+        lattice, offset = self._graph.lattice, self._offset
+        return kernel.update(
+            self._space, lattice, self._table, self._last, self._start, offset, near, self._reaches
+        )
+
+
+class _LatticePlanner(Planner[Own]):
+    """The same path for every seed, but for the configurations of a goal pose."""
+
+    search: Callable[..., AStarSearch | DStarLiteSearch]
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        padding = ends.kept_clearance(self.settings.clearance)
+        for settings, _ in ever_finer(call, self.settings):
+            search = self.search(ends.checker, *ends.rows(), settings, padding)
+            outcome = search.run(lambda: call.remaining <= 0)
+            path = search.path() if outcome is Outcome.FOUND else None
+            if path is None:
+                status = Status.TIMEOUT if outcome is Outcome.GOING else Status.NO_PATH
+                return call.fail(status, _reason(outcome, settings, search))
+            done = f"solved by {call.planner}: {search.expansions} expansions"
+            result = call.finish(ends.complete(path), call.planner, reason=done)
+            if result is not None:
+                return result
+            if settings.resolution <= FINEST:
+                break
+        return call.unsolved("the judge refused every path that was found; a larger clearance may help")
+
+
+class AStar(_LatticePlanner[AStarSettings]):
+    """Weighted A* on a lattice."""
+
+    name, settings_class, search = "a_star", AStarSettings, AStarSearch
+
+
+class DStarLite(_LatticePlanner[DStarLiteSettings]):
+    """D* Lite on a lattice, for one problem; `DStarLiteSearch` is what can be repaired."""
+
+    name, settings_class, search = "d_star_lite", DStarLiteSettings, DStarLiteSearch
+
+
+def _reason(outcome: Outcome, settings: LatticeSettings, search: AStarSearch | DStarLiteSearch) -> str:
+    spacing = f"{settings.settings_name}.spacing (now {settings.spacing:g} rad)"
+    if outcome is Outcome.FULL:
+        return (
+            f"memory is full: {search.nodes} nodes after {search.expansions} expansions; take a coarser "
+            f"{spacing} or a larger {settings.settings_name}.max_nodes"
+        )
+    if outcome is Outcome.EXHAUSTED:
+        return f"there is no path on the lattice; a finer {spacing} may have one"
+    return f"time ran out after {search.expansions} expansions; a coarser {spacing} searches faster"

@@ -1,0 +1,165 @@
+"""MPiNets: motions that a policy makes step by step (A. Fishman et al., "Motion Policy Networks", CoRL 2022).
+
+The policy (`learning.networks.mpinets`) sees points of the scene, of the arm and of the goal, and is rolled
+out from the start, at most 150 steps, the paper's number. The first roll-out is the paper's planner: one
+cloud, no noise, nothing repeated. While there is time, others follow with new clouds and noise.
+
+Differences from the paper, besides those of the network:
+
+- The paper ends a roll-out within 1 cm and 15 degrees of the target pose. A goal here is a configuration to
+  be met to 1e-4 rad: near it, a straight edge leads there if the compiled check calls it free; else the
+  policy goes on. For a pose the goals are configurations by inverse kinematics.
+- The paper has one roll-out. The repetitions, which cost its success nothing, use the time that all planners
+  have. They are spread over the goals, the nearest first, and end where the arm collides.
+- Nothing is repaired or shortened. A motion that the judge refuses is not a result; where nothing better was
+  found, the first one is handed to it, so that the result says what was wrong.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from numpy import ndarray
+from torch import Tensor
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import Space, motions_free
+from robotdiffuse.collision.motions import search_space
+from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, RollOuts
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.scenes.surface_points import sample_surface
+from robotdiffuse.core.settings import Count, NotNegative, Positive
+
+STILL = 1e-4
+"""The policy stands still where no joint moves further in a step [rad]; it would for ever."""
+
+
+@dataclass(frozen=True)
+class MPiNetsSettings(LearnedSettings, name="mpinets"):
+    steps: Count = 150
+    """Most steps of a roll-out (the paper's)."""
+    near: NotNegative = 0.3
+    """Largest distance of a joint at which a straight edge to the goal is tried [rad]."""
+    batch: Count = 8
+    """Roll-outs at once, after the first, which is alone."""
+    noise: NotNegative = 0.015
+    """Standard deviation of the noise on where the policy sees the arm, as in training [rad]; none in the
+    first roll-out."""
+    resolution: Positive = 0.02
+    """No point of the arm moves further than this between two checks [m]."""
+
+
+class MPiNets(LearnedPlanner[MPiNetsSettings]):
+    """The policy's roll-outs as a planner; see the head of this file."""
+
+    name = network_name = "mpinets"
+    settings_class = MPiNetsSettings
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        network, rng = self.network(call.problem.robot), call.rng
+        best: _Motion | None = None
+        tried = 0
+        while best is None or call.remaining > 0:
+            count = self.settings.batch if tried else 1
+            for motion in self._roll_outs(call, network, ends, tried, count, rng):
+                if motion.free:
+                    result = call.finish(motion.path(ends), "policy")
+                    if result is not None:
+                        return result
+                if best is None or motion.arrived > best.arrived:
+                    best = motion
+            tried += count
+        # the judge looks at the meshes, which the covering spheres stick out of: it may be good after all
+        result = call.finish(best.path(ends), "policy")
+        if result is not None:
+            return result
+        what = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
+        return call.unsolved(f"{tried} roll-outs of the policy, the best of which {what}")
+
+    def _roll_outs(
+        self,
+        call: Call,
+        network: MPiNetsNetwork,
+        ends: Ends,
+        tried: int,
+        count: int,
+        rng: np.random.Generator,
+    ) -> "list[_Motion]":
+        """So many roll-outs, or what there is of them when one is free all the way or time runs out.
+
+        `tried` were tried before; the very first goes on even if it collides.
+        """
+        settings, first = self.settings, tried == 0
+        space = search_space(ends.checker, settings.resolution)
+        start, goals = ends.rows()
+        order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")
+        goal = goals[order[np.arange(tried, tried + count) % len(order)]]
+        clouds = scene_clouds(network, ends.checker, count, rng)
+        roll_outs = RollOuts(network, clouds, np.repeat(start[None], count, 0), goal)
+        motions = [_Motion(start, end) for end in goal]
+        for step in range(settings.steps + 1):
+            near = roll_outs.running & (roll_outs.distances() < settings.near)
+            for i in np.flatnonzero(near).tolist():
+                motions[i].try_to_arrive(space)
+            if any(motion.free for motion in motions):
+                break
+            roll_outs.stop(
+                np.array([motion.arrived or (motion.collided and not first) for motion in motions])
+            )
+            if step == settings.steps or not roll_outs.running.any() or call.remaining <= 0:
+                break
+            noise = settings.noise * rng.standard_normal(goal.shape, dtype=np.float32)
+            roll_outs.advance(None if first else noise)
+            for i in np.flatnonzero(roll_outs.running).tolist():
+                motions[i].go(space, roll_outs.waypoints[-1][i])
+            roll_outs.stop(np.abs(roll_outs.waypoints[-1] - roll_outs.waypoints[-2]).max(1) < STILL)
+        return motions
+
+
+class _Motion:
+    """What a roll-out has made so far."""
+
+    def __init__(self, start: Float32[ndarray, "dof"], goal: Float32[ndarray, "dof"]) -> None:
+        self.waypoints, self.goal = [start], goal
+        self.collided = self.arrived = False
+
+    @property
+    def free(self) -> bool:
+        """Whether it reaches the goal free of collision by the compiled check."""
+        return self.arrived and not self.collided
+
+    def go(self, space: Space, q: Float32[ndarray, "dof"]) -> None:
+        self.collided |= not motions_free(space, np.stack([self.waypoints[-1], q]))[0]
+        self.waypoints.append(q)
+
+    def try_to_arrive(self, space: Space) -> None:
+        """Go straight to the goal if that is free."""
+        if motions_free(space, np.stack([self.waypoints[-1], self.goal]))[0]:
+            self.waypoints.append(self.goal)
+            self.arrived = True
+
+    def path(self, ends: Ends) -> Float[ndarray, "n dof"]:
+        """Its waypoints, with the exact ends of the problem as far as it has reached them."""
+        if self.arrived:
+            return ends.complete(np.stack(self.waypoints))
+        return np.concatenate(
+            [ends.start[None], np.stack(self.waypoints[1:] or self.waypoints).astype(np.float64)]
+        )
+
+
+def scene_clouds(
+    network: MPiNetsNetwork, checker: CollisionChecker, count: int, rng: np.random.Generator
+) -> Float32[Tensor, "count points 3"]:
+    """Random clouds of the scene as the network wants them [m]; zeros where nothing is in reach."""
+    points, region = network.settings.scene_points, network.settings.region
+    clouds = np.zeros((count, points, 3), np.float32)
+    for cloud in clouds:
+        found = sample_surface(checker.scene, points, rng, region)
+        if len(found):
+            cloud[:] = found
+    return torch.from_numpy(clouds)

@@ -1,0 +1,256 @@
+"""MPNet: a network proposes states from both ends in turn, until they see each other; then what collides is
+proposed anew.
+
+A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
+Learning-based and Classical Motion Planners", T-RO 2020. The networks are in `learning.networks.mpnet`. The
+parts, by the paper's names:
+
+- *Bidirectional neural planning* (`MPNet._between`): both ends step towards each other, unchecked (the
+  states are "beacons"), until the straight line between them is free.
+- *Lazy states contraction*: states that a free straight line can skip are left out.
+- *Replanning*: states in collision are left out, and neural planning goes between each two states that do not
+  see each other, up to `replanning` times. The network's dropout makes every time another.
+- *Hybrid replanning*, if `hybrid` is on: what is still broken is left to a classical planner, RRT-Connect
+  here (paper: RRT*). It is off by default, the paper's MPNetPath:NR, so that the network is what is measured.
+
+Differences from the paper: `attempts` paths are planned at once, in one batch of the network, until one of
+them is free, and new ones are begun as long as there is time (the paper plans one). Where the network finds
+nothing between two states, the next replanning tries again, where the paper's attempt ends. Of several goals
+the attempts take each an equal share.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from torch import Generator, Tensor
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.motions import finer, search_space
+from robotdiffuse.learning.networks.mpnet import MPNetNetwork
+from robotdiffuse.trajectories.simplification import shortcut
+from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.scenes.surface_points import sample_surface
+from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
+
+SEARCH_ITERATIONS = 500
+"""Iterations of RRT-Connect between two looks at the clock, in hybrid replanning."""
+SEARCH_CAPACITY = 20_000
+
+
+@dataclass(frozen=True)
+class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
+    attempts: Count = 16
+    """Paths that are planned at once (paper: 1)."""
+    steps: Count = 24
+    """Most steps of bidirectional neural planning between two states; a step is 0.7 rad."""
+    replanning: Natural = 10
+    """N_r, how often what collides is planned anew before the attempts are given up."""
+    hybrid: bool = False
+    """Whether RRT-Connect joins what the network has left broken."""
+    hybrid_range: Positive = 1.0
+    """Longest extension of a tree of RRT-Connect [rad, joint-space L2]."""
+    resolution: Positive = 0.03
+    """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
+    covers the rest, and after a path that it refuses it is half of that."""
+    clearance: NotNegative = 0.002
+    """Distance to obstacles that paths keep where start and goal allow it [m]."""
+
+
+class MPNet(LearnedPlanner[MPNetPlannerSettings]):
+    """Motion Planning Networks as a planner."""
+
+    name = network_name = "mpnet"
+    settings_class = MPNetPlannerSettings
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        network, settings, best, rounds = self.network(call.problem.robot), self.settings, Attempt.none(), 0
+        while rounds == 0 or call.remaining > 0:
+            one = NeuralPlanning(call, ends, network, settings, call.rng)
+            found = one.best()
+            rounds += 1
+            if found.broken == 0:
+                result = call.finish(ends.complete(found.path), self.name, one.reason(rounds))
+                if result is not None:
+                    return result
+                settings = replace(settings, resolution=finer(settings.resolution))
+            elif found.broken < best.broken:
+                best = found
+        if len(best.path):
+            result = call.finish(ends.complete(best.path), self.name)
+            if result is not None:
+                return result
+        return call.unsolved(
+            f"no path of the network was free in {call.elapsed:.2f} s and {rounds} rounds of "
+            f"{settings.attempts} attempts; a longer time limit or hybrid replanning may find one"
+        )
+
+
+@dataclass(frozen=True)
+class Attempt:
+    path: Float[ndarray, "n dof"]
+    """[rad]"""
+    broken: float
+    """Segments in collision; infinite if there is no path."""
+
+    @classmethod
+    def none(cls) -> "Attempt":
+        return cls(np.zeros((0, 0), np.float32), np.inf)
+
+
+class NeuralPlanning:
+    """One round of attempts."""
+
+    def __init__(
+        self,
+        call: Call,
+        ends: Ends,
+        network: MPNetNetwork,
+        settings: MPNetPlannerSettings,
+        rng: np.random.Generator,
+    ) -> None:
+        self.call, self.network, self.settings = call, network, settings
+        self.space = search_space(ends.checker, settings.resolution, ends.kept_clearance(settings.clearance))
+        self.generator = Generator().manual_seed(int(rng.integers(2**63)))
+        self.state = random_state(int(rng.integers(2**31)))
+        start, goals = ends.rows()
+        self.starts = np.tile(start, (settings.attempts, 1))
+        self.goals = goals[(np.arange(settings.attempts) + rng.integers(len(goals))) % len(goals)]
+        self.z = scene_code(network, ends.checker, rng)
+        self.replanned = 0
+        """How often what collides was planned anew."""
+        self.searched = False
+        """Whether RRT-Connect was asked."""
+
+    def best(self) -> Attempt:
+        """The shortest path that is free, or the one with the fewest segments in collision."""
+        paths = [self.contracted(path) for path in self.between(self.starts, self.goals, True)]
+        free = [self.segments_free(path) for path in paths]
+        while not any(f.all() for f in free):
+            if self.replanned == self.settings.replanning or self.call.remaining <= 0:
+                break
+            self.replanned += 1
+            paths = [self.contracted(path) for path in self.replan(paths)]
+            free = [self.segments_free(path) for path in paths]
+        if self.settings.hybrid and not any(f.all() for f in free):
+            least = int(np.argmin([(~f).sum() for f in free]))
+            paths = [self.contracted(self.search(paths[least]))]
+            free = [self.segments_free(paths[0])]
+        attempts = [Attempt(path, float((~f).sum())) for path, f in zip(paths, free, strict=True)]
+        return min(attempts, key=lambda a: (a.broken, float(path_length(a.path))))
+
+    def reason(self, rounds: int) -> str:
+        how = " and RRT-Connect" if self.searched else ""
+        return (
+            f"solved by {MPNet.name}: round {rounds}, after {self.replanned} times of neural replanning{how}"
+        )
+
+    def between(
+        self, starts: Float[ndarray, "n dof"], goals: Float[ndarray, "n dof"], one_will_do: bool = False
+    ) -> list[Float[ndarray, "_ dof"]]:
+        """Bidirectional neural planning of many motions at once.
+
+        one_will_do: ends as soon as one of them is free. Those whose ends have not come to see each other
+        have a segment in collision, and so may others, whose states lie in obstacles.
+        """
+        forth, back = [[q] for q in starts], [[q] for q in goals]
+        near, far, apart = forth, back, list(range(len(starts)))
+        for _ in range(self.settings.steps):
+            if not apart or self.call.remaining <= 0:
+                break
+            q, goal = (np.stack([rows[i][-1] for i in apart]) for rows in (near, far))
+            for i, state in zip(apart, self.next_states(q, goal), strict=True):
+                near[i].append(state)
+            met = [i for i in apart if self.segments_free(np.stack([near[i][-1], far[i][-1]]))[0]]
+            if one_will_do and any(self.segments_free(_joined(forth[i], back[i])).all() for i in met):
+                break
+            apart = [i for i in apart if i not in met]
+            near, far = far, near
+        return [_joined(*rows) for rows in zip(forth, back, strict=True)]
+
+    def replan(self, paths: list[Float[ndarray, "_ dof"]]) -> list[Float[ndarray, "_ dof"]]:
+        """The paths without their states in collision, with new states between those that do not see each
+        other."""
+        kept = [self.without_collisions(path) for path in paths]
+        broken = [
+            (a, int(i)) for a, path in enumerate(kept) for i in np.flatnonzero(~self.segments_free(path))
+        ]
+        if not broken:
+            return kept
+        starts, goals = (np.stack([kept[a][i + end] for a, i in broken]) for end in (0, 1))
+        found = dict(zip(broken, self.between(starts, goals), strict=True))
+        return [
+            np.concatenate(
+                [path[:1]]
+                + [found[a, i][1:] if (a, i) in found else path[i + 1, None] for i in range(len(path) - 1)]
+            )
+            for a, path in enumerate(kept)
+        ]
+
+    def search(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+        """The path with RRT-Connect between the states, those in collision left out, that do not see each
+        other; as far as time allows."""
+        self.searched = True
+        path = self.without_collisions(path)
+        pieces = [path[:1]]
+        for (a, b), seen in zip(pairwise(path), self.segments_free(path), strict=True):
+            pieces.append(b[None] if seen else self.searched_between(a, b)[1:])
+        return np.concatenate(pieces)
+
+    def searched_between(self, a: Float[ndarray, "dof"], b: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
+        """A free path from a to b by RRT-Connect; the straight line if time runs out."""
+        trees = rrt_kernel.make_trees(a, b[None], SEARCH_CAPACITY)
+        while self.call.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
+            longest = np.float32(self.settings.hybrid_range)
+            path = rrt_kernel.connect(self.space, trees, longest, SEARCH_ITERATIONS, self.state)
+            if len(path):
+                return path
+        return np.stack([a, b])
+
+    def without_collisions(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+        """The path without the states, but for its ends, that are in collision."""
+        # a motion from a state to itself is that state
+        free = np.array([self.segments_free(np.stack([q, q]))[0] for q in path[1:-1]], bool)
+        return np.concatenate([path[:1], path[1:-1][free], path[-1:]])
+
+    def contracted(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
+        """Lazy states contraction: without the states that free straight lines can skip."""
+        return shortcut(self.space, path, 0, self.state)
+
+    def segments_free(self, path: Float[ndarray, "n dof"]) -> Bool[ndarray, "segments"]:
+        return motions_free(self.space, path)
+
+    def next_states(
+        self, q: Float[ndarray, "n dof"], goal: Float[ndarray, "n dof"]
+    ) -> Float[ndarray, "n dof"]:
+        """Pnet's, with its dropout."""
+        with torch.inference_mode():
+            z = self.z.expand(len(q), -1)
+            return self.network.next_states(
+                z, torch.from_numpy(q), torch.from_numpy(goal), self.generator
+            ).numpy()
+
+
+def _joined(forth: list[ndarray], back: list[ndarray]) -> Float[ndarray, "n dof"]:
+    return np.stack([*forth, *back[::-1]])
+
+
+def scene_code(
+    network: MPNetNetwork, checker: CollisionChecker, rng: np.random.Generator
+) -> Float[Tensor, "1 code"]:
+    """z of a random cloud of the scene's obstacles; of zeros where there are none."""
+    cloud = np.zeros((1, network.settings.points, 3), np.float32)
+    points = sample_surface(checker.scene, network.settings.points, rng, network.region)
+    cloud[0, : len(points)] = points
+    with torch.inference_mode():
+        return network.encode(torch.from_numpy(cloud))

@@ -1,0 +1,388 @@
+"""Planners of the Open Motion Planning Library (OMPL 2, Python bindings) over our collision kernel.
+
+I. Sucan, M. Moll and L. Kavraki, "The Open Motion Planning Library", IEEE Robotics and Automation Magazine
+2012. Every setting is OMPL's own default, read off the planner, unless `OmplSettings` says otherwise.
+
+*Collision.* States are points of a RealVectorStateSpace with the joint limits as bounds. OMPL asks Python for
+every state and every motion; those answer with the compiled kernel that `rrt_connect` searches with.
+
+*First-solution planners* (RRT, RRT-Connect, PRM) end with their first path, which OMPL's PathSimplifier then
+shortens as in its SimpleSetup and in MoveIt. *Anytime planners* (RRT*, Informed RRT*, BIT*, AORRTC) minimize
+joint-space length until time runs out, or until the path is as short as the straight line. Whenever a path is
+IMPROVEMENT shorter than the last, the judge looks at it, so that a late path that it refuses costs no plan.
+
+*Seeds.* OMPL has one source of seeds for the whole process, which is set anew for each search, so that a seed
+gives a path again as long as time does not run out (anytime planners mostly end when it does). The exception
+is PRM: a second thread looks for the path while the roadmap grows, so its path varies from run to run.
+
+*Threads.* OMPL's bindings keep Python's global lock while they search, and searches of several threads would
+mix their seeds: use processes.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision.kernels import lane_collision
+from robotdiffuse.collision.kernels.motions import Space, motions_free
+from robotdiffuse.collision.motions import finer, search_space
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning.planner import Planner, ever_finer
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.core.settings import NotNegative, Positive, Settings
+from robotdiffuse.core.types import Path
+
+try:
+    from ompl import base as ob
+    from ompl import geometric as og
+    from ompl import util as ou
+except ImportError:
+    raise InputError(
+        'planners of OMPL need its Python bindings, not installed: pip install "robotdiffuse[baselines]"'
+    ) from None
+
+IMPROVEMENT = 0.01
+"""An anytime planner stops to hand over a path when it is shorter by this share than the last."""
+OPTIMAL = 1e-4
+"""A path that is longer than the straight line by at most this share is as short as can be."""
+
+
+SAME = 1e-6
+"""Start and goal this close [rad] are one."""
+
+
+@dataclass(frozen=True)
+class OmplSettings(Settings, name="ompl"):
+    resolution: Positive = 0.05
+    """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
+    covers the rest, and after a path that it refuses the search begins anew at half the distance."""
+    clearance: NotNegative = 0.002
+    """Distance to obstacles that paths keep where start and goal allow it [m], as for rrt_connect."""
+    range: Positive | None = None
+    """Longest extension of a tree [rad, joint-space L2]; None: OMPL's own, 0.2 of the space's diameter. PRM
+    and BIT* have none."""
+    simplify: bool = True
+    """Whether OMPL's PathSimplifier shortens the path of a first-solution planner."""
+
+
+class OmplPlanner(Planner[OmplSettings]):
+    """What the planners of OMPL share; a planner is its class in ompl.geometric and a line in PLANNERS."""
+
+    settings_class = OmplSettings
+    algorithm: ClassVar[type[ob.Planner]]
+    anytime: ClassVar[bool]
+    """Whether it goes on after its first path."""
+    backwards: ClassVar[bool] = False
+    """Whether OMPL is asked for a path from the goals to the start."""
+
+    def __init__(self, settings: OmplSettings | None = None) -> None:
+        """Raises InputError for a range where the planner has none."""
+        super().__init__(settings)
+        if self.settings.range is not None and not hasattr(self.algorithm, "setRange"):
+            raise InputError(
+                f"ompl.range is {self.settings.range}; {self.name} has no range, so it must be None"
+            )
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        with _quiet():
+            return self._best(call, ends) if self.anytime else self._first(call, ends)
+
+    def _first(self, call: Call, ends: Ends) -> PlanResult:
+        for settings, attempt in ever_finer(call, self.settings):
+            search = _Search(call, ends, self, settings, attempt)
+            if not search.run():
+                return call.unsolved(search.gave_up)
+            if settings.simplify:
+                search.simplify()
+            result = call.finish(ends.complete(search.path()), self.name)
+            if result is not None:
+                return result
+        return call.unsolved()
+
+    def _best(self, call: Call, ends: Ends) -> PlanResult:
+        """The shortest path that the judge let pass until time runs out or none can be shorter."""
+        problem, settings, attempt = call.problem, self.settings, 0
+        start, goals = ends.rows()
+        nearest = float(np.linalg.norm(goals - start, axis=1).min())
+        enough = (1 + OPTIMAL) * max(nearest, SAME)
+        best, shortest, searched = None, np.inf, np.inf
+        search = _Search(call, ends, self, settings, attempt)
+        while search.run(shorter_than=max((1 - IMPROVEMENT) * searched, enough)):
+            path = Path(problem.robot.joint_names, ends.complete(search.path()))
+            searched = search.cost
+            if path.length < shortest:
+                if call.judge.path(path).valid:
+                    best, shortest = path.positions, path.length
+                    call.improved(shortest)
+                    if searched <= enough:
+                        break
+                else:
+                    settings = replace(settings, resolution=finer(settings.resolution))
+                    attempt, searched = attempt + 1, np.inf
+                    search = _Search(call, ends, self, settings, attempt)
+            if call.remaining <= 0:
+                break
+        if best is None:
+            return call.unsolved(search.gave_up)
+        return call.finish(best, self.name) or call.unsolved("the judge refused the motion along the path")
+
+
+class OmplRRT(OmplPlanner):
+    """S. LaValle and J. Kuffner, "Randomized kinodynamic planning", IJRR 2001."""
+
+    name, algorithm, anytime = "ompl_rrt", og.RRT, False
+
+
+class OmplRRTConnect(OmplPlanner):
+    """J. Kuffner and S. LaValle, "RRT-Connect: An efficient approach to single-query path planning",
+    ICRA 2000."""
+
+    name, algorithm, anytime = "ompl_rrt_connect", og.RRTConnect, False
+
+
+class OmplPRM(OmplPlanner):
+    """L. Kavraki et al., "Probabilistic roadmaps for path planning in high-dimensional configuration spaces",
+    IEEE Transactions on Robotics and Automation 1996."""
+
+    name, algorithm, anytime = "ompl_prm", og.PRM, False
+    # a second thread adds all goals but the first, and holds the roadmap's lock while it waits for Python's,
+    # which the first thread holds while it waits for the roadmap's; with a single goal it adds none
+    backwards = True
+
+
+class OmplRRTStar(OmplPlanner):
+    """S. Karaman and E. Frazzoli, "Sampling-based algorithms for optimal motion planning", IJRR 2011."""
+
+    name, algorithm, anytime = "ompl_rrt_star", og.RRTstar, True
+
+
+class OmplInformedRRTStar(OmplPlanner):
+    """J. Gammell et al., "Informed RRT*: Optimal sampling-based path planning focused via direct sampling of
+    an admissible ellipsoidal heuristic", IROS 2014."""
+
+    name, algorithm, anytime = "ompl_informed_rrt_star", og.InformedRRTstar, True
+
+
+class OmplBITStar(OmplPlanner):
+    """J. Gammell et al., "Batch informed trees (BIT*)", IJRR 2020."""
+
+    name, algorithm, anytime = "ompl_bit_star", og.BITstar, True
+
+
+class OmplAORRTC(OmplPlanner):
+    """T. Wilson et al., "AORRTC: Almost-surely asymptotically optimal planning with RRT-Connect",
+    IEEE Robotics and Automation Letters 2025."""
+
+    name, algorithm, anytime = "ompl_aorrtc", og.AORRTC, True
+
+
+class _Watch:
+    """Ends a search by OMPL, and keeps what Python raised below it: no exception passes through C++."""
+
+    def __init__(self, call: Call) -> None:
+        self.call = call
+        self._error: BaseException | None = None
+        self._condition: ob.PlannerTerminationCondition | None = None
+        self._planner: Any = None
+        self._shorter_than = np.inf
+
+    @contextmanager
+    def until_time_is_over(self) -> Iterator[ob.PlannerTerminationCondition]:
+        """Raises after it what was caught within it."""
+        # not a condition in Python: PRM's second thread would wait forever for the lock that the first holds
+        yield from self._while(ob.timedPlannerTerminationCondition(max(self.call.remaining, 0.0)))
+
+    @contextmanager
+    def until_shorter(self, planner: Any, than: float) -> Iterator[ob.PlannerTerminationCondition]:
+        """The same, but also until the planner has a path shorter than this [rad]."""
+        self._planner, self._shorter_than = planner, than
+        yield from self._while(ob.PlannerTerminationCondition(self._is_over))
+
+    def caught(self, error: BaseException) -> None:
+        self._error = self._error or error
+        if self._condition is not None:
+            self._condition.terminate()
+
+    def raise_caught(self) -> None:
+        """Raise it, and forget it: its traceback knows the validators."""
+        error, self._error = self._error, None
+        try:
+            if error is not None:
+                raise error
+        finally:
+            del error
+
+    def _while(self, condition: ob.PlannerTerminationCondition) -> Iterator[ob.PlannerTerminationCondition]:
+        self._condition = condition
+        try:
+            yield condition
+        finally:
+            # AORRTC keeps the condition, which knows the planner: a cycle that no garbage collector sees
+            self._condition = self._planner = None
+        self.raise_caught()
+
+    def _is_over(self) -> bool:
+        try:
+            return self.call.remaining <= 0 or self._planner.bestCost().value() < self._shorter_than
+        except BaseException as error:
+            self.caught(error)
+            return True
+
+
+class _States(ob.StateValidityChecker):
+    """Single states."""
+
+    def __init__(self, information: ob.SpaceInformation, space: Space, watch: _Watch) -> None:
+        super().__init__(information)
+        self._space, self._watch = space, watch
+        self._joints = slice(0, len(space.lower))
+        self._q = np.empty((1, len(space.lower)), np.float32)
+
+    def isValid(self, state: ob.RealVectorStateType) -> bool:
+        try:
+            space, self._q[0] = self._space, state[self._joints]
+            return bool(lane_collision.free_many(space.robot, space.scene, self._q, space.padding)[0])
+        except BaseException as error:
+            self._watch.caught(error)
+            return False
+
+
+class _Motions(ob.MotionValidator):
+    """Straight motions: the end is checked and the way, not the start, which OMPL knows to be free."""
+
+    def __init__(self, information: ob.SpaceInformation, space: Space, watch: _Watch) -> None:
+        super().__init__(information)
+        self._space, self._watch = space, watch
+        self._joints = slice(0, len(space.lower))
+        self._line = np.empty((2, len(space.lower)), np.float32)
+
+    def checkMotion(self, a: ob.RealVectorStateType, b: ob.RealVectorStateType) -> bool:
+        line = self._line
+        try:
+            line[0], line[1] = a[self._joints], b[self._joints]
+            return bool(motions_free(self._space, line)[0])
+        except BaseException as error:
+            self._watch.caught(error)
+            return False
+
+
+class _Search:
+    """One search by OMPL; it can be continued. Paths are not yet judged."""
+
+    def __init__(
+        self, call: Call, ends: Ends, planner: OmplPlanner, settings: OmplSettings, attempt: int
+    ) -> None:
+        # OMPL hands a seed from this source to each generator that it makes from here on; 0 is none
+        ou.RNG.setSeed(int(np.random.SeedSequence([call.seed, attempt]).generate_state(1)[0]) or 1)
+        self._call, self._robot = call, call.problem.robot
+        self._watch = _Watch(call)
+        space = search_space(ends.checker, settings.resolution, ends.kept_clearance(settings.clearance))
+        # Python keeps what C++ refers to, until the search is over
+        self._states = _state_space(self._robot)
+        self._information = ob.SpaceInformation(self._states)
+        self._validity = _States(self._information, space, self._watch)
+        self._motions = _Motions(self._information, space, self._watch)
+        self._information.setStateValidityChecker(self._validity)
+        self._information.setMotionValidator(self._motions)
+        self._information.setup()
+        start, goals = ends.rows()
+        self._backwards = planner.backwards
+        first, last = (goals, start[None]) if self._backwards else (start[None], goals)
+        self._goals = ob.GoalStates(self._information)
+        for q in last:
+            self._goals.addState(self._state(q))
+        self._definition = ob.ProblemDefinition(self._information)
+        for q in first:
+            self._definition.addStartState(self._state(q))
+        self._definition.setGoal(self._goals)
+        if planner.anytime:
+            # others would take an objective as a reason to go on after their first path
+            self._definition.setOptimizationObjective(ob.PathLengthOptimizationObjective(self._information))
+        self._anytime = planner.anytime
+        # bestCost, setRange and the constructor are of no class that algorithms share
+        algorithm: Any = planner.algorithm
+        self._planner: Any = algorithm(self._information)
+        if settings.range is not None:
+            self._planner.setRange(settings.range)
+        self._planner.setProblemDefinition(self._definition)
+        # BIT* asks for the validity of start and goals here
+        self._planner.setup()
+        self._watch.raise_caught()
+        self._status = ""
+
+    @property
+    def cost(self) -> float:
+        """The length of the path [rad, joint-space L2]."""
+        return float(self._solution().length())
+
+    @property
+    def gave_up(self) -> str:
+        """Why there is no path, if OMPL ended before time did; else ""."""
+        return f"OMPL ended without a path: {self._status}" if self._call.remaining > 0 else ""
+
+    def run(self, shorter_than: float = np.inf) -> bool:
+        """Search for a path, anytime planners for one shorter than this [rad], until time runs out.
+
+        Returns whether there is a path, which may be as long as before. What a validator
+        raised is raised here.
+        """
+        watch = self._watch
+        until = (
+            watch.until_shorter(self._planner, shorter_than) if self._anytime else watch.until_time_is_over()
+        )
+        with until as condition:
+            self._status = self._planner.solve(condition).asString()
+        return self._definition.hasExactSolution()
+
+    def simplify(self) -> None:
+        """Shorten the path as OMPL does, within the time that is left."""
+        with self._watch.until_time_is_over() as condition:
+            og.PathSimplifier(self._information, self._goals).simplify(self._solution(), condition)
+
+    def path(self) -> Float[ndarray, "n dof"]:
+        """Waypoints of the shortest path."""
+        states: Any = self._solution().getStates()
+        rows = np.array([state[0 : self._robot.dof] for state in states])
+        return rows[::-1] if self._backwards else rows
+
+    def _solution(self) -> og.PathGeometric:
+        solution = self._definition.getSolutionPath()
+        assert isinstance(solution, og.PathGeometric)
+        return solution
+
+    def _state(self, q: Float[ndarray, "dof"]) -> ob.RealVectorStateType:
+        state = self._information.allocState()
+        assert isinstance(state, ob.RealVectorStateType)
+        # float32 may lie beyond a limit by rounding, which OMPL would refuse
+        for joint, value in enumerate(np.clip(q.astype(np.float64), self._robot.lower, self._robot.upper)):
+            state[joint] = float(value)
+        return state
+
+
+def _state_space(robot: Robot) -> ob.RealVectorStateSpace:
+    states, bounds = ob.RealVectorStateSpace(robot.dof), ob.RealVectorBounds(robot.dof)
+    for joint in range(robot.dof):
+        bounds.setLow(joint, float(robot.lower[joint]))
+        bounds.setHigh(joint, float(robot.upper[joint]))
+    states.setBounds(bounds)
+    return states
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """OMPL prints to the console, among others that setting a seed again is of no use."""
+    level = ou.getLogLevel()
+    ou.setLogLevel(ou.LogLevel.LOG_NONE)
+    try:
+        yield
+    finally:
+        ou.setLogLevel(level)

@@ -1,0 +1,70 @@
+"""What the hybrid's batches propose for a problem, before anything is searched or chosen: to be looked at."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.start_goal import usable_ends
+from robotdiffuse.planning.learned import nearest_goals
+from robotdiffuse.planning.diffusion.hybrid import WAYPOINTS, RobotDiffuse
+from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.core.results import PlanResult
+
+TIME = 1.0
+"""Limit for finding configurations of the goal [s]."""
+BETWEEN = 4
+"""Clearances are measured so many times from one waypoint to the next."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """A batch."""
+
+    source: str
+    """"network", or "smooth_noise" for an arm without weights."""
+    positions: Float[ndarray, "count waypoints dof"]
+    clearances: Float[ndarray, "count"]
+    """Least signed distance of the covering spheres to the obstacles along each, sampled [m], at most 1 m;
+    negative where they touch, which the meshes within need not."""
+
+
+def draw_candidates(problem: Problem, seed: int = 0) -> Candidates:
+    """A batch as `robotdiffuse` draws it at its turn.
+
+    Raises InputError where start or goal leave nothing to draw.
+    """
+    planner = _planner()
+    model = planner.model(problem.robot)
+    call = Call(planner.name, problem, TIME, seed)
+    ends = usable_ends(call)
+    if isinstance(ends, PlanResult):
+        raise InputError(f"nothing can be drawn: {ends.reason}")
+    start, goals = ends.rows()
+    if model is None:
+        goals = nearest_goals(start, goals, planner.settings.samples)
+        q = smooth_noise(start, goals, planner.settings.samples, WAYPOINTS, problem.robot, call.rng)
+        q = planner.refine(ends.checker, q)
+    else:
+        code = planner.code(model, ends.checker, call.rng)
+        q = planner.draw(model, ends.checker, code, start, goals, call.rng)
+    count, waypoints, dof = q.shape
+    at = np.linspace(0, waypoints - 1, BETWEEN * (waypoints - 1) + 1)
+    low = np.minimum(at.astype(int), waypoints - 2)
+    share = (at - low)[:, None]
+    dense = (1 - share) * q[:, low] + share * q[:, low + 1]
+    distances = ends.checker.link_clearances(dense.reshape(-1, dof)).reshape(count, -1)
+    source = "smooth_noise" if model is None else "network"
+    return Candidates(
+        source, np.asarray(q, np.float64), distances.min(axis=1, initial=1.0).astype(np.float64)
+    )
+
+
+@cache
+def _planner() -> RobotDiffuse:
+    return RobotDiffuse()

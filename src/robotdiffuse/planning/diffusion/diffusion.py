@@ -1,0 +1,208 @@
+"""The paper's method and nothing else: encoder, sampling, guidance.
+
+The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
+collision guidance; every sample goes to the judge as it is, and the shortest valid one is the answer. Where
+none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line, no
+search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance solve.
+Around it, `planning.diffusion.hybrid` puts what makes a motion dependable.
+
+Path constraints are a further cost of guidance, and each waypoint of a sample is projected onto them before
+the judge, who proves them between the waypoints too, is asked. The network has never seen any.
+
+Unless the settings say otherwise, the weights are used with the sampler and the steps that they name, and
+without guidance this is the network alone: `guidance_steps` 0.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.learning.costs.cost import Cost
+from robotdiffuse.learning.costs.path_constraints import path_constraints
+from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
+from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.planning.planner import CONSTRAINTS
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.search.constrained import SHARE, corner_kept
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
+from robotdiffuse.problems.compiled_constraints import PathConstraints
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.surface_points import sample_surface
+from robotdiffuse.core.settings import Count, Natural, NotNegative, OneOf, Share
+from robotdiffuse.core.types import Path
+
+if TYPE_CHECKING:
+    from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
+
+
+@dataclass(frozen=True)
+class SamplingSettings(LearnedSettings):
+    """How batches of trajectories are drawn from a trained model."""
+
+    samples: Count = 16
+    """Trajectories per batch."""
+    sampling_steps: Count | None = None
+    """Calls of the denoiser per batch; None: as many as the weights name."""
+    sampler: Annotated[str, OneOf(SAMPLERS)] | None = None
+    """Name in `learning.samplers.SAMPLERS`; None: the one that the weights name."""
+    eta: Share = 0.0
+    """Fresh noise per denoising step: 0 is DDIM, 1 is ancestral sampling."""
+    guidance_steps: Natural = 8
+    """Gradient steps at each guided denoising step."""
+    guided_share: Share = 0.5
+    """Share of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
+    points: Count = 320
+    """Points of the cloud that the encoder sees (paper: 1,400), unless it wants clouds of its own size."""
+    guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
+
+
+@dataclass(frozen=True)
+class DiffusionSettings(SamplingSettings, name="diffusion"):
+    guidance_scale: float = 1.0
+    """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further,
+    0 hides it. Other than 1 needs weights that were trained with a condition_drop above 0."""
+    optimize_time: NotNegative = 0.0
+    """Time in which further batches are drawn after the first that has a valid sample [s]; the shortest of
+    all is the answer."""
+
+
+Own = TypeVar("Own", bound=SamplingSettings)
+
+
+class ModelSampler(LearnedPlanner[Own]):
+    """What planners around the diffusion model share: to load it, and to draw batches by the settings."""
+
+    network_name = "model"
+
+    def model(self, robot: Robot) -> "MotionModel | None":
+        """The model for a robot; None if none comes with the package.
+
+        Raises InputError if the settings name weights of another robot, or ones that cannot be read.
+        """
+        if self.settings.weights is None and weights_for("model", robot) is None:
+            return None
+        return self.network(robot)
+
+    def draw(
+        self,
+        model: "MotionModel",
+        checker: CollisionChecker,
+        code: Float[ndarray, "code"] | None,
+        start: Float[ndarray, "dof"],
+        goals: Float[ndarray, "k dof"],
+        rng: np.random.Generator,
+        clearances: "ClearanceFn | None" = None,
+        of_problem: Mapping[str, Cost] = MappingProxyType({}),
+        guidance_scale: float = 1.0,
+    ) -> Float[ndarray, "count waypoints dof"]:
+        """A batch of samples under guidance, shared out among the nearest goals.
+
+        code: as by `encode`; None: hidden, as all of the condition, from weights that can do without it.
+        clearances: what the model is told of the obstacles; None: what is true.
+        guidance_scale: of classifier-free guidance, see `MotionModel.denoise_guided`.
+        of_problem: as for `CollisionGuidance`.
+        """
+        from robotdiffuse.learning.clearance_features import link_clearances
+
+        settings = self.settings
+        guidance = CollisionGuidance(checker, settings.guidance, of_problem)
+        goals = nearest_goals(start, goals, settings.samples)
+        counts = [len(part) for part in np.array_split(np.arange(settings.samples), len(goals))]
+        clearances = clearances or link_clearances(checker, model.settings)
+
+        def guide(q: ndarray, _level: float) -> ndarray:
+            return guidance(q, settings.guidance_steps)[0]
+
+        parts = [
+            model.sample(
+                code,
+                start,
+                goal,
+                count,
+                rng,
+                clearances,
+                settings.sampling_steps,
+                guide if settings.guidance_steps else None,
+                settings.eta,
+                guidance_scale,
+                settings.sampler,
+                settings.guided_share,
+            )
+            for goal, count in zip(goals, counts, strict=True)
+        ]
+        return np.concatenate(parts)
+
+
+def encode(
+    model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
+) -> Float[ndarray, "code"]:
+    """z of a scene: its point cloud through the frozen encoder; of so many points, unless the encoder wants
+    clouds of its own size."""
+    assert model.encoder is not None  # a prior is no network of these planners
+    told = model.encoder.settings
+    count = points if model.encoder.any_size else told.cloud
+    return model.encode(sample_surface(checker.scene, count, rng, told.region), rng)
+
+
+def _projected(
+    constraints: PathConstraints, path: Float[ndarray, "waypoints dof"]
+) -> Float[ndarray, "waypoints dof"]:
+    """The path with all waypoints between its ends on what the constraints leave; as it is, for the judge to
+    refuse, where one of them leads nowhere."""
+    between = constraints.projected(path[1:-1], SHARE)
+    return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
+
+
+class Diffusion(ModelSampler[DiffusionSettings]):
+    """The paper's method as a planner; see the head of this file."""
+
+    name = "diffusion"
+    settings_class = DiffusionSettings
+    keeps = frozenset({CONSTRAINTS})
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        model, rng = self.network(call.problem.robot), call.rng
+        start, goals = ends.rows()
+        code = encode(model, ends.checker, self.settings.points, rng)
+        names, constraints = call.problem.robot.joint_names, call.judge.constraints
+        costs = {} if constraints is None else {"path_constraints": path_constraints(constraints, SHARE)}
+        every, valid, until = list[Path](), list[Path](), call.time_limit
+        while not every or call.elapsed < until:
+            batch = self.draw(
+                model,
+                ends.checker,
+                code,
+                start,
+                goals,
+                rng,
+                of_problem=costs,
+                guidance_scale=self.settings.guidance_scale,
+            )
+            if constraints is not None:
+                batch = [_projected(constraints, q) for q in batch]
+            paths = [Path(names, ends.complete(q)) for q in batch]
+            passed = [path for path in paths if call.judge.path(path).valid]
+            for path in passed:
+                call.improved(path.length)
+            if passed and not valid:
+                until = min(call.elapsed + self.settings.optimize_time, call.time_limit)
+            every, valid = every + paths, valid + passed
+        reason = f"{len(valid)} of {len(every)} samples of the network are valid"
+        # where none is, the judge is asked about one once more, so that the result says what is wrong with it
+        for path in sorted(valid or every[-1:], key=lambda path: path.length):
+            how = f"solved by network: {reason}"
+            result = call.finish(path.positions, "network", how, keeps=partial(corner_kept, constraints))
+            if result is not None:
+                return result
+        return call.unsolved(reason)

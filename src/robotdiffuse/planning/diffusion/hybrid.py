@@ -1,0 +1,269 @@
+"""RobotDiffuse, a hybrid: the paper's diffusion model and AORRTC in one anytime loop.
+
+The straight line if it is free. Else a search for a first path, within milliseconds, then ever shorter ones;
+and, for a share of the work, batches of trajectories sampled by the diffusion model under collision guidance,
+or, where none of them is free, the same after more gradient steps (refinement). Of the scene the model is
+told clearances, and no code (see `RobotDiffuse.code`). For an arm without weights the batches are smooth
+noise after as many such steps (see smooth_noise.py). What the batches propose is simplified by the same code
+as what search finds, and the shortest path of either bounds the next search. Everything goes through the
+judge, and the result names the stage that its path comes from.
+
+Under path constraints it is search alone: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
+shorter (the mean of 20 upright cups and of 20 lines; median: the same).
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import islice
+from pathlib import Path as FilePath
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.learning.guidance import CollisionGuidance
+from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.planning.search.aorrtc import AORRTC, STEP, AORRTCSettings
+from robotdiffuse.planning.search.anytime import AnytimeSearch, anytime
+from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.diffusion.diffusion import ModelSampler, SamplingSettings, encode
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.learned import nearest_goals
+from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.core.settings import Bound, Count, Natural
+
+if TYPE_CHECKING:
+    from robotdiffuse.learning.motion_model import MotionModel
+
+BATCH_WORK = 12_000
+"""Iterations of search that take about as long as a batch of 16 samples in two steps, or its refinement."""
+WAYPOINTS = 48
+"""Of smooth noise: as many as the networks have."""
+BATCH_SECONDS = 0.1
+"""What a batch or its refinement takes, until it is known [s]: the first of a process is slow."""
+LONGER = 2.0
+"""A batch may take so many times what those before it took: scenes differ."""
+LOAD_SECONDS = 3.0
+"""A call that has so much time left loads PyTorch and the network, if it would use it [s]."""
+
+
+@dataclass(frozen=True)
+class RobotDiffuseSettings(SamplingSettings, name="robotdiffuse"):
+    sampling_steps: Count | None = 2
+    """Calls of the denoiser per batch. With guidance, more bring no more solved problems, see
+    benchmarks/results/guidance.txt."""
+    refinement_steps: Natural = 40
+    """Most gradient steps on the sampled trajectories that still collide."""
+    shortened: Count = 6
+    """Most candidates of a batch that are simplified."""
+    network_share: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
+    """Share of the work that goes to batches, of the network or of smooth noise; a batch counts as BATCH_WORK
+    iterations of search."""
+    search: AORRTCSettings = field(default_factory=AORRTCSettings)
+
+
+class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
+    """AORRTC and the network's batches in one anytime loop; see the head of this file."""
+
+    name = "robotdiffuse"
+    settings_class = RobotDiffuseSettings
+    keeps = frozenset({CONSTRAINTS, CLEARANCE})
+
+    def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
+        """Raises InputError if the folder that the settings name holds no weights."""
+        super().__init__(settings)
+        self.wanted: set[FilePath] = set()
+        """Weights that a call would have used, had there been time to load them."""
+        self.at_hand: set[FilePath] = set()
+        """Those that are loaded."""
+        self.seconds = {"batch": BATCH_SECONDS, "refinement": BATCH_SECONDS}
+        """What they took of late [s]: the last one, or more if those before did."""
+
+    def prepare(self, robot: Robot) -> None:
+        """See `planning.planner.Planner`: given weights. Those of the package are loaded in a call's own time,
+        if it has LOAD_SECONDS left for that, else by `warm_up` and `load_wanted`."""
+        if self.settings.weights is not None:
+            self._load(robot)
+
+    def load_wanted(self, robot: Robot) -> None:
+        """See `planning.planner.Planner`."""
+        super().load_wanted(robot)
+        if self.weights(robot) in self.wanted:
+            self._load(robot)
+
+    def _load_rarer(self, robot: Robot) -> None:
+        super()._load_rarer(robot)
+        self._load(robot)
+
+    def weights(self, robot: Robot) -> FilePath | None:
+        """The folder of those that are used for a robot; None if there are none."""
+        given = self.settings.weights
+        return weights_for(self.network_name, robot) if given is None else FilePath(given)
+
+    def _load(self, robot: Robot) -> None:
+        weights = self.weights(robot)
+        if weights is not None:
+            self.model(robot)
+            self.at_hand.add(weights)
+
+    def solve(self, call: Call, ends: Ends) -> PlanResult:
+        """See `planning.planner.Planner`."""
+        settings, robot = self.settings, call.problem.robot
+        if call.problem.constraints:
+            from robotdiffuse.planning.search.constrained import plan_constrained
+
+            return plan_constrained(call, ends, settings.search)
+        search = AnytimeSearch(call, ends, settings.search, AORRTC.name)
+        weights = self.weights(robot)
+        if weights is not None:
+            batches = _NetworkBatches(self, call, ends, search, weights)
+        else:
+            batches = _Batches(self, call, ends, search)
+            note = f"there are no weights for {robot.name}; planned by search and smooth noise"
+            call.notes.append(note)
+
+        def improve() -> None:
+            if batches.due:
+                batches.offer()
+            else:
+                search.improve(call.search_until, STEP)
+
+        return anytime(
+            call,
+            ends,
+            search,
+            lambda: search.pays(settings.search.gain, settings.search.patience),
+            improve,
+            batches.offer,
+        )
+
+    def code(
+        self, model: "MotionModel", checker: CollisionChecker, rng: np.random.Generator
+    ) -> Float[ndarray, "code"] | None:
+        """What the network is told beside clearances: z of the scene if its weights cannot do without. Those
+        that ship can, and paths are as long with it, see benchmarks/results/network_inputs.txt."""
+        return None if model.settings.null_condition else encode(model, checker, self.settings.points, rng)
+
+    def refine(
+        self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]
+    ) -> Float[ndarray, "count waypoints dof"]:
+        """More gradient steps on trajectories, whether sampled or not; float32."""
+        return CollisionGuidance(checker, self.settings.guidance)(q, self.settings.refinement_steps)[0]
+
+
+class _Batches:
+    """Batches of smooth noise in the anytime loop of a call."""
+
+    def __init__(self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch) -> None:
+        self.planner, self.call, self.ends, self.search = planner, call, ends, search
+        self._spent = 0
+
+    @property
+    def due(self) -> bool:
+        """Whether the batches have had less than their share of the work, and there is time for one."""
+        batches, share = self._spent + BATCH_WORK, self.planner.settings.network_share
+        return batches <= share * (self.search.work + batches) and self._can()
+
+    def offer(self) -> None:
+        """Draw a batch and offer the shortest free ones to the search."""
+        if self._can():
+            self._draw()
+
+    def _can(self) -> bool:
+        """Whether there is time for a batch."""
+        return self._time_for("batch")
+
+    def _time_for(self, part: str) -> bool:
+        return self.call.remaining > LONGER * self.planner.seconds[part]
+
+    @contextmanager
+    def _timed(self, part: str) -> Iterator[None]:
+        """A batch or its refinement, which counts as work and whose time the next ones will know."""
+        began = self.call.elapsed
+        yield
+        took, self._spent = self.call.elapsed - began, self._spent + BATCH_WORK
+        self.planner.seconds[part] = max(took, 0.5 * (self.planner.seconds[part] + took))
+
+    def _draw(self) -> None:
+        planner, checker, count = self.planner, self.ends.checker, self.planner.settings.samples
+        start, goals = self.ends.rows()
+        goals = nearest_goals(start, goals, count)
+        with self._timed("batch"):
+            q = smooth_noise(start, goals, count, WAYPOINTS, checker.robot, self.call.rng)
+            q = planner.refine(checker, q)
+        self._take(q, "smooth_noise")
+
+    def _take(self, q: Float[ndarray, "count waypoints dof"], stage: str) -> bool:
+        """Offer the shortest ones that are free in the space of the search; whether there were any."""
+        space, most = self.search.space, self.planner.settings.shortened
+        ordered = sorted(np.ascontiguousarray(q, np.float32), key=path_length)
+        paths = list(islice((path for path in ordered if motions_free(space, path).all()), most))
+        for path in paths:
+            if self.call.remaining > 0 or self.search.best is None:
+                self.search.offer(path, stage)
+        return bool(paths)
+
+
+class _NetworkBatches(_Batches):
+    """Batches of the network in its place, refined where none is free."""
+
+    def __init__(
+        self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch, weights: FilePath
+    ) -> None:
+        super().__init__(planner, call, ends, search)
+        self._weights = weights
+
+    def _can(self) -> bool:
+        """Whether there is time for a batch, and for loading the network, which takes seconds once."""
+        self.planner.wanted.add(self._weights)
+        at_hand = self._weights in self.planner.at_hand or self.call.remaining > LOAD_SECONDS
+        return at_hand and super()._can()
+
+    @cached_property
+    def _model(self) -> "MotionModel":
+        model = self.planner.model(self.call.problem.robot)
+        assert model is not None  # there are weights, or these were no batches of a network
+        return model
+
+    @cached_property
+    def _code(self) -> Float[ndarray, "code"] | None:
+        return self.planner.code(self._model, self.ends.checker, self.call.rng)
+
+    def _draw(self) -> None:
+        planner, checker, call = self.planner, self.ends.checker, self.call
+        model = self._model
+        planner.at_hand.add(self._weights)
+        start, goals = self.ends.rows()
+        with self._timed("batch"):
+            sampled = planner.draw(model, checker, self._code, start, goals, call.rng)
+        if not self._take(sampled, "network") and self._time_for("refinement"):
+            with self._timed("refinement"):
+                refined = planner.refine(checker, sampled)
+            self._take(refined, "refinement")
+
+
+def unlearned_starts(
+    start: Float[ndarray, "dof"],
+    goal: Float[ndarray, "dof"],
+    count: int,
+    waypoints: int,
+    robot: Robot,
+    rng: np.random.Generator,
+) -> Float[ndarray, "count waypoints dof"]:
+    """The straight line, and the line with random bumps: the control for what refinement owes to learning."""
+    t = np.linspace(0.0, 1.0, waypoints)[:, None]
+    q = np.repeat((start + t * (goal - start))[None], count, axis=0)
+    for harmonic in (1, 2):
+        bumps = np.sin(np.pi * harmonic * t) * rng.normal(0.0, 0.6 / harmonic, (count, 1, len(start)))
+        q[1:] += bumps[1:]
+    q = np.clip(q, robot.lower, robot.upper)
+    q[:, 0], q[:, -1] = start, goal
+    return q

@@ -1,0 +1,283 @@
+"""Compiled RRT-Connect, and AORRTC: the same with trees that know their costs and keep below a bound.
+
+J. Kuffner and S. LaValle, "RRT-Connect: An efficient approach to single-query path planning", ICRA 2000;
+balanced trees as in J. Kuffner and S. LaValle, "An efficient approach to path planning using balanced
+bidirectional RRT search", 2005. T. S. Wilson, W. Thomason, Z. Kingston and J. D. Gammell, "AORRTC:
+Almost-surely asymptotically optimal planning with RRT-Connect", RA-L 2025; samples as in J. D. Gammell, S. S.
+Srinivasa and T. D. Barfoot, "Informed RRT*", IROS 2014.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.collision.kernels.compiled import allocation_free, random
+from robotdiffuse.collision.kernels.lane_collision import make_workspace
+from robotdiffuse.collision.kernels.motions import distance, motion_free
+from robotdiffuse.collision.kernels.simd import W, lane, load
+
+_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+_TAU = np.float32(6.283185307179586)
+_NOWHERE = np.float32(1e15)
+"""A coordinate that no node has, and whose square is a number [rad]."""
+
+
+class Trees(NamedTuple):
+    """Two trees, from the start and from the goals; filled in place, so that a search can go on."""
+
+    nodes: np.ndarray
+    """[2, capacity, dof]"""
+    columns: np.ndarray
+    """[2 * dof, capacity in full lanes] the same by joint, to search through; nowhere beyond the last."""
+    costs: np.ndarray
+    """[2, capacity in full lanes] lengths of the ways from the roots [rad]; theirs is 0, they come first."""
+    parents: np.ndarray
+    """[2, capacity] -1 for roots."""
+    sizes: np.ndarray
+    """[2]"""
+
+
+@njit(cache=True)
+def make_trees(start, goals, capacity):
+    """Trees with the start and the goals as their roots."""
+    dof, lanes = len(start), (capacity + W - 1) // W * W
+    trees = Trees(
+        np.empty((2, capacity, dof), np.float32),
+        np.empty((2 * dof, lanes), np.float32),
+        np.zeros((2, lanes), np.float32),
+        np.empty((2, capacity), np.int32),
+        np.zeros(2, np.int32),
+    )
+    _add(trees, 0, start, _ZERO, -1)
+    for goal in goals:
+        _add(trees, 1, goal, _ZERO, -1)
+    return trees
+
+
+@njit(cache=True, nogil=True)
+def search(space, trees, goals, bound, longest, iterations, state):
+    """Grow the trees for a number of iterations, or until they hold a path shorter than `bound` [rad].
+
+    `longest` bounds extensions [rad]; `bound` may be infinite, the search is RRT-Connect then. Returns the
+    waypoints [n, dof] from the start to a goal, with n = 0 if none was found yet. Stops early when a tree is
+    full.
+    """
+    nodes, costs, parents, sizes = trees.nodes, trees.costs, trees.parents, trees.sizes
+    dof, bounded = nodes.shape[2], bound < np.float32(np.inf)
+    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
+    sample, new = np.empty(dof, np.float32), np.empty(dof, np.float32)
+    shares = _shares(nodes[0, 0], goals, bound) if bounded else np.empty(0, np.float32)
+    for _ in range(iterations):
+        tree = 0 if sizes[0] <= sizes[1] else 1
+        other = 1 - tree
+        if sizes[tree] >= nodes.shape[1] or sizes[other] >= nodes.shape[1]:
+            break
+        if bounded:
+            _sample_within(space, nodes[0, 0], goals, shares, bound, sample, state)
+        else:
+            _sample_box(space, sample, state)
+        roots, other_roots = (len(goals), 1) if tree else (1, len(goals))
+        allowed = bound
+        if bounded:
+            least = _to_roots(nodes, tree, roots, sample)
+            allowed = least + random(state) * (bound - _to_roots(nodes, other, other_roots, sample) - least)
+        near = _nearest(trees, tree, sample, allowed)
+        gap = distance(nodes[tree, near], sample)
+        share = min(longest / max(gap, np.float32(1e-6)), _ONE)
+        for j in range(dof):
+            new[j] = nodes[tree, near, j] + share * (sample[j] - nodes[tree, near, j])
+        cost = costs[tree, near] + share * gap
+        if bounded and cost + _to_roots(nodes, other, other_roots, new) >= bound:
+            continue
+        if not motion_free(space, nodes[tree, near], new, block, work):
+            continue
+        if bounded:
+            near, cost = _cheaper(space, trees, tree, roots, near, cost, new, block, work, state)
+        here = _add(trees, tree, new, cost, near)
+        near = _nearest(trees, other, new, bound - cost)
+        while sizes[other] < nodes.shape[1]:
+            gap = distance(nodes[other, near], new)
+            if bounded and costs[other, near] + gap + cost >= bound:
+                break
+            last = gap <= longest
+            share = _ONE if last else longest / gap
+            for j in range(dof):
+                sample[j] = nodes[other, near, j] + share * (new[j] - nodes[other, near, j])
+            if not motion_free(space, nodes[other, near], sample, block, work):
+                break
+            if last:
+                return _join(nodes, parents, tree, here, near)
+            near = _add(trees, other, sample, costs[other, near] + longest, near)
+    return np.empty((0, dof), np.float32)
+
+
+@njit(cache=True, nogil=True)
+def connect(space, trees, longest, iterations, state):
+    """RRT-Connect: `search` without a bound."""
+    nowhere = np.empty((0, trees.nodes.shape[2]), np.float32)
+    return search(space, trees, nowhere, np.float32(np.inf), longest, iterations, state)
+
+
+@allocation_free(inline="always")
+def _add(trees, tree, q, cost, parent):
+    here, dof = trees.sizes[tree], len(q)
+    for j in range(dof):
+        trees.nodes[tree, here, j] = q[j]
+        if here % W == 0:
+            trees.columns[tree * dof + j, here : here + W] = _NOWHERE
+        trees.columns[tree * dof + j, here] = q[j]
+    trees.costs[tree, here], trees.parents[tree, here] = cost, parent
+    trees.sizes[tree] += 1
+    return here
+
+
+@allocation_free(fastmath=True)
+def _to_roots(nodes, tree, roots, q):
+    """Distance to the nearest root: no way to it is shorter [rad]."""
+    least = np.float32(1e9)
+    for r in range(roots):
+        least = min(least, distance(nodes[tree, r], q))
+    return least
+
+
+@allocation_free()
+def _nearest(trees, tree, q, allowed):
+    """The nearest node by position and cost of those that reach q at a cost of at most `allowed`.
+
+    The cost of q itself is thought to be `allowed`. Without a bound the nearest by position; where no node is
+    near enough, the nearest root.
+    """
+    bounded = allowed < np.float32(np.inf)
+    best, where = np.float32(np.inf), -1
+    for part in range((trees.sizes[tree] + W - 1) // W):
+        apart = _squared(trees, tree, part, q)
+        if bounded:
+            late = allowed - load(trees.costs, tree, part)
+            both = apart + late * late
+            near = (both < best) & ~(late < _ZERO) & ~(late * late < apart)
+        else:
+            both = apart
+            near = both < best
+        i = 0
+        while near != 0:
+            if near & 1 and lane(both, i) < best:
+                best, where = lane(both, i), W * part + i
+            near, i = near >> 1, i + 1
+    if where >= 0:
+        return where
+    for n in range(trees.sizes[tree]):
+        if trees.parents[tree, n] >= 0:
+            break
+        apart = distance(trees.nodes[tree, n], q)
+        if apart < best:
+            best, where = apart, n
+    return where
+
+
+@allocation_free(inline="always")
+def _squared(trees, tree, part, q):
+    """Squared distances of sixteen nodes from q."""
+    dof = len(q)
+    aside = load(trees.columns, tree * dof, part) - q[0]
+    total = aside * aside
+    for j in range(1, dof):
+        aside = load(trees.columns, tree * dof + j, part) - q[j]
+        total = total + aside * aside
+    return total
+
+
+@njit(cache=True)
+def _cheaper(space, trees, tree, roots, near, cost, new, block, work, state):
+    """A parent that reaches `new` more cheaply, and that cost: cheaper ones are drawn until one is not
+    free."""
+    least = _to_roots(trees.nodes, tree, roots, new)
+    while cost > least:
+        allowed = least + random(state) * (cost - least)
+        other = _nearest(trees, tree, new, allowed)
+        through = trees.costs[tree, other] + distance(trees.nodes[tree, other], new)
+        if other == near or through >= cost:
+            break
+        if not motion_free(space, trees.nodes[tree, other], new, block, work):
+            break
+        near, cost = other, through
+    return near, cost
+
+
+@allocation_free()
+def _sample_box(space, q, state):
+    for j in range(len(q)):
+        q[j] = space.lower[j] + random(state) * (space.upper[j] - space.lower[j])
+
+
+@njit(cache=True)
+def _shares(start, goals, bound):
+    """Cumulative shares of the samples that go to the goals, by the volumes of their spheroids."""
+    shares, total = np.empty(len(goals), np.float32), _ZERO
+    for g in range(len(goals)):
+        straight = distance(start, goals[g])
+        if straight < bound:
+            flat = np.sqrt(_ONE - (straight / bound) ** 2)
+            total += flat ** np.float32(len(start) - 1)
+        shares[g] = total
+    return shares / max(total, np.float32(1e-30))
+
+
+@njit(cache=True)
+def _sample_within(space, start, goals, shares, bound, q, state):
+    """Uniform in the prolate hyperspheroid of the ways between start and a goal shorter than `bound`, clamped
+    to the limits; the goal is drawn by `shares`."""
+    dof, u, g = len(q), random(state), 0
+    while g < len(goals) - 1 and u > shares[g]:
+        g += 1
+    straight = distance(start, goals[g])
+    across = _HALF * np.sqrt(max(bound * bound - straight * straight, _ZERO))
+    norm = _ZERO
+    for j in range(dof):
+        q[j] = _normal(state)
+        norm += q[j] * q[j]
+    scale = random(state) ** (_ONE / np.float32(dof)) / np.sqrt(max(norm, np.float32(1e-12)))
+    for j in range(dof):
+        q[j] *= scale * (_HALF * bound if j == 0 else across)
+    # the reflection that takes the first axis to the direction of the goal
+    along, total = _ZERO, _ZERO
+    for j in range(dof):
+        v = (_ONE if j == 0 else _ZERO) - (goals[g, j] - start[j]) / max(straight, np.float32(1e-9))
+        along += v * q[j]
+        total += v * v
+    for j in range(dof):
+        v = (_ONE if j == 0 else _ZERO) - (goals[g, j] - start[j]) / max(straight, np.float32(1e-9))
+        turned = q[j] - (np.float32(2.0) * along / total * v if total > np.float32(1e-9) else _ZERO)
+        q[j] = min(max(turned + _HALF * (start[j] + goals[g, j]), space.lower[j]), space.upper[j])
+
+
+@allocation_free()
+def _normal(state):
+    """A standard normal number (G. Box and M. Muller, 1958)."""
+    radius = np.sqrt(np.float32(-2.0) * np.log(max(random(state), np.float32(1e-12))))
+    return radius * np.cos(_TAU * random(state))
+
+
+@njit(cache=True)
+def _join(nodes, parents, tree, here, near):
+    a, b = (here, near) if tree == 0 else (near, here)
+    count = 0
+    for side, node in ((0, a), (1, b)):
+        while node >= 0:
+            node = parents[side, node]
+            count += 1
+    path = np.empty((count, nodes.shape[2]), np.float32)
+    count, node = 0, a
+    while node >= 0:
+        count += 1
+        node = parents[0, node]
+    node = a
+    for i in range(count - 1, -1, -1):
+        path[i] = nodes[0, node]
+        node = parents[0, node]
+    node = b
+    while node >= 0:
+        path[count] = nodes[1, node]
+        count += 1
+        node = parents[1, node]
+    return path

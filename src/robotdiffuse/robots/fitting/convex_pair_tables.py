@@ -1,0 +1,69 @@
+"""Pairs of links that pass closer to each other than covering spheres can tell, as a flange in a fork.
+
+How two links stand to each other depends only on the joints between them. Where these are one or two, a table
+over them says, by the convex parts, where the two are apart: in a cell in whose middle their distance is more
+than what any point of one moves within the cell, seen from the other. Cells of which that cannot be said are
+split, down to a fraction of a millimetre of motion.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.robots.fitting.allowed_collisions import Links
+from robotdiffuse.robots.joint_tables import TURN, JointTable
+from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.robot import Robot
+
+CELLS = 128
+"""Of a table along each joint: a power of two."""
+SLACK = 1e-5
+"""More than what rounding does to a distance [m]."""
+
+
+def joint_table(robot: Robot, links: Links, pair: tuple[str, str], finest: float) -> JointTable:
+    """Where the convex parts of two links are apart that have one or two joints between them.
+
+    Cells within which they move no further than `finest` [m] are not split.
+    """
+    joints = robot.joints_between(*pair)
+    far = max(pair, key=robot.link_frame)
+    with_spheres = [link for link in robot.link_names if link in robot.spheres]
+    lever = motion_radii(robot)[with_spheres.index(far), list(joints)]
+    slides = np.array(robot.prismatic)[list(joints)]
+    lower, upper = robot.lower[list(joints)], robot.upper[list(joints)]
+    upper = np.where(slides, upper, np.minimum(upper, lower + TURN))
+    columns = [[j.name for j in links.joints].index(robot.joint_names[joint]) for joint in joints]
+    held = links.named({})
+    edge = (upper - lower) / CELLS
+    apart = np.ones((CELLS,) * len(joints), dtype=bool)
+    size = np.full(len(joints), float(CELLS))
+    parts = np.indices([len(robot.meshes[link]) for link in pair]).reshape(2, -1)
+    low = np.zeros((parts.shape[1], len(joints)))  # a row for each two parts in a cell where they may touch
+    while len(low):
+        cells, cell = np.unique(low, axis=0, return_inverse=True)
+        q = np.tile(held, (len(cells), 1))
+        q[:, columns] = lower + edge * (cells + size / 2)
+        travel = float(lever @ (edge * size) / 2) + SLACK
+        poses = links.poses(q, frozenset(pair))
+        distance = links.part_distances(poses, *pair, cell.ravel(), parts, travel)
+        touch = distance <= travel
+        given_up = touch & ((size <= 1).all() & (distance <= 0) | (distance < -travel) | (travel < finest))
+        for first, last in zip(*_cells(np.unique(low[given_up], axis=0), size), strict=True):
+            apart[tuple(slice(*ends) for ends in zip(first, last, strict=True))] = False
+        axis = int((lever * edge * size).argmax())
+        size = size.copy()
+        size[axis] /= 2
+        low, parts = low[touch & ~given_up], parts[:, touch & ~given_up]
+        low = np.concatenate([low, low + size * (np.arange(len(size)) == axis)])
+        parts = np.tile(parts, 2)
+        if (size <= 1).all():  # of a cell in which something touches no more is asked
+            is_open = apart[tuple(_cells(low, size)[0].T)]
+            low, parts = low[is_open], parts[:, is_open]
+    names = tuple(robot.joint_names[joint] for joint in joints)
+    return JointTable(pair, names, tuple(lower.tolist()), tuple(upper.tolist()), apart)
+
+
+def _cells(low: Float[ndarray, "n joints"], size: Float[ndarray, "joints"]) -> tuple[ndarray, ndarray]:
+    """The first cell along each joint that boxes reach into, and the one behind the last."""
+    return np.floor(low).astype(int), np.ceil(low + size).astype(int)

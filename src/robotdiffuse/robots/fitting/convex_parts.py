@@ -1,0 +1,425 @@
+"""Convex parts that together hold a collision mesh: what Coal can measure exactly.
+
+A mesh is cut by planes until no part's hull sticks out of it too far, then parts are joined again as long as
+their common hull does not. A hull of all that a plane leaves on one side of a closed surface holds the solid
+on that side, so the parts cover mesh and solid by construction, whatever the mesh looks like. How far a hull
+sticks out is measured on a voxel grid: what cannot be reached from outside without crossing the surface is
+solid, so that holes smaller than a voxel, inner walls and triangles that overlap do no harm.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from numba import njit
+from numpy import ndarray
+from scipy import ndimage
+from scipy.spatial import ConvexHull, HalfspaceIntersection, KDTree, QhullError
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.robot import ConvexMesh
+
+THIN = 1e-3
+"""Least thickness of a hull [m]: of a sheet, spheres and distances would have none to go by."""
+CUTS = np.arange(1, 10) / 10
+"""Where a part may be cut, along each axis, as shares of its length."""
+STEP = 1e-4
+"""How far from such a surface a part is cut [m]."""
+TIE = 0.999
+"""Of cuts that leave as little volume, but for such a factor, the first is taken."""
+WALLS = 6
+"""Surfaces across an axis at which a part may be cut too, at most."""
+CHOICE_POINTS = 1200
+"""Points of the surface from which the best cut is chosen, about."""
+MOST_NORMALS = 1000
+"""Faces of a hull whose planes are all looked at when it is simplified."""
+DEEPEST = 60
+"""Times that a triangle is halved, at most."""
+TIGHT, SLOPE = 0.125, 0.3
+"""About a tight place parts may stick out by such a share of what they may elsewhere, and by so much more per
+distance from there."""
+MORE = 4
+"""About tight places a link is cut into so many times as many parts, at most."""
+GROWTH = 1e-7
+"""Simplified hulls are larger by this [m]: more than rounding takes away."""
+
+
+@dataclass(frozen=True)
+class PartSettings:
+    """How closely convex parts follow a mesh."""
+
+    concavity: float = 0.007
+    """How far the hull of a part may stick out of the mesh [m]."""
+    most: int = 16
+    """Parts of a link, at most."""
+    voxels: int = 400_000
+    """Of the grid on which that is measured, about."""
+    finest: float = 0.0015
+    """Edge of a voxel, at least [m]."""
+    faces: int = 400
+    """Hulls with more triangles are simplified, outwards."""
+    rounding: float = 5e-4
+    """How far a simplified hull may stick out of the hull [m], as long as 120 planes suffice."""
+
+    def __post_init__(self) -> None:
+        if not self.finest > 0 or not self.concavity > 0 or self.most < 1:
+            raise InputError(
+                f"convex parts: concavity is {self.concavity}, finest {self.finest}, most {self.most}; "
+                "all must be positive"
+            )
+
+    def scaled(self, size: float) -> "PartSettings":
+        """For meshes that are so many times as large."""
+        lengths = ("concavity", "finest", "rounding")
+        return replace(self, **{name: size * getattr(self, name) for name in lengths})
+
+    def finer(self) -> "PartSettings":
+        """With voxels of half the size."""
+        return replace(self, voxels=8 * self.voxels, finest=self.finest / 2)
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """A triangle mesh in the frame of its link [m]; it need not be closed."""
+
+    vertices: Float[ndarray, "v 3"]
+    faces: Int[ndarray, "f 3"]
+
+
+def convex_parts(
+    surfaces: tuple[Surface, ...],
+    settings: PartSettings | None = None,
+    tight: Float[ndarray, "n 3"] | None = None,
+) -> tuple[ConvexMesh, ...]:
+    """Convex meshes whose union holds the surfaces of a link and what they enclose; about `tight` places they
+    stick out as little as they can."""
+    settings = settings or PartSettings()
+    soups = [surface.vertices[surface.faces] for surface in surfaces]
+    space = _Space.around(soups, settings if tight is None else settings.finer())
+    parts = [_Part.of(soup, _spread(soup, space.pitch), space, settings) for soup in soups]
+    parts = _cut(parts, space, settings, max(settings.most, 2 * len(parts)))
+    if tight is not None:
+        about, space = space.about(tight, settings.concavity)
+        parts = [replace(part, concavity=about.concavity(part.hull)) for part in parts]
+        parts = _cut(parts, about, settings, MORE * settings.most)
+    return tuple(_without_contained(_joined([part.hull for part in parts], space, settings)))
+
+
+def _cut(parts: list["_Part"], space: "_Space", settings: PartSettings, most: int) -> list["_Part"]:
+    """Parts cut in two, those that stick out furthest first."""
+    parts = list(parts)
+    while len(parts) < most:
+        worst = max(range(len(parts)), key=lambda i: parts[i].concavity)
+        if parts[worst].concavity <= settings.concavity:
+            break
+        parts[worst : worst + 1] = parts[worst].halves(space, settings)
+    return parts
+
+
+def convex_hull(points: Float[ndarray, "n 3"]) -> ConvexMesh:
+    """Convex hull with outward faces; points thinner than `THIN` in a direction are given that thickness."""
+    points = _thick(points)
+    hull = ConvexHull(points)
+    used, index = np.unique(hull.simplices, return_inverse=True)
+    vertices, faces = points[used], index.reshape(hull.simplices.shape)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    inwards = np.einsum("fd,fd->f", np.cross(b - a, c - a), hull.equations[:, :3]) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return ConvexMesh(vertices, faces)
+
+
+def _thick(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+    """The points, and others beside them along the principal axes in which they are thin: around each."""
+    axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2]
+    for axis in axes[np.ptp(points @ axes.T, axis=0) < THIN]:
+        points = np.concatenate([points - axis * THIN / 2, points + axis * THIN / 2])
+    return points
+
+
+def face_normals(mesh: ConvexMesh) -> Float[ndarray, "f 3"]:
+    """Outward unit normals; zero for a face without area."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    return np.where(size > 1e-14, normals / np.maximum(size, 1e-14), 0.0)
+
+
+def planes_of(mesh: ConvexMesh) -> tuple[Float[ndarray, "p 3"], Float[ndarray, "p"]]:
+    """Normals and offsets of the distinct planes of a convex mesh."""
+    normals = face_normals(mesh)
+    normals = np.unique(np.round(normals[np.linalg.norm(normals, axis=1) > 0.5], 9), axis=0)
+    # the farthest vertex, not the face's own: rounding must not put a plane inside the mesh
+    return normals, (mesh.vertices @ normals.T).max(0)
+
+
+def simplified(hull: ConvexMesh, settings: PartSettings = PartSettings(), most: int = 120) -> ConvexMesh:
+    """A convex mesh that holds a hull, of some of the hull's own planes; the same one if it has few faces.
+
+    Planes are added where the corners that the others leave stick out most.
+    """
+    settings = settings or PartSettings()
+    if len(hull.faces) <= settings.faces:
+        return hull
+    normals = face_normals(hull)
+    if len(normals) > MOST_NORMALS:  # those that are much alike count once
+        _, first = np.unique(np.round(normals * 12).astype(int) @ [1, 100, 10_000], return_index=True)
+        normals = normals[first]
+    normals = np.concatenate([np.eye(3), -np.eye(3), normals[np.linalg.norm(normals, axis=1) > 0.5]])
+    offsets = (hull.vertices @ normals.T).max(0) + GROWTH
+    chosen, middle = list(range(6)), hull.vertices.mean(0)
+    try:
+        while True:
+            halfspaces = np.column_stack([normals[chosen], -offsets[chosen]])
+            corners = HalfspaceIntersection(halfspaces, middle).intersections
+            beyond = corners @ normals.T - offsets
+            worst = beyond.max(1)
+            if worst.max() <= settings.rounding or len(chosen) >= most:
+                return convex_hull(corners)
+            for corner in np.argsort(-worst)[: min(8, most - len(chosen))]:
+                plane = int(beyond[corner].argmax())
+                if worst[corner] > settings.rounding and plane not in chosen:
+                    chosen.append(plane)
+    except QhullError:  # almost flat
+        return hull
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    triangles: Float[ndarray, "n 3 3"]
+    points: Float[ndarray, "m 3"]
+    """All over the triangles, for the choice of cuts."""
+    hull: ConvexMesh
+    concavity: float
+
+    @staticmethod
+    def of(triangles: ndarray, points: ndarray, space: "_Space", settings: PartSettings) -> "_Part":
+        hull = simplified(convex_hull(triangles.reshape(-1, 3)), settings)
+        return _Part(triangles, points, hull, space.concavity(hull))
+
+    def halves(self, space: "_Space", settings: PartSettings) -> list["_Part"]:
+        """The two sides of the plane that leaves hulls of least volume; itself if it is too small to cut."""
+        low, size = self.hull.vertices.min(0), np.ptp(self.hull.vertices, axis=0)
+        points, apart = _thinned(self.points, space.pitch)
+        best, least = None, np.inf
+        for axis in sorted(np.flatnonzero(size > 6 * space.pitch), key=lambda axis: -size[axis]):
+            for at in (*_walls(points[:, axis], space.pitch), *(low[axis] + CUTS * size[axis])):
+                height = points[:, axis] - at
+                volume = 0.0
+                for side in (points[height <= 0], points[height > 0]):
+                    edge = side[np.abs(side[:, axis] - at) <= apart]
+                    edge[:, axis] = at  # where the surface meets the plane, about
+                    volume += _volume(np.concatenate([side, edge]))
+                if volume < TIE * least:
+                    best, least = (int(axis), float(at)), volume
+        halves = _sides(self.triangles, *best) if best else ()
+        if best is None or not all(map(len, halves)):
+            return [replace(self, concavity=0.0)]
+        low_points = self.points[:, best[0]] <= best[1]
+        points = (self.points[low_points], self.points[~low_points])
+        return [_Part.of(side, near, space, settings) for side, near in zip(halves, points, strict=True)]
+
+
+@dataclass(frozen=True, eq=False)
+class _Space:
+    """What is around a surface: for each voxel the distance to the solid, zero in it [m]."""
+
+    origin: Float[ndarray, "3"]
+    pitch: float
+    distance: Float[ndarray, "nx ny nz"]
+
+    @staticmethod
+    def around(soups: list[Float[ndarray, "n 3 3"]], settings: PartSettings) -> "_Space":
+        corners = np.concatenate(soups).reshape(-1, 3)
+        low, high = corners.min(0), corners.max(0)
+        size = np.maximum(high - low, settings.finest)
+        pitch = max(float(np.prod(size) / settings.voxels) ** (1 / 3), size.max() / 300, settings.finest)
+        origin = low - 2.5 * pitch
+        shape = np.ceil((high - origin) / pitch).astype(int) + 3
+        occupied = np.zeros(shape, dtype=bool)
+        for soup in soups:
+            _mark(occupied, split(soup, pitch / 2), origin, pitch)
+        found: Any = ndimage.label(~occupied)
+        free = found[0] == found[0][0, 0, 0]
+        return _Space(origin, pitch, ndimage.distance_transform_edt(free) * pitch)
+
+    def about(self, tight: Float[ndarray, "n 3"], concavity: float) -> tuple["_Space", "_Space"]:
+        """With greater distances about some places, so that what sticks out there counts for more: only these
+        distances, and all."""
+        near = np.argwhere((self.distance > 0) & (self.distance < 3 * concavity))
+        far = KDTree(tight).query(self.origin + (near + 0.5) * self.pitch)[0]
+        allowed = TIGHT * concavity + SLOPE * np.maximum(far - 2 * concavity, 0.0)
+        near, allowed = near[allowed < concavity], allowed[allowed < concavity]
+        alone = np.zeros_like(self.distance)
+        alone[tuple(near.T)] = self.distance[tuple(near.T)] * concavity / allowed
+        return replace(self, distance=alone), replace(self, distance=np.maximum(alone, self.distance))
+
+    def concavity(self, hull: ConvexMesh) -> float:
+        """How far a hull sticks out of the solid [m], about."""
+        low = np.floor((hull.vertices.min(0) - self.origin) / self.pitch).astype(int)
+        high = np.ceil((hull.vertices.max(0) - self.origin) / self.pitch).astype(int) + 1
+        return _farthest_inside(self.distance, self.origin, self.pitch, low, high, *planes_of(hull))
+
+
+@njit(cache=True)
+def _mark(occupied, triangles, origin, pitch):
+    """Mark the voxels in which corners of triangles lie."""
+    for t in range(len(triangles)):
+        for k in range(3):
+            i = int((triangles[t, k, 0] - origin[0]) / pitch)
+            j = int((triangles[t, k, 1] - origin[1]) / pitch)
+            occupied[i, j, int((triangles[t, k, 2] - origin[2]) / pitch)] = True
+
+
+@njit(cache=True)
+def _farthest_inside(distance, origin, pitch, low, high, normals, offsets):
+    """Largest distance of a voxel whose centre is within the planes."""
+    best = 0.0
+    for i in range(max(low[0], 0), min(high[0], distance.shape[0])):
+        x = origin[0] + (i + 0.5) * pitch
+        for j in range(max(low[1], 0), min(high[1], distance.shape[1])):
+            y = origin[1] + (j + 0.5) * pitch
+            for k in range(max(low[2], 0), min(high[2], distance.shape[2])):
+                if distance[i, j, k] <= best:
+                    continue
+                z = origin[2] + (k + 0.5) * pitch
+                inside = True
+                for f in range(len(offsets)):
+                    if normals[f, 0] * x + normals[f, 1] * y + normals[f, 2] * z > offsets[f]:
+                        inside = False
+                        break
+                if inside:
+                    best = distance[i, j, k]
+    return best
+
+
+def _walls(heights: Float[ndarray, "n"], pitch: float) -> list[float]:
+    """Just before and behind where a surface runs across an axis: parts often meet there."""
+    counts, edges = np.histogram(heights, max(int(np.ptp(heights) / pitch), 1))
+    most = np.argsort(-counts)[:WALLS]
+    middles = [
+        float(np.median(heights[(heights >= edges[k]) & (heights <= edges[k + 1])]))
+        for k in most
+        if counts[k] > 2 * np.median(counts)
+    ]
+    return [middle + step for middle in middles for step in (-STEP, STEP)]
+
+
+def _spread(triangles: Float[ndarray, "n 3 3"], pitch: float) -> Float[ndarray, "m 3"]:
+    """Points all over a surface."""
+    return _one_per_cube(split(triangles, 2 * pitch).reshape(-1, 3), pitch)
+
+
+def _thinned(points: Float[ndarray, "n 3"], size: float) -> tuple[Float[ndarray, "m 3"], float]:
+    """Fewer points, one of each cube, and the edge of the cubes [m]."""
+    while len(points) > CHOICE_POINTS:
+        size *= 1.3
+        points = _one_per_cube(points, size)
+    return points, size
+
+
+def _one_per_cube(points: Float[ndarray, "n 3"], size: float) -> Float[ndarray, "m 3"]:
+    cubes = np.floor((points - points.min(0)) / size).astype(np.int64)
+    _, first = np.unique(np.ravel_multi_index(tuple(cubes.T), cubes.max(0) + 1), return_index=True)
+    return points[first]
+
+
+def _volume(points: Float[ndarray, "n 3"]) -> float:
+    try:
+        return ConvexHull(points).volume
+    except (QhullError, ValueError):  # flat, or fewer than four points
+        return 0.0
+
+
+def _sides(
+    triangles: Float[ndarray, "n 3 3"], axis: int, at: float
+) -> tuple[Float[ndarray, "a 3 3"], Float[ndarray, "b 3 3"]]:
+    """What of triangles lies on the two sides of an axis-aligned plane."""
+    height = triangles[:, :, axis] - at
+    below, above = (height <= 0).all(1), (height >= 0).all(1)
+    crossing, height = triangles[~below & ~above], height[~below & ~above]
+    # the corner that is alone on its side comes first
+    negative = height < 0
+    alone = np.where(negative.sum(1) == 1, negative.argmax(1), (~negative).argmax(1))
+    turn = (alone[:, None] + np.arange(3)) % 3
+    rows = np.arange(len(crossing))[:, None]
+    (a, b, c), (x, y, z) = np.moveaxis(crossing[rows, turn], 1, 0), height[rows, turn].T[:, :, None]
+    ab, ac = a + (b - a) * (x / (x - y)), a + (c - a) * (x / (x - z))
+    single = np.stack([a, ab, ac], axis=1)
+    double = np.concatenate([np.stack([ab, b, c], axis=1), np.stack([ab, c, ac], axis=1)])
+    low = x[:, 0] < 0
+    return (
+        np.concatenate([triangles[below], single[low], double[np.tile(~low, 2)]]),
+        np.concatenate([triangles[above & ~below], single[~low], double[np.tile(low, 2)]]),
+    )
+
+
+def _joined(hulls: list[ConvexMesh], space: _Space, settings: PartSettings) -> list[ConvexMesh]:
+    """Hulls joined, those first whose common hull sticks out least, as long as it does not too far."""
+    hulls = list(hulls)
+    known: dict[tuple[int, int], tuple[float, ConvexMesh]] = {}
+    while len(hulls) > 1:
+        for i, a in enumerate(hulls):
+            for b in hulls[i + 1 :]:
+                if (id(a), id(b)) not in known:
+                    both = convex_hull(np.concatenate([a.vertices, b.vertices]))
+                    both = simplified(both, settings)
+                    known[id(a), id(b)] = (space.concavity(both), both)
+        pairs = [
+            (known[id(a), id(b)][0], i, j) for i, a in enumerate(hulls) for j, b in enumerate(hulls) if i < j
+        ]
+        least, i, j = min(pairs)
+        if least > settings.concavity:
+            break
+        both = known[id(hulls[i]), id(hulls[j])][1]
+        hulls = [hull for k, hull in enumerate(hulls) if k not in (i, j)] + [both]
+    return hulls
+
+
+def _without_contained(hulls: list[ConvexMesh]) -> list[ConvexMesh]:
+    """Hulls without those that lie in one other."""
+    kept = sorted(hulls, key=lambda hull: float(np.prod(np.ptp(hull.vertices, axis=0))))
+    for hull in tuple(kept):
+        others = [planes_of(other) for other in kept if other is not hull]
+        if any((hull.vertices @ normals.T <= offsets).all() for normals, offsets in others):
+            kept.remove(hull)
+    return kept
+
+
+def split(triangles: Float[ndarray, "n 3 3"], size: "float | Float[ndarray, 'n']") -> Float[ndarray, "m 3 3"]:
+    """Halve triangles at their longest edge until no edge is longer than `size` [m]."""
+    sizes = np.broadcast_to(np.asarray(size, np.float64), len(triangles))
+    return _split(np.ascontiguousarray(triangles, np.float64), sizes**2)
+
+
+@njit(cache=True)
+def _split(triangles, squares):
+    out, count = np.empty((4 * len(triangles) + 64, 3, 3)), 0
+    open_ones = np.empty((DEEPEST + 2, 3, 3))
+    for t in range(len(triangles)):
+        open_ones[0], left = triangles[t], 1
+        while left > 0:
+            left -= 1
+            longest, k = -1.0, 0
+            for i in range(3):
+                j = (i + 1) % 3
+                square = 0.0
+                for d in range(3):
+                    square += (open_ones[left, i, d] - open_ones[left, j, d]) ** 2
+                if square > longest:
+                    longest, k = square, i
+            if longest <= squares[t] or left >= DEEPEST:
+                if count == len(out):
+                    out = np.concatenate((out, np.empty_like(out)))
+                out[count] = open_ones[left]
+                count += 1
+                continue
+            for d in range(3):
+                a, b = open_ones[left, k, d], open_ones[left, (k + 1) % 3, d]
+                c = open_ones[left, (k + 2) % 3, d]
+                middle = 0.5 * (a + b)
+                open_ones[left, 0, d], open_ones[left, 1, d], open_ones[left, 2, d] = a, middle, c
+                open_ones[left + 1, 0, d], open_ones[left + 1, 1, d] = middle, b
+                open_ones[left + 1, 2, d] = c
+            left += 2
+    return out[:count].copy()

@@ -1,0 +1,331 @@
+"""Spheres that cover the convex collision meshes of a link, sticking out little.
+
+The surface is cut into small triangles. A sphere is convex, so it covers a triangle if and only if it holds
+its three corners: a set of spheres in which every small triangle lies within one sphere provably covers the
+surface, not just samples of it.
+
+How large a sphere may be about a place is told by a grid (see sphere_room.py). For the cells given to one
+sphere, its best centre p is the minimum of max |corner - p| - room(p). Like Lloyd's algorithm, the fit
+alternates between giving each cell to the sphere that holds it with most room to spare and moving each sphere
+to its best centre. It starts from a greedy set cover and drops spheres as long as all have room.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.fitting.convex_parts import split
+from robotdiffuse.robots.robot import ConvexMesh, Robot
+from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
+    DIRECTIONS,
+    assign,
+    gaps,
+    greedy_cover,
+    held_by_one,
+    relax,
+    within,
+)
+from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Room, Solid, stacked_planes
+
+MARGIN = 1e-5
+"""Added to the radii [m]: covers rounding in files and in single-precision kernels."""
+BURIED = 1e-9
+"""What lies deeper in another part is no surface of the union [m]."""
+SLACK = 0.1
+"""Of the spacing of the grid, what room a sphere may lack."""
+COARSE, FINE = (5.0, 60_000), (8.0, 150_000)
+"""Cells to choose spheres by, and to fit them to in the end: how many to the radius of a disc, and in all."""
+APART = 0.02
+"""Spheres that are added at once begin at least so far from each other [m]."""
+
+
+@dataclass(frozen=True)
+class SphereSettings:
+    """How closely spheres follow the meshes of a link."""
+
+    first_half: float = 0.015
+    """How far a sphere may stick out of a link that half of the joints (rounded up) or fewer move [m]."""
+    second_half: float = 0.009
+    """The same for the links beyond, which work closer to obstacles [m]."""
+    fixed: float = 0.03
+    """The same for links that no planned joint moves, which nothing but the arm itself can meet [m]."""
+    relative: float = 1.0
+    """Never more than this times the radius of the largest sphere inside the link."""
+    finest: float = 0.004
+    """Nor less than this [m]."""
+    candidates: int = 1000
+    """Places inside the mesh that the greedy cover chooses from."""
+    rounds: int = 5
+    """Rounds of the alternation for each number of spheres."""
+    tries: int = 3
+    """Spheres that turn out to be needed before the others of a round are no longer asked."""
+    starts: int = 1
+    """Fits from different starts, of which the one with the fewest spheres is kept."""
+    most: int = 200
+    """Spheres of a link, about; where they do not suffice, they stick out further."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.finest <= min(self.first_half, self.second_half):
+            raise InputError(
+                f"sphere tolerances: finest is {self.finest}; it must be positive and at most first_half "
+                f"({self.first_half}) and second_half ({self.second_half})"
+            )
+
+    def scaled(self, size: float) -> "SphereSettings":
+        """For links that are so many times as large."""
+        lengths = ("first_half", "second_half", "fixed", "finest")
+        return replace(self, **{name: size * getattr(self, name) for name in lengths})
+
+    def tolerance(self, robot: Robot, link: str, inradius: float) -> float:
+        """How far the spheres of a link may stick out [m] whose largest inner sphere has this radius [m]."""
+        frame = robot.link_frame(link)
+        wanted = self.first_half if frame <= (robot.dof + 1) // 2 else self.second_half
+        if frame == 0:
+            wanted = max(wanted, self.fixed)
+        return float(max(min(wanted, self.relative * inradius), self.finest))
+
+
+def fit_spheres(
+    solid: Solid,
+    bounds: Bounds,
+    rng: np.random.Generator,
+    settings: SphereSettings = SphereSettings(),
+) -> Float[ndarray, "n 4"]:
+    """Spheres [x y z radius, m] that cover convex meshes, inside and surface, and keep within bounds."""
+    room = solid.room(bounds)
+    inside = solid.inside
+    # sticking out of a flat face by e, a sphere covers a disc of radius sqrt(2 r e); cells are much smaller
+    coarse, fine = (_Cells.of(solid, bounds, *size) for size in (COARSE, FINE))
+    covers = []
+    for _ in range(settings.starts):
+        places = rng.permutation(inside)[: settings.candidates] + rng.uniform(-0.5, 0.5, 3) * solid.spacing
+        centers = _thin_out(room, coarse, _first_cover(room, coarse, places, settings), settings)
+        covers.append(centers)
+    centers = _with_enough(room, fine, min(covers, key=len), settings)
+    centers, _ = _relax(room, fine, centers, settings.rounds, -np.inf)  # as little as so many can
+    return _without_holes(solid, inside, _with_radii(room, fine, centers))
+
+
+def stick_out(solid: Solid, spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "n"]:
+    """How far each sphere reaches out of the meshes [m]."""
+    return spheres[:, 3] - solid.as_room().at(spheres[:, :3])
+
+
+def covered(meshes: tuple[ConvexMesh, ...], spheres: Float[ndarray, "n 4"], finest: float = 2e-6) -> bool:
+    """Whether the spheres provably cover the surface of the union of the meshes.
+
+    Triangles that no one sphere holds are cut in four, until all are held, or a corner is found that is in
+    no sphere, or they are smaller than `finest` [m].
+    """
+    triangles = np.concatenate([mesh.vertices[mesh.faces] for mesh in meshes])
+    single = [stacked_planes((mesh,)) for mesh in meshes] if len(meshes) > 1 else []
+    while len(triangles):
+        corners = triangles.reshape(-1, 3)
+        held, bare = held_by_one(triangles, spheres)
+        is_open = ~held
+        for planes in single:
+            hidden = within(corners, *planes, BURIED)
+            is_open &= ~hidden.reshape(-1, 3).all(1)
+            bare &= ~hidden
+        if bare.any():
+            return False
+        triangles = triangles[is_open]
+        if len(triangles) and np.linalg.norm(np.ptp(triangles, axis=1), axis=1).min() < finest:
+            return False
+        a, b, c = np.moveaxis(triangles, 1, 0)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        triangles = np.concatenate([np.stack(quarter, axis=1) for quarter in quarters])
+    return True
+
+
+@dataclass(frozen=True, eq=False)
+class _Cells:
+    """Small triangles of the surface of the union of meshes."""
+
+    points: Float[ndarray, "p 3"]
+    corners: Int[ndarray, "c 3"]
+    """Indices into points."""
+    sharp: Bool[ndarray, "p"]
+    """Vertices of the meshes; all other points lie between neighbours on a face or an edge."""
+
+    @staticmethod
+    def of(solid: Solid, bounds: Bounds, cut: float, most: int) -> "_Cells":
+        """Triangles, without those inside another mesh, whose edges are a fraction of the largest disc that a
+        sphere within bounds can cover; a larger one where there would be more than `most`."""
+        soup, vertices, left_out = [], [], False
+        planes = [stacked_planes((mesh,)) for mesh in solid.meshes]
+        boxes = [(mesh.vertices.min(0), mesh.vertices.max(0)) for mesh in solid.meshes]
+        for k, mesh in enumerate(solid.meshes):
+            triangles = mesh.vertices[mesh.faces]
+            size = _disc(bounds.tolerance, solid.depth) / cut
+            triangles = split(triangles, size)
+            hidden = np.zeros(len(triangles), dtype=bool)
+            low, high = triangles.min(1), triangles.max(1)
+            for other, (lowest, highest) in enumerate(boxes):
+                if other != k:
+                    asked = np.flatnonzero(((low >= lowest) & (high <= highest)).all(1) & ~hidden)
+                    corners = triangles[asked].reshape(-1, 3)
+                    hidden[asked] = within(corners, *planes[other], BURIED).reshape(-1, 3).all(1)
+            triangles = triangles[~hidden]
+            if bounds.varies:
+                tolerances = bounds.tolerances(triangles.mean(1))
+                triangles = split(triangles, _disc(tolerances, solid.depth) / cut)
+            soup.append(triangles)
+            vertices.append(mesh.vertices)
+            left_out |= bool(hidden.any() or bounds.varies)
+        corners = np.concatenate(soup).reshape(-1, 3)
+        crowd = len(corners) / 3 / most
+        if crowd > 1:
+            return _Cells.of(solid, bounds, cut / np.sqrt(1.1 * crowd), most)
+        points = np.concatenate([*vertices, corners])
+        lattice = np.round((points - points.min(0)) * (2**20 / np.ptp(points, axis=0).max())).astype(np.int64)
+        _, first, index = np.unique(lattice @ (1, 2**21, 2**42), return_index=True, return_inverse=True)
+        count = len(points) - len(corners)
+        points = points[first]
+        sharp = np.zeros(len(points), dtype=bool)
+        sharp[index.ravel()[:count]] = True
+        # where triangles were left out, any point may be a corner of what is left
+        sharp |= left_out
+        return _Cells(points, index.ravel()[count:].reshape(-1, 3), sharp)
+
+    def assigned(self, room: Room, centers: Float[ndarray, "n 3"]) -> "_Assignment":
+        count = len(self.corners)
+        owner, heir = np.empty(count, np.int64), np.empty(count, np.int64)
+        least, second = np.empty(count), np.empty(count)
+        assign(self.points, self.corners, centers, room.at(centers), owner, least, heir, second)
+        return _Assignment(owner, least, heir, second)
+
+    def part(self, mine: Bool[ndarray, "c"]) -> "_Cells":
+        """Some of the cells; points on their border count as vertices, for what is beyond holds them."""
+        outside = np.zeros(len(self.points), dtype=bool)
+        outside[self.corners[~mine]] = True
+        used, index = np.unique(self.corners[mine], return_inverse=True)
+        return _Cells(self.points[used], index.reshape(-1, 3), (self.sharp | outside)[used])
+
+
+class _Assignment(NamedTuple):
+    """Which sphere each cell is given to."""
+
+    owner: Int[ndarray, "c"]
+    """The one that holds it with most room to spare."""
+    least: Float[ndarray, "c"]
+    """What that one lacks [m]."""
+    heir: Int[ndarray, "c"]
+    """The next best one; -1 if there is none."""
+    second: Float[ndarray, "c"]
+    """What that one lacks [m]."""
+
+
+def _relax(
+    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], rounds: int, enough: float
+) -> tuple[Float[ndarray, "n 3"], float]:
+    """Better centres, and how much room the worst sphere lacks [m]; ends early at `enough`."""
+    return relax(cells.points, cells.corners, cells.sharp, centers, rounds, enough, *room.arrays, DIRECTIONS)
+
+
+def _first_cover(
+    room: Room, cells: _Cells, places: Float[ndarray, "n 3"], settings: SphereSettings
+) -> Float[ndarray, "k 3"]:
+    """Centres from a greedy set cover."""
+    chosen = greedy_cover(cells.points, cells.corners, places, room.at(places))
+    return _with_enough(room, cells, places[chosen], settings)
+
+
+def _with_enough(
+    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
+) -> Float[ndarray, "m 3"]:
+    """Centres moved, with more until all spheres have the room that they need."""
+    enough = room.spacing * SLACK
+    centers, worst = _relax(room, cells, centers, settings.rounds, enough)
+    while worst > enough and len(centers) < settings.most:
+        lacking = cells.assigned(room, centers).least
+        extra = _apart(cells.points[cells.corners].mean(1), lacking, len(centers) // 20 + 1)
+        centers, worst = _relax(room, cells, np.concatenate([centers, extra]), settings.rounds, enough)
+    return centers
+
+
+def _apart(points: Float[ndarray, "c 3"], lacking: Float[ndarray, "c"], count: int) -> Float[ndarray, "k 3"]:
+    """The points that lack most, none close to another."""
+    order = np.argsort(-lacking)[: max(1, int((lacking > 0).sum()))]
+    points, chosen = points[order], []
+    while len(points) and len(chosen) < count:
+        chosen.append(points[0])
+        points = points[np.linalg.norm(points - points[0], axis=1) > APART]
+    return np.array(chosen)
+
+
+def _thin_out(
+    room: Room, cells: _Cells, centers: Float[ndarray, "n 3"], settings: SphereSettings
+) -> Float[ndarray, "m 3"]:
+    """Drop spheres, those first whose cells the others take over best, as long as there is room.
+
+    Only those that take over cells are moved for it.
+    """
+    enough = room.spacing * SLACK
+    centers, kept = centers.copy(), np.zeros(len(centers), dtype=bool)
+    while len(centers) > 1:
+        given = cells.assigned(room, centers)
+        loss = np.full(len(centers), -np.inf)
+        np.maximum.at(loss, given.owner, given.second)
+        dropped, moved, failures = np.zeros_like(kept), np.zeros_like(kept), 0
+        for i in np.argsort(loss):
+            heirs = np.unique(given.heir[given.owner == i])
+            if kept[i] or moved[i] or moved[heirs].any():
+                continue
+            if not len(heirs):
+                dropped[i] = True
+                continue
+            among = np.zeros(len(centers), dtype=bool)
+            among[i] = among[heirs] = True
+            part = cells.part(among[given.owner])
+            rest, worst = _relax(room, part, centers[heirs], settings.rounds, enough)
+            if worst > enough:
+                kept[i], failures = True, failures + 1
+                if failures == settings.tries:
+                    break
+                continue
+            centers[heirs], dropped[i] = rest, True
+            moved |= among
+        if not dropped.any():
+            break
+        kept &= ~moved
+        centers, kept = centers[~dropped], kept[~dropped]
+    return centers
+
+
+def _with_radii(room: Room, cells: _Cells, centers: Float[ndarray, "n 3"]) -> Float[ndarray, "m 4"]:
+    """Least radii with which each sphere holds its own cells; spheres without any are dropped."""
+    owner = cells.assigned(room, centers).owner
+    radii = np.zeros(len(centers))
+    far = np.linalg.norm(cells.points[cells.corners] - centers[owner][:, None], axis=2).max(1)
+    np.maximum.at(radii, owner, far + MARGIN)
+    return np.concatenate([centers, radii[:, None]], axis=1)[radii > 0]
+
+
+def _without_holes(
+    solid: Solid, inside: Float[ndarray, "g 3"], spheres: Float[ndarray, "n 4"]
+) -> Float[ndarray, "m 4"]:
+    """Fill holes inside the meshes, where a small obstacle could hide, from the deepest place on."""
+    depth = solid.as_room().at(inside)
+    gap = gaps(inside, spheres)
+    # nothing between the grid's points is further from them than half of a cube's diagonal
+    half = np.sqrt(0.75) * solid.spacing
+    is_open = gap > np.where(depth > 2 * half, -half, 0.0)
+    inside, depth, extra = inside[is_open], depth[is_open], []
+    while len(inside):
+        deepest = int(depth.argmax())
+        extra.append(np.append(inside[deepest], max(depth[deepest], half)))
+        is_open = np.linalg.norm(inside - inside[deepest], axis=1) > extra[-1][3] - half
+        is_open[deepest] = False
+        inside, depth = inside[is_open], depth[is_open]
+    return np.concatenate([spheres, np.reshape(extra, (-1, 4))])
+
+
+def _disc(tolerance: Any, depth: float) -> Any:
+    """Radius of what a sphere covers of a face [m] that sticks out by a tolerance, from a depth."""
+    return np.sqrt(2 * tolerance * depth + tolerance**2)

@@ -1,0 +1,232 @@
+"""Which joints of a URDF's tree are an arm: chains that end where a gripper or a hand begins; or several."""
+
+import re
+from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
+
+from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
+from robotdiffuse.robots.parsing.srdf import Srdf
+
+GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb", re.IGNORECASE)
+"""In the name of a joint: it is a gripper's, if few joints follow it."""
+BOTH, ALL = "both", "all"
+"""Groups of all arms of a robot: of two, and of any number."""
+ENDINGS = "_-/0123456789 "
+"""Of what the names of an arm's joints have in common."""
+PINCH, GRASP = 2, 3
+"""Movable joints in a row that a way from a branching has at most if the branching is a gripper's: of two
+ways, as two fingers are, and of more."""
+ARM = 4
+"""Movable joints in a row that an arm has at least where there are several chains. After so many, three or
+more ways are a hand's, however long its fingers."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A chain of movable joints and the link that it ends with."""
+
+    joints: tuple[str, ...]
+    tip: str
+    own: int
+    """How many of the joints come after the last branching above the arm."""
+
+    @property
+    def name(self) -> str:
+        """What its own joints' names have in common at their beginning, else the tip."""
+        columns = zip(*self.joints[-self.own :], strict=False)
+        same = takewhile(lambda letters: len({*letters}) == 1, columns)
+        common = "".join(letters[0] for letters in same).rstrip(ENDINGS)
+        return common.removesuffix("joint").rstrip("_-/ ") or self.tip
+
+
+class JointTree:
+    """The movable joints below a link."""
+
+    def __init__(self, base: str, joints: list[Joint]) -> None:
+        """`joints` as in `Robot.joints`: all below the base, parents before children."""
+        self.base = base
+        self.below: dict[str, list[Joint]] = {}
+        self.moving: dict[str, int] = {}
+        """Independent movable joints in a row below each link, at most."""
+        self.moved: set[str] = set()
+        """Links with a movable joint below them, be it one that follows another."""
+        depth: dict[str, int] = {}
+        for joint in joints:
+            self.below.setdefault(joint.parent, []).append(joint)
+        for joint in reversed(joints):
+            self.moving[joint.parent] = max(self.moving.get(joint.parent, 0), self._way(joint))
+            depth[joint.parent] = max(depth.get(joint.parent, 0), depth.get(joint.child, 0) + 1)
+            if joint.kind in MOVING_KINDS or joint.child in self.moved:
+                self.moved.add(joint.parent)
+        self._depth = depth
+
+    def _way(self, joint: Joint) -> int:
+        drives = joint.kind in MOVING_KINDS and joint.mimic is None
+        return self.moving.get(joint.child, 0) + drives
+
+    def arms(self) -> list[Arm]:
+        """The chains that could be meant: arms where there are some, else the longest chains."""
+        found = self._from(self.base, (), 0)
+        own = [arm for arm in found if arm.own >= ARM]
+        longest = max((len(arm.joints) for arm in found), default=0)
+        return own or [arm for arm in found if len(arm.joints) == longest]
+
+    def _from(self, link: str, chain: tuple[str, ...], own: int) -> list[Arm]:
+        while True:
+            ways = [j for j in self.below.get(link, []) if j.kind in MOVING_KINDS or j.child in self.moved]
+            if chain and self._holds(ways, own):
+                return [Arm(chain, link, own)]
+            if len(ways) > 1:
+                branches = [self._from(j.child, *self._with(j, chain, 0)) for j in ways]
+                return [arm for branch in branches for arm in branch]
+            if not ways:
+                return [Arm(chain, self._end(link), own)] if own else []
+            chain, own = self._with(ways[0], chain, own)
+            link = ways[0].child
+
+    def _with(self, joint: Joint, chain: tuple[str, ...], own: int) -> tuple[tuple[str, ...], int]:
+        return ((*chain, joint.name), own + 1) if joint.kind in MOVING_KINDS else (chain, own)
+
+    def _holds(self, ways: list[Joint], own: int) -> bool:
+        """Whether a gripper or a hand begins where these joints branch off, `own` joints after the last."""
+        rows = [self._way(joint) for joint in ways]
+        if len(ways) == 1:
+            jaw = ways[0].kind in MOVING_KINDS and GRIPPER.search(ways[0].name)
+            return bool(jaw) and rows[0] <= GRASP
+        if len(ways) == 2:
+            return max(rows) <= PINCH
+        return len(ways) > 2 and (max(rows) <= GRASP or own >= ARM)
+
+    def _end(self, link: str) -> str:
+        """The deepest link that fixed joints connect with a link."""
+        while self.below.get(link):
+            link = max(self.below[link], key=lambda joint: self._depth.get(joint.child, 0)).child
+        return link
+
+
+def planned_joints(
+    file: Path, base: str, joints: list[Joint], tip: str | None, group: str | None, srdf: Srdf | None
+) -> tuple[set[str], list[str]]:
+    """Names of the joints that are planned if they are not locked, and the tips: several of a group that is a
+    tree, as two arms are.
+
+    `joints` are all below the base, parents before children. Raises InputError for an unknown tip or group, a
+    group of joints that do not all lead to the tip that is named, and several arms of which none is chosen.
+    """
+    above = {joint.child: joint for joint in joints}
+    if tip is not None and tip not in (base, *above):
+        raise unknown_name(f"tip link below {base} in {file.name}", tip, [base, *above])
+    chosen: list[str] | None = None
+    if group is not None and srdf is not None and group in srdf.groups:
+        chosen = [joint.name for joint in srdf.joints(group, tuple(joints))]
+        if not chosen:
+            raise InputError(f"{srdf.path}: group {group} has no movable joint below {base}")
+        tips = _ends(chosen, above, srdf.tips(group)) if tip is None else [tip]
+    elif group is not None or tip is None:
+        arms = JointTree(base, joints).arms()
+        groups = [] if srdf is None else list(srdf.groups)
+        found = _one_arm(file, arms, groups) if group is None else _named_arms(file, arms, group, groups)
+        tips = [tip] if tip else [arm.tip for arm in found] or [base]
+    else:
+        tips = [tip]
+    leading = [joint for end in tips for joint in chain(above, end) if joint.kind in MOVING_KINDS]
+    off = [name for name in chosen or () if name not in {joint.name for joint in leading}]
+    if off:
+        raise InputError(
+            f"{file}: {', '.join(off)} of group {group} do not lead to {tip}; leave out --tip, or choose a "
+            f"group of one arm"
+        )
+    passive = frozenset() if srdf is None else srdf.passive
+    names = {joint.name for joint in leading if joint.mimic is None and joint.name not in passive}
+    return names if chosen is None else names & {*chosen}, tips
+
+
+def _ends(chosen: list[str], above: dict[str, Joint], written: list[str]) -> list[str]:
+    """Where a group's joints end: at the tips of the chains that it is written as, else at last links."""
+    last = {joint.child: joint.child for joint in above.values() if joint.name in chosen}
+    for link in [*last]:
+        for joint in chain(above, link)[:-1]:
+            last.pop(joint.child, None)
+    for tip in written:
+        on_way = [joint.child for joint in chain(above, tip) if joint.child in last]
+        if on_way:
+            last[on_way[-1]] = tip
+    return list(last.values())
+
+
+def passive_notes(srdf: Srdf | None, joints: list[Joint]) -> list[str]:
+    """What a robot says of the passive joints that it holds."""
+    passive = frozenset() if srdf is None else srdf.passive
+    return [f"joint {joint.name} is passive; it is held" for joint in joints if joint.name in passive]
+
+
+def chain(above: dict[str, Joint], tip: str) -> list[Joint]:
+    """The joints that lead to a link, from the base on; `above` is the joint above each link."""
+    joints: list[Joint] = []
+    while tip in above:
+        joints.append(above[tip])
+        tip = above[tip].parent
+    return joints[::-1]
+
+
+def refuse_linkages(file: Path, robot: Robot) -> None:
+    """Joints that follow a planned one would move, and are held: InputError if they move geometry."""
+    by_name = {joint.name: joint for joint in robot.joints}
+    above = {joint.child: joint for joint in robot.joints}
+    for joint in robot.joints:
+        leader = joint
+        while leader.mimic is not None:
+            leader = by_name[leader.mimic.joint]
+        if joint.mimic is None or leader.name in robot.locked:
+            continue
+        if any(joint in chain(above, link) for link in (*robot.meshes, *robot.tips)):
+            raise InputError(
+                f"{file}: joint {joint.name} follows {leader.name}, which is planned; linkages are not "
+                f"supported: hold it with --lock {leader.name}=VALUE, or end the arm above it with --tip"
+            )
+
+
+def _one_arm(file: Path, arms: list[Arm], groups: list[str]) -> list[Arm]:
+    """The only arm of a robot, if it has any; InputError, which lists them, if there are several.
+
+    `groups` are names that may be chosen besides, those of its SRDF.
+    """
+    if len(arms) < 2:
+        return arms
+    raise InputError(
+        f"{file} has {len(arms)} arms: {_listed(arms)}; choose one, or {_together(arms)} as one robot: "
+        f"robotdiffuse robot add {file.name} --group {_names_of(arms)[0]}"
+        + (f" (groups of its SRDF: {', '.join(groups)})" if groups else "")
+    )
+
+
+def _named_arms(file: Path, arms: list[Arm], name: str, groups: list[str]) -> list[Arm]:
+    """The arm that a name of `_names_of` or a tip stands for, or all; InputError, which lists them, for
+    others."""
+    names = _names_of(arms)
+    chosen = [arm for arm, its in zip(arms, names, strict=True) if name in (its, arm.tip)]
+    if chosen:
+        return chosen[:1]
+    together = {ALL, _together(arms)} if len(arms) > 1 else set[str]()
+    if name in together:
+        return arms
+    raise unknown_name(f"group of {file}", name, [*names, *sorted(together), *groups])
+
+
+def _together(arms: list[Arm]) -> str:
+    return BOTH if len(arms) == 2 else ALL
+
+
+def _names_of(arms: list[Arm]) -> list[str]:
+    """The arms' names, or their tips where two have the same name."""
+    names = [arm.name for arm in arms]
+    return [arm.tip if names.count(arm.name) > 1 else arm.name for arm in arms]
+
+
+def _listed(arms: list[Arm]) -> str:
+    return ", ".join(
+        f"{name} ({len(arm.joints)} joints to {arm.tip})"
+        for name, arm in zip(_names_of(arms), arms, strict=True)
+    )

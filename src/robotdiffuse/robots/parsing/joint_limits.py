@@ -1,0 +1,90 @@
+"""Joint limits from a file, in the form of MoveIt's joint_limits.yaml."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+from robotdiffuse.core.bounds import FASTEST, LARGEST
+from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.robots.robot import MOVING_KINDS, Joint, Robot
+from robotdiffuse.robots.parsing.urdf import ACCELERATION_PER_VELOCITY, JERK_PER_ACCELERATION
+
+FIELDS = {
+    "min_position": "lower",
+    "max_position": "upper",
+    "max_velocity": "velocity",
+    "max_acceleration": "acceleration",
+    "max_jerk": "jerk",
+}
+FLAGS = (
+    "has_position_limits",
+    "has_velocity_limits",
+    "has_acceleration_limits",
+    "has_jerk_limits",
+)
+
+
+def read_limits(file: str | Path) -> dict[str, dict[str, float]]:
+    """Limits by joint and field of Joint, from a YAML or JSON file.
+
+    It holds joint_limits: {JOINT: {max_velocity: 2.0}}, with the fields min_position, max_position,
+    max_velocity, max_acceleration, max_jerk; MoveIt's has_..._limits are accepted, and a field whose flag is
+    false is left out. Raises InputError naming the joint and the field.
+    """
+    data = read_yaml(file, "joint limits")
+    joints = data.get("joint_limits") if isinstance(data, dict) else None
+    if not isinstance(joints, dict):
+        raise InputError(
+            f"{file} holds no joint_limits; it must be joint_limits: {{JOINT: {{max_velocity: ...}}}}"
+        )
+    return {str(name): _fields(str(file), str(name), entry) for name, entry in joints.items()}
+
+
+def with_limits(robot: Robot, limits: dict[str, dict[str, float]]) -> Robot:
+    """The robot with other limits; acceleration and jerk follow a new velocity unless they are given too. A
+    continuous joint that is given a position is revolute from then on, within half a turn either way."""
+    movable = {joint.name: joint for joint in robot.joints if joint.kind in MOVING_KINDS}
+    for name in limits:
+        if name not in movable:
+            raise unknown_name("joint in joint_limits", name, movable)
+    changed = [
+        _changed(joint, limits[joint.name]) if joint.name in limits else joint for joint in robot.joints
+    ]
+    return replace(robot, joints=tuple(changed))
+
+
+def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
+    if not isinstance(entry, dict):
+        raise InputError(f"{file}: joint_limits of {joint} is {shown(entry)}; it must be a mapping")
+    fields: dict[str, float] = {}
+    for key, value in entry.items():
+        if key in FLAGS:
+            continue
+        if key not in FIELDS:
+            raise unknown_name(f"field of {joint} in {file}", key, FIELDS)
+        kind = "position" if key.endswith("position") else key.removeprefix("max_")
+        if entry.get(f"has_{kind}_limits") is False:
+            continue
+        most = LARGEST if kind == "position" else FASTEST
+        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or abs(value) > most or (kind != "position" and value <= 0):
+            raise InputError(
+                f"{file}: {key} of {joint} is {shown(value)}; it must be a number within "
+                f"±{most:g}, above 0 for a rate"
+            )
+        fields[FIELDS[key]] = float(value)
+    return fields
+
+
+def _changed(joint: Joint, fields: dict[str, float]) -> Joint:
+    if "velocity" in fields and "acceleration" not in fields:
+        fields = fields | {"acceleration": ACCELERATION_PER_VELOCITY * fields["velocity"]}
+    if "acceleration" in fields and "jerk" not in fields:
+        fields = fields | {"jerk": JERK_PER_ACCELERATION * fields["acceleration"]}
+    if joint.kind == "continuous" and {"lower", "upper"} & fields.keys():
+        joint = replace(joint, kind="revolute", lower=-math.pi, upper=math.pi)
+    lower, upper = fields.get("lower", joint.lower), fields.get("upper", joint.upper)
+    if lower > upper:
+        raise InputError(f"joint_limits of {joint.name}: min_position {lower} is above max_position {upper}")
+    return replace(joint, **fields)

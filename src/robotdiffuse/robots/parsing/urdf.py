@@ -1,0 +1,450 @@
+"""Reading a serial arm from a URDF file."""
+
+import hashlib
+import xml.etree.ElementTree as ET
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.bounds import FASTEST, LARGEST, SMALLEST, points, within
+from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.input_files import parse_xml, read_triangles
+from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull
+from robotdiffuse.robots.parsing.joint_groups import passive_notes, planned_joints, refuse_linkages
+from robotdiffuse.robots.inertias import Inertia, inertia_of
+from robotdiffuse.robots.parsing.mobile_bases import moves_in_a_plane
+from robotdiffuse.robots.parsing.packages import Packages, urdf_text
+from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
+from robotdiffuse.robots.parsing.srdf import Srdf
+from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
+
+MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+KINDS = (*MOVING_KINDS, "fixed")
+MOST_LINKS = 500
+"""Of a robot; humanoids with hands have about 100."""
+DEFAULT_VELOCITY = 1.0
+"""For movable joints whose URDF gives none [rad/s] or [m/s]."""
+ACCELERATION_PER_VELOCITY = 4.0
+"""URDF has no acceleration limit: full speed after a quarter of a second [1/s]."""
+JERK_PER_ACCELERATION = 10.0
+"""Nor one for jerk: full acceleration after a tenth of a second [1/s]."""
+
+
+def read_urdf(
+    path: str | Path,
+    base: str | None = None,
+    tip: str | None = None,
+    locked: dict[str, float] | None = None,
+    group: str | None = None,
+    srdf: Srdf | None = None,
+    packages: dict[str, str | Path] | None = None,
+) -> Robot:
+    """A robot from a URDF or xacro file, see `UrdfTree.robot`; `packages` are folders by name, see
+    `robots.parsing.packages`."""
+    return UrdfTree(Path(path), packages or {}).robot(base, tip, locked, group, srdf)
+
+
+@dataclass
+class UrdfTree:
+    """The links and joints of one URDF file, checked as they are read."""
+
+    path: Path
+    folders: dict[str, str | Path]
+    """Of packages by name."""
+    notes: list[str] = field(default_factory=list)
+    _surfaces: dict[str, tuple[Surface, ...]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.packages = Packages(self.path, self.folders)
+        self.text = urdf_text(self.path, self.packages)
+        root = parse_xml(self.text, str(self.path))
+        if root.tag != "robot":
+            raise InputError(
+                f"{self.path} is not a URDF: its root element is <{root.tag}>, not <robot>; "
+                f"convert other formats to URDF first"
+            )
+        self.name = root.get("name") or self.path.stem
+        self.links = {self._name(link, "link"): link for link in root.findall("link")}
+        if len(self.links) > MOST_LINKS:
+            raise InputError(f"{self.path} has {len(self.links)} links; at most {MOST_LINKS} are read")
+        solid = any(link.find("collision") is not None for link in self.links.values())
+        self.kind = "collision" if solid else "visual"
+        """The elements of links that are their geometry."""
+        self.elements = {self._name(joint, "joint"): joint for joint in root.findall("joint")}
+        self.parents: dict[str, str] = {}
+        """The joint above each link but the root."""
+        self.children: dict[str, list[str]] = {}
+        for name, element in self.elements.items():
+            parent, child = self._end(name, element, "parent"), self._end(name, element, "child")
+            if child in self.parents:
+                raise InputError(
+                    f"{self.path}: link {child} has two parent joints ({self.parents[child]}, {name}); a "
+                    f"URDF is a tree: leave one out, and let the joints that close the loop mimic others"
+                )
+            self.parents[child] = name
+            self.children.setdefault(parent, []).append(name)
+        roots = [link for link in self.links if link not in self.parents]
+        if len(roots) != 1:
+            raise InputError(
+                f"{self.path}: a URDF has one root link, this one has {len(roots)}"
+                + (f" ({', '.join(roots[:5])}); connect them with fixed joints" if roots else ": a loop")
+            )
+        self.root = roots[0]
+
+    def robot(
+        self,
+        base: str | None = None,
+        tip: str | None = None,
+        locked: dict[str, float] | None = None,
+        group: str | None = None,
+        srdf: Srdf | None = None,
+    ) -> Robot:
+        """A robot from a URDF or xacro file, with convex collision meshes and without spheres.
+
+        `base` is the root of the tree by default; where it stands in the root's frame is kept, for scenes
+        that are given there, while links above it are left out. `group` names a group of the SRDF, or an arm
+        by what the names of its joints begin with, or is "both" or "all"; `tip` a link. A group of several
+        chains, as of two arms, is one robot with several tips. Without both, the robot must have one arm:
+        from the base as far as the link where a gripper or a hand begins (`robots.parsing.joint_groups` tells how these are
+        known), else to the deepest link. So it is panda_hand for a Panda with fingers.
+
+        Planned are the movable joints of the group, or all from base to tip; less passive ones and those that
+        mimic others. All other joints are locked: at what `locked` says, in a pose of the SRDF, or at zero
+        clipped into their limits; mimic joints where the joint that they follow puts them.
+
+        Acceleration and jerk limits, which URDF lacks, are 4 / s times the velocity and 10 / s times the
+        acceleration (see limits.py to set them). Collision elements become convex hulls in the link's frame;
+        cylinders, capsules and spheres become polyhedra around them. If no link has any, visual ones are
+        taken, with a note.
+
+        Raises InputError, one line that names the file, for anything missing or contradictory in it.
+        """
+        base = base or self.root
+        if base not in self.links:
+            raise unknown_name(f"base link in {self.path.name}", base, self.links)
+        joints = self.below(base)
+        names = [base, *(joint.child for joint in joints)]
+        planned, ends = planned_joints(self.path, base, joints, tip, group, srdf)
+        meshes, inertias = self.geometry(names), self.inertias(names)
+        robot = Robot(
+            name=self.name,
+            base=base,
+            tip=ends[0],
+            other_tips=tuple(ends[1:]),
+            joints=tuple(joints),
+            meshes={link: parts for link, parts in meshes.items() if parts},
+            notes=(*self.notes, *passive_notes(srdf, joints)),
+            root=self.carried(base),
+            above=self.above(base),
+            poses={} if srdf is None else dict(srdf.poses),
+            inertias=inertias,
+        )
+        resting = {} if srdf is None else srdf.resting()
+        rest = {
+            joint.name: float(np.clip(resting.get(joint.name, 0.0), joint.lower, joint.upper))
+            for joint in joints
+            if joint.kind in MOVING_KINDS and (joint.name not in planned or joint.lower == joint.upper)
+        }
+        robot = replace(robot, locked=following(robot.joints, rest)).with_locked(locked or {})
+        if robot.dof == 0:
+            raise InputError(
+                f"{self.path}: no movable joint between {base} and {ends[0]}; choose another --base or --tip"
+            )
+        refuse_linkages(self.path, robot)
+        return robot
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the URDF, compiled if it is a xacro file, and of the collision meshes it names: equal if
+        the robot is."""
+        digest = hashlib.sha256(self.text)
+        for element in self.links.values():
+            for mesh in element.findall(f"{self.kind}/geometry/mesh"):
+                digest.update(self.packages.file(mesh.get("filename", "")).read_bytes())
+        return digest.hexdigest()
+
+    def _name(self, element: ET.Element, what: str) -> str:
+        name = element.get("name")
+        if not name:
+            raise InputError(f"{self.path}: a <{what}> has no name")
+        return name
+
+    def _end(self, name: str, element: ET.Element, what: str) -> str:
+        end = element.find(what)
+        link = "" if end is None else end.get("link", "")
+        if link not in self.links:
+            raise InputError(f"{self.path}: joint {name}: its {what} link {shown(link)} is not in the file")
+        return link
+
+    def _numbers(self, text: str, count: int, what: str, most: float = LARGEST) -> Float[ndarray, "n"]:
+        try:
+            values = np.array([float(word) for word in text.split()])
+        except ValueError:
+            values = np.zeros(0)
+        if len(values) != count or not np.isfinite(values).all():
+            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be {count} finite number(s)")
+        if not within(values, most):
+            raise InputError(f"{self.path}: {what} is {shown(text)}; it must be within ±{most:g}")
+        return values
+
+    def _origin(self, element: ET.Element, what: str) -> Float[ndarray, "4 4"]:
+        origin = element.find("origin")
+        if origin is None:
+            return np.eye(4)
+        rpy = self._numbers(origin.get("rpy", "0 0 0"), 3, f"{what}: origin rpy")
+        xyz = self._numbers(origin.get("xyz", "0 0 0"), 3, f"{what}: origin xyz")
+        return transform(xyz, rotation_from_rpy(*map(float, rpy)))
+
+    def below(self, link: str) -> list[Joint]:
+        """Joints below a link, parents before children."""
+        joints: list[Joint] = []
+        for name in self.children.get(link, []):
+            joints.append(self._joint(name))
+            joints += self.below(joints[-1].child)
+        return joints
+
+    def above(self, link: str) -> dict[str, Float[ndarray, "4 4"]]:
+        """T_link_ancestor of the links above a link, up to the first movable joint."""
+        found: dict[str, ndarray] = {}
+        T_link_ancestor = np.eye(4)
+        while link in self.parents:
+            name = self.parents[link]
+            element = self.elements[name]
+            if element.get("type") != "fixed":
+                break
+            link = self._end(name, element, "parent")
+            T_link_ancestor = T_link_ancestor @ inverse(self._origin(element, f"joint {name}"))
+            found[link] = T_link_ancestor
+        return found
+
+    def carried(self, link: str) -> str:
+        """What a scene that places the robot places, on the way to a link: the root, or what a mobile base
+        without geometry carries, be it one joint or three."""
+        way: list[str] = []
+        end = link
+        while end in self.parents:
+            way.insert(0, self.parents[end])
+            end = self._end(way[0], self.elements[way[0]], "parent")
+        bare = [self.links[self.root].find(kind) is None for kind in ("collision", "visual")]
+        for k, name in enumerate(way, 1):
+            if not all(bare):
+                break
+            child = self._end(name, self.elements[name], "child")
+            if self.elements[name].get("type") in ("planar", "floating"):
+                return child
+            if moves_in_a_plane([self._joint(above) for above in way[:k]]):
+                return child
+            bare += [self.links[child].find(kind) is None for kind in ("collision", "visual")]
+        return self.root
+
+    def _joint(self, name: str) -> Joint:
+        element = self.elements[name]
+        what = f"joint {name}"
+        kind = element.get("type", "")
+        if kind not in KINDS:
+            child = self._end(name, element, "child")
+            raise InputError(
+                f"{self.path}: {what} has type {shown(kind)}; supported: {', '.join(KINDS)}; "
+                f"--base {child} plans what is on {child} as it stands"
+            )
+        axis_element = element.find("axis")
+        axis = np.array([1.0, 0.0, 0.0])
+        if axis_element is not None and kind != "fixed":
+            axis = self._numbers(axis_element.get("xyz", "1 0 0"), 3, f"{what}: axis")
+            if np.linalg.norm(axis) < 1e-6:
+                raise InputError(f"{self.path}: {what}: its axis is zero; give it a direction")
+            axis = axis / np.linalg.norm(axis)
+        joint = Joint(
+            name=name,
+            kind=kind,
+            parent=self._end(name, element, "parent"),
+            child=self._end(name, element, "child"),
+            T_parent_joint=self._origin(element, what),
+            axis=axis,
+            mimic=None if kind == "fixed" else self._mimic(name, element),
+        )
+        return joint if kind == "fixed" else self._with_limits(joint, element.find("limit"))
+
+    def _mimic(self, name: str, element: ET.Element) -> Mimic | None:
+        followed = element.find("mimic")
+        if followed is None:
+            return None
+        leaders, leader, last = [name], followed, followed
+        while leader is not None:
+            leaders.append(leader.get("joint", ""))
+            if leaders[-1] not in self.elements or leaders[-1] in leaders[:-1]:
+                raise InputError(
+                    f"{self.path}: joint {leaders[-2]} mimics {shown(leaders[-1])}; it must be another "
+                    f"joint of the file that does not follow it"
+                )
+            last, leader = leader, self.elements[leaders[-1]].find("mimic")
+        if self.elements[leaders[-1]].get("type") == "fixed" or last is None:
+            self.notes.append(f"joint {name} mimics the fixed joint {leaders[-1]}; taken as independent")
+            return None
+        what = f"joint {name}: mimic"
+        multiplier = self._numbers(followed.get("multiplier", "1"), 1, f"{what} multiplier")
+        offset = self._numbers(followed.get("offset", "0"), 1, f"{what} offset")
+        return Mimic(leaders[1], float(multiplier[0]), float(offset[0]))
+
+    def _with_limits(self, joint: Joint, limit: ET.Element | None) -> Joint:
+        given: dict[str, float] = {}
+        for what in ("lower", "upper", "velocity"):
+            if limit is not None and limit.get(what) is not None:
+                text, most = limit.get(what, ""), FASTEST if what == "velocity" else LARGEST
+                given[what] = float(self._numbers(text, 1, f"joint {joint.name}: {what} limit", most)[0])
+        if joint.kind == "continuous":
+            given["lower"], given["upper"] = -TURNS, TURNS
+        if "lower" not in given and "upper" not in given:
+            raise InputError(
+                f"{self.path}: joint {joint.name} is {joint.kind} and has no <limit lower= upper=>"
+            )
+        lower, upper = given.get("lower", 0.0), given.get("upper", 0.0)
+        if lower > upper:
+            raise InputError(f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}")
+        velocity = given.get("velocity", 0.0)
+        if velocity <= 0:
+            velocity = DEFAULT_VELOCITY
+            self.notes.append(f"joint {joint.name} has no velocity limit; {velocity:g} taken")
+        acceleration = ACCELERATION_PER_VELOCITY * velocity
+        jerk = JERK_PER_ACCELERATION * acceleration
+        return replace(
+            joint,
+            lower=lower,
+            upper=upper,
+            velocity=velocity,
+            acceleration=acceleration,
+            jerk=jerk,
+            effort=self._effort(joint.name, limit),
+        )
+
+    def _effort(self, name: str, limit: ET.Element | None) -> float:
+        """0 where none is given, or one that cannot be used: most robots are planned without."""
+        if limit is None or limit.get("effort") is None:
+            return 0.0
+        try:
+            effort = self._numbers(limit.get("effort", ""), 1, f"joint {name}: effort limit")[0]
+        except InputError:
+            return 0.0
+        return max(float(effort), 0.0)
+
+    def inertias(self, links: list[str]) -> dict[str, Inertia]:
+        """Of the links that have a mass; those that no body can have are left out, with a note."""
+        found = {}
+        for link in links:
+            element = self.links[link].find("inertial")
+            mass = None if element is None else element.find("mass")
+            if element is None or mass is None or mass.get("value", "").strip() in ("0", "0.0"):
+                continue
+            try:
+                found[link] = self._inertia(element, f"link {link}: inertial")
+            except (InputError, ValueError):
+                self.notes.append(f"link {link} has an inertia that no body has; left out")
+        return found
+
+    def _inertia(self, element: ET.Element, what: str) -> Inertia:
+        mass, inertia = element.find("mass"), element.find("inertia")
+        value = "" if mass is None else mass.get("value", "")
+        mass = self._numbers(value, 1, what)[0]
+        of = {} if inertia is None else inertia.attrib
+        xx, xy, xz, yy, yz, zz = (self._numbers(of.get(name, ""), 1, what)[0] for name in MOMENTS)
+        T = self._origin(element, what)
+        R = T[:3, :3]
+        moments = R @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ R.T
+        return inertia_of([mass, *T[:3, 3], *moments[np.triu_indices(3)]])
+
+    def geometry(self, links: list[str]) -> dict[str, tuple[ConvexMesh, ...]]:
+        """Hulls of the links' collision elements by link, in its frame; of their visual ones if no link of
+        the file has any of the others."""
+        parts = {
+            link: tuple(convex_hull(surface.vertices) for surface in self.surfaces(link)) for link in links
+        }
+        if self.kind == "visual" and any(parts.values()):
+            self.notes.append("no link has collision geometry; the visual geometry is taken")
+        elif any(parts.values()):
+            shown = [
+                link for link in links if not parts[link] and self.links[link].find("visual") is not None
+            ]
+            if shown:
+                self.notes.append(f"links without collision geometry are not checked: {', '.join(shown)}")
+        return parts
+
+    def surfaces(self, link: str) -> tuple[Surface, ...]:
+        """The link's collision elements as the file has them, in the link's frame."""
+        if link not in self._surfaces:
+            self._surfaces[link] = self._read_surfaces(link)
+        return self._surfaces[link]
+
+    def _read_surfaces(self, link: str) -> tuple[Surface, ...]:
+        parts = []
+        for element in self.links[link].findall(self.kind):
+            geometry = element.find("geometry")
+            shape = next(iter(geometry), None) if geometry is not None else None
+            if shape is None:
+                raise InputError(f"{self.path}: link {link}: a <{self.kind}> has no geometry")
+            surface = self._surface(shape, link)
+            T = self._origin(element, f"link {link}: {self.kind}")
+            parts.append(Surface(surface.vertices @ T[:3, :3].T + T[:3, 3], surface.faces))
+        return tuple(parts)
+
+    def _surface(self, shape: ET.Element, link: str) -> Surface:
+        def positive(name: str, count: int) -> Float[ndarray, "n"]:
+            what = f"link {link}: {shape.tag} {name}"
+            values = self._numbers(shape.get(name, ""), count, what)
+            if (values < SMALLEST).any():
+                raise InputError(f"{self.path}: {what} is {shown(shape.get(name))}; it must be positive")
+            return values
+
+        if shape.tag == "mesh":
+            return self._mesh(shape, link)
+        if shape.tag == "box":
+            points = np.array(trimesh.creation.box(positive("size", 3)).vertices)
+        elif shape.tag == "sphere":
+            points = _ball() * positive("radius", 1)
+        elif shape.tag == "capsule":
+            ball, half = _ball() * positive("radius", 1), float(positive("length", 1)[0]) / 2
+            points = np.concatenate([ball + np.array([0, 0, z]) for z in (-half, half)])
+        elif shape.tag == "cylinder":
+            angle = np.arange(32) * np.pi / 16
+            ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+            ring = ring * positive("radius", 1) / np.cos(np.pi / 32)
+            half = float(positive("length", 1)[0]) / 2
+            points = np.concatenate([np.insert(ring, 2, z, axis=1) for z in (-half, half)])
+        else:
+            raise InputError(
+                f"{self.path}: link {link}: {self.kind} shape <{shape.tag}> is not known; known: box, "
+                f"capsule, cylinder, mesh, sphere"
+            )
+        hull = convex_hull(points)
+        return Surface(hull.vertices, hull.faces)
+
+    def _mesh(self, shape: ET.Element, link: str) -> Surface:
+        file = self.packages.file(shape.get("filename", ""))
+        where = f"link {link}: mesh"
+        try:
+            vertices, faces = read_triangles(file, merge=True)
+            vertices = points(where, "vertices", vertices * self._scale(shape, where))
+        except InputError as error:
+            raise InputError(f"{self.path}: {error}") from None
+        if len(vertices) < 4:
+            raise InputError(
+                f"{self.path}: link {link}: {file} holds no triangle mesh with four corners; repair it or "
+                f"take its element out"
+            )
+        return Surface(vertices, faces)
+
+    def _scale(self, shape: ET.Element, where: str) -> Float[ndarray, "3"]:
+        scale = self._numbers(shape.get("scale", "1 1 1"), 3, f"{where} scale")
+        if (np.abs(scale) < SMALLEST).any():
+            raise InputError(f"{where} scale is {shown(shape.get('scale'))}; no number of it may be 0")
+        return scale
+
+
+def _ball() -> Float[ndarray, "n 3"]:
+    """A polyhedron about the unit ball."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=1.0)
+    inner = np.einsum("fd,fd->f", ball.face_normals, ball.triangles[:, 0]).min()
+    return np.array(ball.vertices) / inner

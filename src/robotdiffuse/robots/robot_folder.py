@@ -1,0 +1,296 @@
+"""A robot as a folder: robot.json (human-readable) and meshes.npz (convex collision meshes)."""
+
+import io
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.bounds import LARGEST, unit_quaternion, within
+from robotdiffuse.core.errors import InputError, shortened, shown
+from robotdiffuse.core.input_files import read_arrays, read_json
+from robotdiffuse.robots.inertias import inertia_of
+from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
+from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
+
+FORMAT = 2
+"""2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""
+AXIS_SLACK = 1e-3
+"""Of a joint axis's length."""
+WHOLE_TURN = 6.283
+"""A continuous joint whose limits are narrower than this is revolute [rad]: older files may hold some."""
+ROBOT_FILE, MESH_FILE = "robot.json", "meshes.npz"
+LIMITS = ("lower", "upper", "velocity", "acceleration", "jerk")
+
+
+def write_bundle(robot: Robot, folder: str | Path, source: dict[str, Any]) -> None:
+    """Write robot.json and meshes.npz into a folder, each whole or not at all; other files in it stay.
+
+    `source` says where the robot comes from: urdf, sha256, licence, and, where preparation measured them, the
+    shares of free configurations and of those that spheres refuse, free and refused. Raises InputError if the
+    folder cannot be written.
+    """
+    folder = Path(folder)
+    meshes = io.BytesIO()
+    np.savez_compressed(meshes, allow_pickle=False, **_pack(robot))
+    text = _dump(_to_json(robot, source)) + "\n"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _replace(folder / MESH_FILE, meshes.getvalue())
+        _replace(folder / ROBOT_FILE, text.encode())
+    except OSError as error:
+        raise InputError(f"cannot write the robot folder {folder}: {error.strerror}") from None
+
+
+def _replace(file: Path, content: bytes) -> None:
+    fresh = file.with_name(f".{file.name}.{os.getpid()}")
+    try:
+        fresh.write_bytes(content)
+        os.replace(fresh, file)
+    finally:
+        fresh.unlink(missing_ok=True)
+
+
+def read_bundle(folder: str | Path) -> Robot:
+    """The robot in a folder; raises InputError naming the file if one is missing or damaged."""
+    data = _read_json(Path(folder) / ROBOT_FILE)
+    meshes = _unpack(Path(folder) / MESH_FILE)
+    try:
+        robot = _from_json(data, meshes)
+        _check_tree(robot)
+        robot.frame_offsets  # noqa: B018  (walks the tree: fails if a joint has no parent)
+        of_links = {*robot.spheres, *robot.inertias}
+        if robot.dof == 0 or not of_links <= set(robot.link_names):
+            raise ValueError("no planned joints, or spheres or inertias of an unknown link")
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        raise InputError(
+            f"{Path(folder) / ROBOT_FILE} is damaged: {type(error).__name__}: {shortened(str(error))}"
+        ) from None
+    return robot
+
+
+def _check_tree(robot: Robot) -> None:
+    """Raises ValueError unless each joint hangs from the base or from a link of a joint before it."""
+    links = {robot.base}
+    for joint in robot.joints:
+        if joint.parent not in links or joint.child in links:
+            raise ValueError(f"joint {joint.name} is not part of a tree, parents before children")
+        links.add(joint.child)
+    leaders = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
+    for name in leaders:
+        seen = set[str]()
+        while name in leaders:
+            if name in seen:
+                raise ValueError(f"joint {name} mimics itself")
+            seen.add(name)
+            name = leaders[name]
+    of_tables = {link for table in robot.tables for link in table.links}
+    if not {*robot.tips, *robot.meshes, *of_tables} <= links:
+        raise ValueError("the tip, meshes or a table of an unknown link")
+    if any((rows[:, 3] <= 0).any() for rows in robot.spheres.values() if len(rows)):
+        raise ValueError("spheres without a size")
+
+
+def read_source(folder: str | Path) -> dict[str, Any]:
+    """Where the robot in a folder comes from, as `write_bundle` got it."""
+    source = _read_json(Path(folder) / ROBOT_FILE).get("source", {})
+    return source if isinstance(source, dict) else {}
+
+
+def _to_json(robot: Robot, source: dict[str, Any]) -> dict:
+    return {
+        "format": FORMAT,
+        "name": robot.name,
+        "source": source,
+        "units": "metres, radians, seconds, kilograms; quaternions wxyz; spheres are x y z radius in the "
+        "link's frame; inertias mass x y z of its centre xx xy xz yy yz zz about it, along the link's axes",
+        "base": robot.base,
+        "tip": robot.tip,
+        **({"other_tips": list(robot.other_tips)} if robot.other_tips else {}),
+        "root": robot.root or robot.base,
+        "above": {link: pose_entry(T_base_link) for link, T_base_link in robot.above.items()},
+        "locked": robot.locked,
+        "poses": robot.poses,
+        "joints": [_joint_to_json(joint) for joint in robot.joints],
+        "spheres": {link: np.round(spheres, 6).tolist() for link, spheres in robot.spheres.items()},
+        "inertias": {link: inertia.values for link, inertia in robot.inertias.items()},
+        "allowed_collisions": sorted(sorted(pair) for pair in robot.allowed_collisions),
+        **({"tables": [_table_to_json(table) for table in robot.tables]} if robot.tables else {}),
+        "notes": list(robot.notes),
+    }
+
+
+def _table_to_json(table: JointTable) -> dict:
+    """Cells by eight, each a bit, along the last joint."""
+    rows = np.packbits(np.atleast_2d(table.apart), axis=1)
+    return {
+        "links": list(table.links),
+        "joints": list(table.joints),
+        "lower": list(table.lower),
+        "upper": list(table.upper),
+        "apart": [row.tobytes().hex() for row in rows],
+    }
+
+
+def _table_from_json(data: dict) -> JointTable:
+    joints = tuple(map(str, data["joints"]))
+    apart = np.array([np.frombuffer(bytes.fromhex(row), np.uint8) for row in data["apart"]])
+    apart = np.unpackbits(apart, axis=1).astype(bool)
+    lower, upper = (tuple(map(float, data[end])) for end in ("lower", "upper"))
+    ends = (len(lower), len(upper), 1 if len(apart) == 1 else 2)
+    spans = [0 < high - low <= LARGEST for low, high in zip(lower, upper, strict=False)]
+    if ends != (len(joints),) * 3 or not all(spans):
+        raise ValueError("a table over one or two joints expected, lower below upper")
+    a, b = map(str, data["links"])
+    return JointTable((a, b), joints, lower, upper, apart[0] if len(joints) == 1 else apart)
+
+
+def _joint_to_json(joint: Joint) -> dict:
+    data = {
+        "name": joint.name,
+        "kind": joint.kind,
+        "parent": joint.parent,
+        "child": joint.child,
+        **pose_entry(joint.T_parent_joint),
+    }
+    if joint.kind in MOVING_KINDS:
+        data |= {"axis": joint.axis.tolist()} | {name: getattr(joint, name) for name in LIMITS}
+    if joint.effort:
+        data["effort"] = joint.effort
+    if joint.mimic is not None:
+        data["mimic"] = list(joint.mimic)
+    return data
+
+
+def _dump(data: dict) -> str:
+    """JSON with one joint, sphere or pair to a line."""
+
+    def compact(value: object) -> str:
+        return json.dumps(value, allow_nan=False)
+
+    lines = []
+    for key, value in data.items():
+        if key == "spheres":
+            links = [
+                f"    {compact(link)}: [\n" + ",\n".join(f"      {compact(row)}" for row in rows) + "\n    ]"
+                for link, rows in value.items()
+            ]
+            text = "{\n" + ",\n".join(links) + "\n  }"
+        elif key == "inertias" and value:
+            rows = [f"    {compact(link)}: {compact(row)}" for link, row in value.items()]
+            text = "{\n" + ",\n".join(rows) + "\n  }"
+        elif isinstance(value, list) and value:
+            text = "[\n" + ",\n".join(f"    {compact(item)}" for item in value) + "\n  ]"
+        else:
+            text = compact(value)
+        lines.append(f"  {compact(key)}: {text}")
+    return "{\n" + ",\n".join(lines) + "\n}"
+
+
+def _read_json(file: Path) -> dict:
+    data = read_json(file)
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise InputError(
+            f"{file} is not a robot of format {FORMAT}; make it again with: robotdiffuse robot add"
+        )
+    return data
+
+
+def _from_json(data: dict, meshes: dict[str, tuple[ConvexMesh, ...]]) -> Robot:
+    return Robot(
+        name=str(data["name"]),
+        base=str(data["base"]),
+        tip=str(data["tip"]),
+        other_tips=tuple(map(str, data.get("other_tips", ()))),
+        joints=tuple(_joint_from_json(joint) for joint in data["joints"]),
+        spheres={str(link): _array(rows, 4, f"spheres of {link}") for link, rows in data["spheres"].items()},
+        meshes=meshes,
+        allowed_collisions=frozenset(frozenset(map(str, pair)) for pair in data["allowed_collisions"]),
+        tables=tuple(_table_from_json(table) for table in data.get("tables", ())),
+        locked={str(name): float(value) for name, value in data["locked"].items()},
+        notes=tuple(map(str, data["notes"])),
+        root=str(data["root"]),
+        above={str(link): _pose_from_json(pose, f"above: {link}") for link, pose in data["above"].items()},
+        poses={
+            str(name): {str(joint): float(value) for joint, value in pose.items()}
+            for name, pose in data.get("poses", {}).items()
+        },
+        inertias={str(link): inertia_of(row) for link, row in data.get("inertias", {}).items()},
+    )
+
+
+def _joint_from_json(data: dict) -> Joint:
+    name, kind = str(data["name"]), str(data["kind"])
+    T = _pose_from_json(data, f"joint {name}")
+    if kind == "fixed":
+        return Joint(name, kind, str(data["parent"]), str(data["child"]), T, np.array([0.0, 0.0, 1.0]))
+    if kind not in MOVING_KINDS:
+        raise ValueError(f"joint {name} is of kind {shown(kind)}")
+    axis = _array([data["axis"]], 3, f"joint {name}: axis")[0]
+    lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
+    rates = (velocity, acceleration, jerk)
+    if not -LARGEST <= lower <= upper <= LARGEST or not min(rates) > 0 or not max(rates) < np.inf:
+        raise ValueError(f"joint {name}: limits")
+    if not abs(np.linalg.norm(axis) - 1) < AXIS_SLACK:
+        raise ValueError(f"joint {name}: an axis of length 1 expected")
+    if kind == "continuous" and upper - lower < WHOLE_TURN:
+        kind = "revolute"
+    elif kind == "continuous":
+        lower, upper = -TURNS, TURNS
+    mimic = None
+    if "mimic" in data:
+        master, multiplier, offset = data["mimic"]
+        mimic = Mimic(str(master), float(multiplier), float(offset))
+    effort = float(data.get("effort", 0.0))
+    if not 0 <= effort <= LARGEST:
+        raise ValueError(f"joint {name}: effort")
+    ends, limits = (str(data["parent"]), str(data["child"])), (lower, upper, velocity, acceleration, jerk)
+    return Joint(name, kind, *ends, T, axis, *limits, mimic, effort)
+
+
+def _pose_from_json(data: dict, what: str) -> Float[ndarray, "4 4"]:
+    xyz = _array([data["xyz"]], 3, f"{what}: xyz")[0]
+    wxyz = unit_quaternion(what, data["wxyz"])
+    return transform(xyz, rotation_from_quaternion(wxyz))
+
+
+def _array(rows: object, width: int, what: str) -> Float[ndarray, "n w"]:
+    array = np.asarray(rows, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != width or not within(array):
+        raise ValueError(f"{what}: {width} finite numbers within ±{LARGEST:g} in each row expected")
+    return array
+
+
+def _pack(robot: Robot) -> dict[str, ndarray]:
+    """All meshes in four arrays: reading many small ones would take longer."""
+    parts = [(link, mesh) for link, meshes in robot.meshes.items() for mesh in meshes]
+    return {
+        "links": np.array([link for link, _ in parts], dtype=np.str_),
+        "sizes": np.array([(len(m.vertices), len(m.faces)) for _, m in parts], np.int64).reshape(-1, 2),
+        "vertices": np.concatenate([np.zeros((0, 3)), *(mesh.vertices for _, mesh in parts)]),
+        "faces": np.concatenate([np.zeros((0, 3), np.int64), *(mesh.faces for _, mesh in parts)]),
+    }
+
+
+def _unpack(file: Path) -> dict[str, tuple[ConvexMesh, ...]]:
+    arrays = read_arrays(file)
+    try:
+        links, sizes, vertices, faces = (arrays[key] for key in ("links", "sizes", "vertices", "faces"))
+        ends = np.cumsum(sizes, axis=0)
+        if len(links) and (ends[-1] != (len(vertices), len(faces))).any():
+            raise ValueError("sizes do not add up")
+        meshes: dict[str, tuple[ConvexMesh, ...]] = {}
+        for link, (v, f), (v_end, f_end) in zip(links, sizes, ends, strict=True):
+            corners = _array(vertices[v_end - v : v_end], 3, f"vertices of {link}")
+            mesh = ConvexMesh(corners, np.asarray(faces[f_end - f : f_end], np.int64))
+            if not ((mesh.faces >= 0) & (mesh.faces < len(corners))).all():
+                raise ValueError(f"faces of {link}: indices of its {len(corners)} vertices expected")
+            meshes[str(link)] = (*meshes.get(str(link), ()), mesh)
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{file} is damaged: {type(error).__name__}: {shortened(str(error))}") from None
+    return meshes

@@ -1,0 +1,123 @@
+"""Scenes of spheres and boxes as arrays: what data sets hold, and what training reads many of at once."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, Int8
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Shape, Sphere
+from robotdiffuse.core.transforms import rotation_from_quaternion
+
+NONE, SPHERE, BOX = 0, 1, 2
+"""Kinds of packed shapes: none, for an empty row; a sphere; a box."""
+PARAMETERS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class PackedScenes:
+    """Scenes of at most k spheres and boxes each, and the floors that they stand on. Lengths in [m].
+
+    Point clouds of them are made by `surface_clouds`.
+    """
+
+    kinds: Int8[ndarray, "n k"]
+    params: Float32[ndarray, "n k 10"]
+    """Of a sphere center, radius; of a box center, size, wxyz; filled up with zeros."""
+    floors: Float[ndarray, "n 6"] | None = None
+    """Center and size of each floor, zeros where a scene has none; None: no scene has one. A floor is apart
+    from the obstacles: clouds do not show it, and it does not turn."""
+
+    def __len__(self) -> int:
+        return len(self.kinds)
+
+    def __getitem__(self, rows: slice | Int[ndarray, "m"] | Bool[ndarray, "n"]) -> "PackedScenes":
+        floors = None if self.floors is None else self.floors[rows]
+        return PackedScenes(self.kinds[rows], self.params[rows], floors)
+
+    @staticmethod
+    def pack(scenes: Sequence[Scene], slots: int, floor: bool = False) -> "PackedScenes":
+        """Scenes in so many rows each. floor: whether the first shape of each is the floor.
+
+        Raises InputError for other shapes, and if there are more of them than slots.
+        """
+        kinds = np.full((len(scenes), slots), NONE, np.int8)
+        params = np.zeros((len(scenes), slots, PARAMETERS), np.float32)
+        for scene, kind, row in zip(scenes, kinds, params, strict=True):
+            _pack(scene.shapes[floor:], kind, row)
+        floors = np.array([floor_row(s.shapes[0]) for s in scenes]).reshape(-1, 6) if floor else None
+        return PackedScenes(kinds, params, floors)
+
+    @staticmethod
+    def joined(parts: Sequence["PackedScenes"]) -> "PackedScenes":
+        """One after the other; all with floors, or all without."""
+        kinds, params = (np.concatenate([getattr(p, name) for p in parts]) for name in ("kinds", "params"))
+        floors = [p.floors for p in parts if p.floors is not None]
+        return PackedScenes(kinds, params, np.concatenate(floors) if floors else None)
+
+    def floor(self, i: int) -> Box | None:
+        """What the scene of this number stands on."""
+        if self.floors is None or not self.floors[i].any():
+            return None
+        return Box(self.floors[i, :3], self.floors[i, 3:], name="floor")
+
+    def scene(self, i: int) -> Scene:
+        """The scene of this number, its floor first; exact up to float32. Names are lost."""
+        floor = self.floor(i)
+        shapes: list[Shape] = [] if floor is None else [floor]
+        for kind, row in zip(self.kinds[i], self.params[i], strict=True):
+            if kind == SPHERE:
+                shapes.append(Sphere(row[:3], row[3]))
+            elif kind == BOX:
+                shapes.append(Box(row[:3], row[3:6], row[6:]))
+        return Scene(shapes)
+
+    def turned(self, angle: Float32[ndarray, "n"]) -> "PackedScenes":
+        """Each scene turned about the z axis [rad], its floor left as it is."""
+        params = self.params.copy()
+        c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
+        x, y = params[..., 0].copy(), params[..., 1].copy()
+        params[..., 0], params[..., 1] = c * x - s * y, s * x + c * y
+        # the quaternion of the turn, (cos, 0, 0, sin) of half the angle, times that of the obstacle
+        c, s = np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None]
+        w, i, j, k = np.moveaxis(params[..., 6:].copy(), -1, 0)
+        params[..., 6:] = np.stack([c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w], -1)
+        return PackedScenes(self.kinds, params, self.floors)
+
+    def distances(self, at: Float[ndarray, "places 3"]) -> Float[ndarray, "n places"]:
+        """Signed distance [m] of places to the nearest obstacle of each scene; infinite if it has none."""
+        nearest = np.full((len(self), len(at)), np.inf)
+        for kind, p in zip(self.kinds.T, self.params.transpose(1, 0, 2).astype(np.float64), strict=True):
+            box, some = kind == BOX, kind != NONE
+            away = at - p[:, None, :3]
+            distance = np.linalg.norm(away, axis=-1) - p[:, 3, None]
+            local = np.abs(away[box] @ rotation_from_quaternion(p[box, 6:])) - p[box, None, 3:6] / 2
+            outside = np.linalg.norm(local.clip(min=0), axis=-1)
+            distance[box] = outside + local.max(-1).clip(max=0)
+            nearest[some] = np.minimum(nearest[some], distance[some])
+        return nearest
+
+
+def floor_row(floor: Shape | None) -> Float[ndarray, "6"]:
+    """A row of `PackedScenes.floors`. Raises InputError unless the floor is a box that is not turned."""
+    if floor is None:
+        return np.zeros(6)
+    if not isinstance(floor, Box) or floor.wxyz[0] != 1:
+        raise InputError(f"the floor {floor.name} is a {floor.kind}; it must be a box that is not turned")
+    return np.concatenate([floor.center, floor.size])
+
+
+def _pack(shapes: Sequence[Shape], kinds: Int8[ndarray, "k"], params: Float32[ndarray, "k 10"]) -> None:
+    if len(shapes) > len(kinds):
+        raise InputError(f"the scene has {len(shapes)} shapes; there are {len(kinds)} slots")
+    for i, shape in enumerate(shapes):
+        params[i, :3] = getattr(shape, "center", 0)
+        if isinstance(shape, Sphere):
+            kinds[i], params[i, 3] = SPHERE, shape.radius
+        elif isinstance(shape, Box):
+            kinds[i], params[i, 3:6], params[i, 6:] = BOX, shape.size, shape.wxyz
+        else:
+            raise InputError(f"{shape.name} is a {shape.kind}; only spheres and boxes can be packed")

@@ -1,0 +1,152 @@
+"""Points on the surfaces of obstacles: what the encoder sees of a scene. Of many scenes at once, see
+`surface_clouds`."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from numpy.random import Generator
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, Triangulated
+from robotdiffuse.core.settings import Positive, Settings
+
+ROUNDS = 6
+"""How often `sample_surface` draws before it repeats points that it has."""
+
+
+@dataclass(frozen=True)
+class VisibleRegion(Settings, name="region"):
+    """Where points on obstacles count: within reach of the arm and above the plane that it stands on."""
+
+    floor: float = 0.02
+    """Points must be higher than this [m]: the mounting plane is part of every scene and tells nothing."""
+    center: tuple[float, float, float] = (0.0, 0.0, 0.3)
+    """In the base frame [m]: on the base axis, about at a Panda's shoulder."""
+    reach: Positive = 1.2
+    """Points must be within this distance of the centre [m]; a Panda's flange reaches 0.86."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.floor >= self.center[2] + self.reach:
+            raise InputError(
+                f"floor is {self.floor}; it must be below the top of the reach, {self.center[2] + self.reach}"
+            )
+
+    def holds(self, points: Float[ndarray, "*b 3"]) -> ndarray:
+        x, y, z = (points[..., i] - self.center[i] for i in range(3))
+        return (points[..., 2] > self.floor) & (x * x + y * y + z * z < self.reach**2)
+
+
+PANDA_REGION = VisibleRegion()
+
+
+def _sphere(shape: Sphere, n: int, rng: Generator) -> ndarray:
+    directions = rng.standard_normal((n, 3))
+    directions *= (shape.radius / np.sqrt((directions * directions).sum(axis=1)))[:, None]
+    return directions + shape.center
+
+
+def _box(shape: Box, n: int, rng: Generator) -> ndarray:
+    points = rng.random((n, 3)) - 0.5
+    x, y, z = shape.size
+    faces = np.array([y * z, z * x, x * y])
+    axis = np.searchsorted(np.cumsum(faces / faces.sum())[:2], rng.random(n), side="right")
+    rows = np.arange(n)
+    points[rows, axis] = np.where(points[rows, axis] < 0, -0.5, 0.5)
+    return (points * shape.size) @ shape.rotation.T + shape.center
+
+
+def _cylinder(shape: Cylinder, n: int, rng: Generator) -> ndarray:
+    angle = rng.random(n) * (2 * np.pi)
+    height = rng.random(n) - 0.5
+    on_side = rng.random(n) * (shape.height + shape.radius) < shape.height
+    radius = np.where(on_side, 1.0, np.sqrt(rng.random(n))) * shape.radius
+    z = np.where(on_side, height, np.where(height < 0, -0.5, 0.5)) * shape.height
+    local = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
+    return local @ shape.rotation.T + shape.center
+
+
+def _capsule(shape: Capsule, n: int, rng: Generator) -> ndarray:
+    local = rng.standard_normal((n, 3))
+    on_side = rng.random(n) * (shape.height + 2 * shape.radius) < shape.height
+    local[on_side, 2] = 0
+    local *= (shape.radius / np.sqrt((local * local).sum(axis=1)))[:, None]
+    along = np.where(on_side, rng.random(n) - 0.5, np.copysign(0.5, local[:, 2]))
+    local[:, 2] += along * shape.height
+    return local @ shape.rotation.T + shape.center
+
+
+def _triangles(shape: Triangulated, n: int, rng: Generator) -> ndarray:
+    mesh = shape.mesh
+    edges = np.cumsum(mesh.face_areas)
+    face = np.searchsorted(edges[:-1], rng.random(n) * edges[-1], side="right")
+    u, v = rng.random((2, n, 1))
+    outside = u + v > 1
+    u, v = np.where(outside, 1 - u, u), np.where(outside, 1 - v, v)
+    a, b, c = np.moveaxis(mesh.world_vertices[mesh.faces[face]], 1, 0)
+    return a + u * (b - a) + v * (c - a)
+
+
+def _point_cloud(shape: PointCloud, n: int, rng: Generator) -> ndarray:
+    return shape.points[rng.integers(len(shape.points), size=n)]
+
+
+DRAWS: dict[type[Shape], Callable[..., ndarray]] = {
+    Sphere: _sphere,
+    Box: _box,
+    Cylinder: _cylinder,
+    Capsule: _capsule,
+    Mesh: _triangles,
+    PointCloud: _point_cloud,
+}
+"""By shape: n points, uniform by area, in the base frame; of a shape that is not here, on its triangles."""
+
+
+def _draw_of(shape: Shape) -> Callable[..., ndarray]:
+    return next((DRAWS[kind] for kind in type(shape).__mro__ if kind in DRAWS), _triangles)
+
+
+def sample_surface(
+    scene: Scene, count: int, rng: Generator, region: VisibleRegion = PANDA_REGION
+) -> Float[ndarray, "count 3"]:
+    """`count` points on the shapes, in random order, uniform by area within the region [m].
+
+    Where hardly anything of a surface lies in the region, points repeat. If nothing does: no points, an
+    array of shape (0, 3).
+    """
+    shapes = [shape for shape in scene.shapes if shape.area > 0 and _may_be_seen(shape, region)]
+    if not shapes or count == 0:
+        return np.zeros((0, 3))
+    areas = np.array([shape.area for shape in shapes])
+    shares = areas / areas.sum()
+    found: list[ndarray] = []
+    missing, draw = count, 2 * count
+    for _ in range(ROUNDS):
+        parts = rng.multinomial(draw, shares)
+        draws = [_draw_of(shape) for shape in shapes]
+        drawn = [f(s, int(n), rng) for f, s, n in zip(draws, shapes, parts, strict=True) if n > 0]
+        points = np.concatenate(drawn)
+        points = points[region.holds(points)]
+        # The points come shape by shape; any first few of them would be of the first shape alone.
+        points = points[rng.permutation(len(points))[:missing]]
+        found.append(points)
+        missing -= len(points)
+        if missing == 0:
+            break
+        draw = min(4 * draw, 65536)
+    points = np.concatenate(found)
+    if 0 < missing < count:
+        points = np.concatenate([points, points[rng.integers(len(points), size=missing)]])
+    return points
+
+
+def _may_be_seen(shape: Shape, region: VisibleRegion) -> bool:
+    low, high = shape.bounds
+    if high[2] <= region.floor:
+        return False
+    gap = np.maximum(0, np.maximum(low - region.center, region.center - high))
+    return bool(gap @ gap < region.reach**2)

@@ -1,0 +1,103 @@
+"""A server from start to stop."""
+
+import asyncio
+import signal
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import uvicorn
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.server.app import make_app
+from robotdiffuse.server.connection import Connection
+from robotdiffuse.server.worker_pool import Pool
+from robotdiffuse.server.settings import GRACE, KEPT, ServeSettings
+
+BACKLOG = 128
+"""Connections that wait to be taken."""
+SIGNALS = signal.SIGINT, signal.SIGTERM
+
+
+class _Server(uvicorn.Server):
+    """Stops when it is told: requests that wait are refused, those with a worker finished. Told twice, it
+    stops at once."""
+
+    def __init__(self, config: uvicorn.Config, pool: Pool) -> None:
+        super().__init__(config)
+        self.pool = pool
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        loop = asyncio.get_running_loop()
+        for number in SIGNALS:
+            loop.add_signal_handler(number, self._told, number)
+        try:
+            yield
+        finally:
+            for number in SIGNALS:
+                loop.remove_signal_handler(number)
+
+    def _told(self, number: int) -> None:
+        self.pool.stop()
+        self.force_exit = self.should_exit
+        self.should_exit = True
+
+
+def serve(robots: dict[str, Robot], settings: ServeSettings, say: Callable[[str], None] = print) -> None:
+    """Answer requests until SIGTERM or Ctrl-C. `say` is told the address, and when there is a worker.
+
+    Raises InputError for an address that cannot be listened at, and if no worker can be started.
+    """
+    family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)  # asyncio looks for TCP
+    with listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((settings.host, settings.port))
+            listener.listen(BACKLOG)
+        except (OSError, OverflowError) as error:
+            why = getattr(error, "strerror", None) or str(error)
+            raise InputError(f"cannot listen at {settings.host}, port {settings.port}: {why}") from None
+        asyncio.run(_serve(robots, settings, listener, say))
+
+
+async def _serve(
+    robots: dict[str, Robot], settings: ServeSettings, listener: socket.socket, say: Callable[[str], None]
+) -> None:
+    pool = Pool(robots, settings)
+    config = uvicorn.Config(
+        make_app(pool, robots),
+        lifespan="off",
+        http=Connection,
+        log_level="error",  # what clients do wrong is for them
+        access_log=False,
+        server_header=False,
+        timeout_keep_alive=KEPT,
+        timeout_graceful_shutdown=int(settings.longest + GRACE) + 1,
+        ws="none",
+    )
+    server = _Server(config, pool)
+
+    def started(task: asyncio.Future[None]) -> None:
+        if task.cancelled() or task.exception() is not None:
+            server.should_exit = True
+        else:
+            say(f"ready, with {settings.workers} worker{'s' * (settings.workers > 1)}")
+
+    say(f"listening at {_address(listener)}; loading compiled code (a new machine compiles for a minute)")
+    starting = asyncio.ensure_future(pool.start())
+    starting.add_done_callback(started)
+    try:
+        await server.serve([listener])
+    finally:
+        starting.cancel()
+        pool.close()
+    if starting.done() and not starting.cancelled():
+        starting.result()
+
+
+def _address(listener: socket.socket) -> str:
+    host, port = listener.getsockname()[:2]
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"

@@ -1,0 +1,223 @@
+"""Pictures (.png) and films (.gif) of a replay, by PyBullet's software renderer."""
+
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+import pybullet
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.simulation.camera import DepthCamera, Light, RawImage, render, take
+from robotdiffuse.simulation.replay import Replay
+from robotdiffuse.simulation.world import World
+
+LIGHT = Light(direction=(0.5, -0.7, 1.6), ambient=0.62, diffuse=0.42, specular=0.04)
+FLOOR_COLORS = ((0xF0, 0xF1, 0xF3), (0xE4, 0xE6, 0xEA))
+TILE = 0.25
+"""Side of a tile of the floor [m]."""
+GHOST = 0.4
+"""Share of a ghost's own colour in a picture; the rest is what is behind it."""
+AZIMUTHS = np.radians(np.arange(-60, 300, 45))
+"""Directions from which a view is tried; the one that sees most of the arm is taken."""
+ELEVATION = 0.42
+"""Of the camera over the middle of the scene [rad]."""
+NEAR = 0.4
+"""Obstacles are in the picture as far as they are this close to a box around the arm [m]."""
+ROOM = 1.03
+"""Factor on the distance at which that all just fits."""
+FLOOR_GAP = 0.002
+"""Between the floor and the lowest thing above it [m]."""
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+MOMENTS = (0.0, 0.33, 0.67, 1.0)
+"""Shares of the duration at which views are judged; a picture shows them all, the last one solid."""
+
+
+@dataclass(frozen=True)
+class FilmSettings:
+    width: int = 640
+    """[pixels]"""
+    height: int = 480
+    """[pixels]"""
+    oversampling: int = 2
+    """Pixels rendered for one pixel of the picture, along each side: the renderer leaves edges jagged."""
+    rate: float = 20.0
+    """Frames per second of a film, which runs in real time [1/s]."""
+    most_frames: int = 150
+    """Longer films have fewer frames per second."""
+    colors: int = 128
+    """In a film's palette."""
+    field_of_view: float = 0.6
+    """Vertical angle [rad]."""
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("width", 16, 1920),
+            ("height", 16, 1080),
+            ("oversampling", 1, 4),
+            ("rate", 1, 50),
+            ("most_frames", 2, 1000),
+            ("colors", 2, 256),
+        ):
+            if not low <= getattr(self, name) <= high:
+                raise InputError(f"film.{name} is {getattr(self, name)}; it must lie in [{low}, {high}]")
+        if not 0.05 <= self.field_of_view <= 2:
+            raise InputError(f"film.field_of_view is {self.field_of_view}; it must lie in [0.05, 2] rad")
+
+
+DEFAULT = FilmSettings()
+
+
+FLAT = 0.02
+"""Obstacles that rise no further above the arm's foot are ground [m]."""
+
+
+def write_png(
+    robot: Robot, scene: Scene, run: Replay, file: str | Path, settings: FilmSettings = DEFAULT
+) -> None:
+    """One picture: the arm where the replay ends, and where it was before as ghosts.
+
+    Raises InputError where the file cannot be written.
+    """
+    from PIL import Image
+
+    with World(robot, scene, look=True) as world:
+        camera = _prepare(world, run, settings)
+        *ghosts, picture = [_shot(world, q, camera) for q in _at(run, MOMENTS)]
+    pixels, nearest = picture.rgb.astype(np.float64), picture.depth
+    for ghost in reversed(ghosts):
+        over = (ghost.bodies == world.body) & (ghost.depth < nearest)
+        pixels[over] = GHOST * ghost.rgb[over] + (1 - GHOST) * pixels[over]
+        nearest = np.where(over, ghost.depth, nearest)
+    content = BytesIO()
+    Image.fromarray(_reduced(pixels, settings.oversampling)).save(content, "PNG")
+    write_atomically(Path(file), content.getvalue())
+
+
+def write_gif(
+    robot: Robot, scene: Scene, run: Replay, file: str | Path, settings: FilmSettings = DEFAULT
+) -> None:
+    """A film of the replay in real time that stays a second on its last frame and starts again.
+
+    Raises InputError where the file cannot be written.
+    """
+    from PIL import Image
+
+    duration = float(run.times[-1])
+    # GIF counts in hundredths of a second
+    delay = max(round(100 / settings.rate), int(np.ceil(100 * duration / (settings.most_frames - 1))))
+    shares = np.append(np.arange(0, 100 * duration, delay) / (100 * duration), 1.0)
+    with World(robot, scene, look=True) as world:
+        camera = _prepare(world, run, settings)
+        shots = [
+            Image.fromarray(_reduced(_shot(world, q, camera).rgb, settings.oversampling))
+            for q in _at(run, shares)
+        ]
+    strip = Image.fromarray(np.concatenate([np.asarray(shots[i]) for i in (0, len(shots) // 2, -1)]))
+    palette = strip.quantize(settings.colors, method=Image.Quantize.MEDIANCUT)
+    frames = [shot.quantize(palette=palette, dither=Image.Dither.NONE) for shot in shots]
+    durations = [10 * delay] * (len(frames) - 1) + [1000]
+    content = BytesIO()
+    frames[0].save(content, "GIF", save_all=True, append_images=frames[1:], duration=durations, loop=0)
+    write_atomically(Path(file), content.getvalue())
+
+
+def _at(run: Replay, shares: "Float[ndarray, 'n'] | tuple[float, ...]") -> Float[ndarray, "n dof"]:
+    """The simulated configurations at shares of the duration."""
+    return run.positions[np.rint(np.multiply(shares, len(run.times) - 1)).astype(np.int64)]
+
+
+def _shot(world: World, q: Float[ndarray, "dof"], camera: DepthCamera) -> RawImage:
+    world.place(q)
+    return take(world, camera, LIGHT)
+
+
+def _reduced(pixels: ndarray, factor: int) -> UInt8[ndarray, "h w 3"]:
+    """The mean of each block of pixels."""
+    h, w = pixels.shape[0] // factor, pixels.shape[1] // factor
+    blocks = pixels.reshape(h, factor, w, factor, 3).astype(np.float64)
+    return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def _prepare(world: World, run: Replay, settings: FilmSettings) -> DepthCamera:
+    """Lay a floor and choose the view: arm and obstacles in the image, most of the arm in sight."""
+    poses = _at(run, MOMENTS)
+    low, high = _extent(world, poses)
+    _add_floor(world, low, high)
+    cameras = [_camera(low, high, azimuth, settings) for azimuth in AZIMUTHS]
+    seen = [sum(_visible(world, q, camera) for q in poses) for camera in cameras]
+    return cameras[int(np.argmax(seen))]
+
+
+def _camera(
+    low: Float[ndarray, "3"], high: Float[ndarray, "3"], azimuth: float, settings: FilmSettings
+) -> DepthCamera:
+    """Seen from this side, near enough that the box just fits."""
+    flat = np.cos(ELEVATION)
+    sight = np.array([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(ELEVATION)])
+    middle = (low + high) / 2
+    slope = np.tan(settings.field_of_view / 2)
+    camera = DepthCamera(
+        _point(middle + sight),
+        _point(middle),
+        width=settings.width * settings.oversampling,
+        height=settings.height * settings.oversampling,
+        field_of_view=settings.field_of_view,
+    )
+    corners = (CORNERS * (high - low) / 2) @ camera.rotation
+    wide = slope * np.array([settings.width / settings.height, 1.0])
+    distance = ROOM * float((np.abs(corners[:, :2]) / wide - corners[:, 2:]).max())
+    place = _point(middle + distance * sight)
+    return replace(camera, position=place, near=0.02 * distance, far=20 * distance)
+
+
+def _point(xyz: Float[ndarray, "3"]) -> tuple[float, float, float]:
+    return float(xyz[0]), float(xyz[1]), float(xyz[2])
+
+
+def _visible(world: World, q: Float[ndarray, "dof"], camera: DepthCamera) -> int:
+    """Pixels of a small picture that show the arm."""
+    world.place(q)
+    small = replace(camera, width=120, height=round(120 * camera.height / camera.width))
+    return int((render(world, small).labels == 0).sum())
+
+
+def _extent(world: World, poses: Float[ndarray, "n dof"]) -> tuple[Float[ndarray, "3"], Float[ndarray, "3"]]:
+    """Corners of a box around the arm in these poses and what of the obstacles is near it [m]."""
+    boxes = []
+    for q in poses:
+        world.place(q)
+        pybullet.performCollisionDetection(physicsClientId=world.client)
+        boxes += [
+            pybullet.getAABB(world.body, world.links[link], physicsClientId=world.client)
+            for link, meshes in world.robot.meshes.items()
+            if meshes
+        ]
+    low, high = np.min(boxes, axis=(0, 1)), np.max(boxes, axis=(0, 1))
+    wide, foot = (low - NEAR, high + NEAR), low[2]
+    for body in world.obstacles.values():
+        bounds = np.array(pybullet.getAABB(body, physicsClientId=world.client))
+        if bounds[1, 2] <= foot + FLAT:
+            continue  # what the arm stands on may leave the image
+        box = np.clip(bounds, *wide)
+        low, high = np.minimum(low, box[0]), np.maximum(high, box[1])
+    return low, high
+
+
+def _add_floor(world: World, low: Float[ndarray, "3"], high: Float[ndarray, "3"]) -> None:
+    """Tiles in two greys under everything, to be seen only."""
+    middle, radius = (low + high) / 2, TILE + float((high - low)[:2].max()) / 2
+    count = int(np.ceil(radius / TILE))
+    cells = np.stack(np.meshgrid(*[np.arange(-count, count)] * 2), axis=-1).reshape(-1, 2)
+    cells = cells[np.linalg.norm(cells + 0.5, axis=1) * TILE < radius]
+    for parity, color in enumerate(FLOOR_COLORS):
+        corners = cells[cells.sum(axis=1) % 2 == parity][:, None] + np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
+        vertices = np.pad(corners.reshape(-1, 2) * TILE, ((0, 0), (0, 1)))
+        faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(corners))[:, None, None]
+        xyz = np.array([*middle[:2], low[2] - FLOOR_GAP])
+        world.add_surface(vertices, faces.reshape(-1, 3), color, xyz)

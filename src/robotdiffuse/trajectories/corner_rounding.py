@@ -1,0 +1,69 @@
+"""A polyline with rounded corners: twice continuously differentiable, at a known distance to the polyline."""
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.trajectories.timing_kernel import places
+
+DEVIATION = 3.0 / 16.0
+"""Distance between corner and blend, over half width times the change of direction: b(0)."""
+
+
+class BlendedPolyline:
+    """Straight lines between waypoints, each corner rounded over a half width to either side of it.
+
+    The parameter s is the arc length of the polyline, and b(u) a C2 replacement of max(u, 0) on [-1, 1],
+    whose second derivative is 3/4 (1 - u²). With directions e before and f behind corner i at s_i and
+    u = (s - s_i) / d_i in [-1, 1], the path is w_i + d_i (e u + (f - e) b(u)). It leaves the polyline by at
+    most 3/16 d_i |f - e|, at u = 0.
+    """
+
+    def __init__(self, waypoints: Float[ndarray, "n dof"], half_widths: Float[ndarray, "corners"]) -> None:
+        """Takes at least two waypoints, no two neighbours equal, and a half width for each inner one.
+
+        Half widths must not exceed half of the shorter neighbouring segment.
+        """
+        self.waypoints = waypoints
+        steps = waypoints[1:] - waypoints[:-1]
+        lengths = np.linalg.norm(steps, axis=1)
+        self.knots: Float[ndarray, "n"] = np.concatenate([[0.0], np.cumsum(lengths)])
+        self.directions: Float[ndarray, "segments dof"] = steps / lengths[:, None]
+        self.half_widths = half_widths
+
+    @property
+    def length(self) -> float:
+        """Arc length of the polyline: the end of the parameter s."""
+        return float(self.knots[-1])
+
+    @property
+    def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+        """What compiled code reads of it."""
+        return self.waypoints, self.knots, self.directions, self.half_widths
+
+    def __call__(self, s: Float[ndarray, "m"], order: int) -> Float[ndarray, "m dof"]:
+        """The path (order 0) or its first or second derivative with respect to s."""
+        return places(self.arrays, s, order)
+
+
+def half_widths(
+    waypoints: Float[ndarray, "n dof"], deviations: Float[ndarray, "corners"]
+) -> Float[ndarray, "corners"]:
+    """The widest blends that leave the polyline by no more than the deviations and do not overlap."""
+    steps = waypoints[1:] - waypoints[:-1]
+    lengths = np.linalg.norm(steps, axis=1)
+    directions = steps / lengths[:, None]
+    turn = np.linalg.norm(directions[1:] - directions[:-1], axis=1)
+    room = 0.5 * np.minimum(lengths[:-1], lengths[1:])
+    return np.minimum(room, deviations / np.maximum(DEVIATION * turn, 1e-12))
+
+
+def corner_middle(path: Float[ndarray, "n dof"], row: int, deviation: float) -> Float[ndarray, "dof"]:
+    """The middle of the rounded corner at an inner row: the mean of both ways from it, as far as they go."""
+    e, f = path[row] - path[row - 1], path[row + 1] - path[row]
+    lengths = np.linalg.norm(e), np.linalg.norm(f)
+    if min(lengths) == 0:
+        return path[row]
+    turn = f / lengths[1] - e / lengths[0]
+    width = half_widths(path[row - 1 : row + 2], np.array([deviation]))[0]
+    return path[row] + DEVIATION * width * turn

@@ -1,0 +1,249 @@
+"""Simplification of paths: waypoints left out, corners smoothed, straight lines between places of a path.
+
+R. Geraerts and M. Overmars, "Creating high-quality paths for motion planning", IJRR 2007, for shortcuts;
+corners are smoothed by the subdivision of B-splines as in W. Thomason, Z. Kingston and L. Kavraki, "Motions
+in Microseconds via Vectorized Sampling-Based Planning", ICRA 2024, and in OMPL's path simplifier.
+"""
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.collision.kernels.compiled import allocation_free, random
+from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
+from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
+
+_ONE, _HALF = np.float32(1.0), np.float32(0.5)
+SMOOTHINGS = 5
+"""Subdivisions of a path between two looks for waypoints that can be left out."""
+LEAST_MOVE = np.float32(0.005)
+"""A corner that smoothing would move less than this stays, and tightening makes no shorter segments [rad]."""
+PAYS = np.float32(1e-3)
+"""A round that takes off a smaller share of the length is the last."""
+LEAVE_OUT, PULL = np.float32(0.1), np.float32(0.35)
+"""Of the changes that tighten a path: the share that leaves a waypoint out, and with that which pulls it
+straight towards its neighbours' chord. The others move it at random besides."""
+FARTHEST, NEARER = np.float32(0.3), np.float32(5.0)
+"""Of random moves of a waypoint: the longest, in each joint [rad], and the logarithm of how much shorter the
+shortest are."""
+
+
+@njit(cache=True, nogil=True)
+def simplify(space, path, rounds):
+    """A path between the same ends that is free and no longer.
+
+    In each of the rounds waypoints that straight lines can skip are left out, corners are smoothed, and
+    skipped again.
+    """
+    work, block, a, _ = _room(space, path)
+    points = _skipped(space, path, block, work)
+    length = path_length(points)
+    for _ in range(rounds):
+        if len(points) <= 2:
+            return points
+        smooth = _skipped(space, _smoothed(space, points, a, block, work), block, work)
+        shorter = path_length(smooth)
+        # halves of segments were not checked again, and their checks fall elsewhere
+        if shorter >= length or not _free(space, smooth, block, work):
+            break
+        points = smooth
+        if shorter > length * (_ONE - PAYS):
+            break
+        length = shorter
+    return points
+
+
+@njit(cache=True, nogil=True)
+def shortcut(space, path, tries, state):
+    """A path between the same ends that is free and no longer: waypoints that straight lines can skip are
+    left out, then come `tries` attempts, in turn a random shortcut between places on different segments and a
+    move of a waypoint into the chord of its neighbours."""
+    work, block, a, b = _room(space, path)
+    points = _skipped(space, path, block, work)
+    if tries == 0 or len(points) <= 2:
+        return points
+    return _shortcuts(space, points, tries, a, b, block, work, state)
+
+
+@njit(cache=True, nogil=True)
+def tighten(space, path, tries, state):
+    """A path between the same ends that is free and no longer, near a given one that is free: after so many
+    attempts to leave out a waypoint drawn at random, or to move it.
+
+    Shortcuts and smoothing end a little above the shortest path of the same way round. Cutting corners gets
+    there, but each corner more makes the motion slower.
+    """
+    work, block, a, _ = _room(space, path)
+    points, n = path.copy(), len(path)
+    for _ in range(tries):
+        if n <= 2:
+            break
+        i = 1 + min(int(random(state) * np.float32(n - 2)), n - 3)
+        change = random(state)
+        if change < LEAVE_OUT:
+            if motion_free(space, points[i - 1], points[i + 1], block, work):
+                points[i : n - 1] = points[i + 1 : n].copy()
+                n -= 1
+        else:
+            _move(space, points, i, change >= PULL, a, block, work, state)
+    return points[:n].copy()
+
+
+@njit(cache=True)
+def _room(space, path):
+    """What the checks of motions need, and two configurations."""
+    dof = path.shape[1]
+    work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
+    return work, block, np.empty(dof, np.float32), np.empty(dof, np.float32)
+
+
+@njit(cache=True)
+def _free(space, path, block, work):
+    for i in range(len(path) - 1):  # noqa: SIM110
+        if not motion_free(space, path[i], path[i + 1], block, work):
+            return False
+    return True
+
+
+@njit(cache=True)
+def _skipped(space, path, block, work):
+    """The path less the waypoints that straight lines can skip, farthest first."""
+    out = np.empty(path.shape, np.float32)
+    n, i = 0, 0
+    while True:
+        out[n] = path[i]
+        n += 1
+        if i == len(path) - 1:
+            return out[:n].copy()
+        following = i + 1
+        for k in range(len(path) - 1, i + 1, -1):
+            if motion_free(space, path[i], path[k], block, work):
+                following = k
+                break
+        i = following
+
+
+@njit(cache=True)
+def _smoothed(space, path, trial, block, work):
+    """The path with the middles of its segments as waypoints, and its corners drawn towards them,
+    repeatedly."""
+    points, dof = path, path.shape[1]
+    for _ in range(SMOOTHINGS):
+        finer = np.empty((2 * len(points) - 1, dof), np.float32)
+        for i in range(len(points)):
+            finer[2 * i] = points[i]
+            if i > 0:
+                finer[2 * i - 1] = _HALF * (points[i - 1] + points[i])
+        changed = False
+        for i in range(2, len(finer) - 1, 2):
+            moved = np.float32(0.0)
+            for j in range(dof):
+                chord = _HALF * (finer[i - 1, j] + finer[i + 1, j])
+                trial[j] = _HALF * (finer[i, j] + chord)
+                moved += (trial[j] - finer[i, j]) ** 2
+            if moved < LEAST_MOVE * LEAST_MOVE:
+                continue
+            if motion_free(space, finer[i - 1], trial, block, work) and motion_free(
+                space, trial, finer[i + 1], block, work
+            ):
+                finer[i] = trial
+                changed = True
+        if not changed:
+            return points
+        points = finer
+    return points
+
+
+@njit(cache=True)
+def _shortcuts(space, path, tries, a, b, block, work, state):
+    capacity, dof = len(path) + tries + 2, path.shape[1]
+    points, n = np.empty((capacity, dof), np.float32), len(path)
+    points[:n] = path
+    for attempt in range(tries):
+        if n <= 2:
+            break
+        if attempt % 2 == 1:
+            _pull_in(space, points, n, a, block, work, state)
+            continue
+        total = path_length(points[:n])
+        s, t = random(state) * total, random(state) * total
+        if t < s:
+            s, t = t, s
+        i = _place_at(points, n, s, a)
+        k = _place_at(points, n, t, b)
+        # the remnants of the cut segments are checked anew: their checks fall elsewhere than before
+        if (
+            i == k
+            or not motion_free(space, a, b, block, work)
+            or not motion_free(space, points[i], a, block, work)
+            or not motion_free(space, b, points[k + 1], block, work)
+        ):
+            continue
+        # keep points[..i], a, b, points[k + 1..]
+        shift = 2 - (k - i)
+        if n + shift > capacity:
+            continue
+        if shift > 0:
+            for m in range(n - 1, k, -1):
+                points[m + shift] = points[m]
+        elif shift < 0:
+            for m in range(k + 1, n):
+                points[m + shift] = points[m]
+        points[i + 1], points[i + 2] = a, b
+        n += shift
+    return _skipped(space, points[:n], block, work)
+
+
+@allocation_free()
+def _place_at(points, n, length, out):
+    """Writes the place at a length along the path; returns the index of its segment."""
+    for i in range(n - 1):
+        d = distance(points[i], points[i + 1])
+        if length <= d or i == n - 2:
+            share = min(length / max(d, np.float32(1e-9)), _ONE)
+            for j in range(points.shape[1]):
+                out[j] = points[i, j] + share * (points[i + 1, j] - points[i, j])
+            return i
+        length -= d
+    return 0
+
+
+@njit(cache=True)
+def _pull_in(space, points, n, trial, block, work, state):
+    """Moves a random inner waypoint towards the chord of its neighbours as far as stays free (halving)."""
+    i = 1 + int(random(state) * np.float32(n - 2))
+    i = min(i, n - 2)
+    before, after = points[i - 1], points[i + 1]
+    d1, d2 = distance(before, points[i]), distance(points[i], after)
+    share = d1 / max(d1 + d2, np.float32(1e-9))
+    pull = np.float32(0.5) + np.float32(0.5) * random(state)
+    for _ in range(4):
+        for j in range(points.shape[1]):
+            chord = before[j] + share * (after[j] - before[j])
+            trial[j] = points[i, j] + pull * (chord - points[i, j])
+        if motion_free(space, before, trial, block, work) and motion_free(space, trial, after, block, work):
+            points[i] = trial
+            return
+        pull *= np.float32(0.4)
+
+
+@njit(cache=True)
+def _move(space, points, i, anywhere, trial, block, work, state):
+    """Moves the i-th waypoint towards the chord of its neighbours, and at random if it may go anywhere, where
+    that is free and shorter."""
+    before, at, after = points[i - 1], points[i], points[i + 1]
+    d1, d2 = distance(before, at), distance(at, after)
+    share = d1 / max(d1 + d2, np.float32(1e-9))
+    pull = random(state) ** 2
+    far = FARTHEST * np.exp(-NEARER * random(state)) if anywhere else np.float32(0.0)
+    for j in range(points.shape[1]):
+        chord = before[j] + share * (after[j] - before[j])
+        aside = far * (np.float32(2.0) * random(state) - _ONE)
+        trial[j] = min(max(at[j] + pull * (chord - at[j]) + aside, space.lower[j]), space.upper[j])
+    new1, new2 = distance(before, trial), distance(trial, after)
+    if (
+        new1 + new2 < d1 + d2
+        and min(new1, new2) >= LEAST_MOVE
+        and motion_free(space, before, trial, block, work)
+        and motion_free(space, trial, after, block, work)
+    ):
+        points[i] = trial

@@ -1,0 +1,175 @@
+"""What counts as right: the judge's settings, and how far a configuration is off a goal."""
+
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
+from robotdiffuse.robots.kinematics import link_origins, link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
+from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
+
+
+@dataclass(frozen=True)
+class VerifySettings(Settings, name="verify"):
+    """What counts as a violation."""
+
+    contact: Positive = 1e-4
+    """Meshes closer than this [m] count as touching; at or above it, clearances are certified, the smaller it
+    is, the longer it takes."""
+    limit_slack: NotNegative = 1e-6
+    """Joint limits may be exceeded by this [rad] or [m]."""
+    start_tolerance: NotNegative = 1e-6
+    """Largest difference of any joint from the problem's start [rad] or [m]."""
+    goal_tolerance: NotNegative = 1e-4
+    """Largest difference of any joint from one of the goal configurations [rad] or [m]."""
+    goal_distance: NotNegative = 0.01
+    """Largest distance from the position of a goal pose [m] (the paper's 1 cm)."""
+    goal_angle: NotNegative = float(np.radians(15))
+    """Largest angle from the orientation of a goal pose [rad] (the paper's 15 degrees)."""
+    goal_slack: NotNegative = 1e-5
+    """Tolerances that a pose states may be exceeded by this [m] or [rad]."""
+    rest: NotNegative = 1e-6
+    """A motion stands still where no joint is faster than this [rad/s] or [m/s]."""
+    rate_slack: NotNegative = 0.01
+    """Share by which a trajectory may exceed velocity, acceleration and effort limits; also the share of a
+    velocity limit by which the velocities that it says may be off, and at which it is at rest."""
+    rate_agreement: NotNegative = 0.5
+    """Share of the greatest acceleration of the joint by which one that a trajectory says may lie outside of
+    the mean ones before and after its row."""
+    jump: Positive = 1.5
+    """A step of a trajectory longer than this times what the velocity limit allows in its time is a jump."""
+    chord: Positive = 1e-3
+    """Between rows a trajectory is judged on straight lines, unless the cubic through their positions and
+    velocities, as controllers follow it, leaves them by more than this [rad] or [m]: then along the cubic."""
+    constraint_chord: Positive = 1e-6
+    """Path constraints are judged along that cubic always: on straight lines that leave it by no more than
+    this [rad] or [m], which is taken from their tolerances."""
+    reversal_angle: NotNegative = float(np.radians(150))
+    """A turn in joint space by more than this [rad] is a sharp reversal ..."""
+    reversal_step: NotNegative = 0.05
+    """... if the straight moves before and after it are both at least this long [rad, joint-space L2]."""
+    reversals: Natural = 3
+    """More sharp reversals than this are twitching."""
+    tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
+    """Each clearance of a `Report` is at least this share of the least one that was measured, in (0, 1)."""
+
+
+DEFAULT = VerifySettings()
+LOOKS = 0.25
+"""Share of a blend between places at which a motion is looked at [rad, joint-space L2]."""
+
+
+class GoalError(NamedTuple):
+    """How far a configuration is off a goal."""
+
+    message: str
+    subject: str | None
+    excess: float
+
+
+def goal_error(
+    robot: Robot, goal: Goal, q: Float[ndarray, "dof"], settings: VerifySettings = DEFAULT, blend: float = 0.0
+) -> GoalError | None:
+    """How far a configuration is off a goal, of several the nearest by its own measure; None at the goal.
+
+    `blend`: how far off it may be: from a configuration in joint space [rad, L2], from the position of a pose
+    or the box that it may be in [m].
+    """
+    if isinstance(goal, AnyGoal):
+        errors = [goal_error(robot, one, q, settings, blend) for one in goal.goals]
+        off = [error for error in errors if error is not None]
+        return min(off, key=lambda error: error.excess) if len(off) == len(errors) else None
+    if isinstance(goal, PosesGoal):
+        errors = [goal_error(robot, one, q, settings, blend) for one in goal.poses]
+        return max((error for error in errors if error), key=lambda error: error.excess, default=None)
+    if isinstance(goal, JointGoal):
+        differences = goal.positions - q
+        differences -= robot.turns(differences)
+        off = float(np.abs(differences).max(axis=1).min(initial=np.inf))
+        if off <= settings.goal_tolerance or np.linalg.norm(differences, axis=1).min() <= blend:
+            return None
+        return GoalError(f"{off:.3g} from the nearest goal configuration (largest joint error)", None, off)
+    T_goal_end = inverse(goal.T_base_frame) @ link_pose(robot, q, goal.frame)
+    distance, angle = float(np.linalg.norm(T_goal_end[:3, 3])), rotation_angle(T_goal_end[:3, :3])
+    xyz, rpy = goal.xyz_tolerance, goal.rpy_tolerance
+    slack = settings.goal_slack
+    if xyz is None:
+        there = distance <= max(settings.goal_distance, blend)
+    else:
+        beyond = np.maximum(np.abs(T_goal_end[:3, 3]) - xyz - slack, 0.0)
+        there = bool(np.linalg.norm(beyond) <= blend)
+    turned = angle <= settings.goal_angle if rpy is None else _turned(T_goal_end[:3, :3], rpy, slack)
+    if there and turned:
+        return None
+    more = "" if xyz is None and rpy is None else ", which is beyond its tolerances"
+    message = (
+        f"with {goal.frame} {distance * 100:.2f} cm and {np.degrees(angle):.1f} degrees off the goal "
+        f"pose{more}"
+    )
+    return GoalError(message, goal.frame, distance)
+
+
+def passes(
+    robot: Robot,
+    goal: Goal,
+    q: Float[ndarray, "n dof"],
+    blend: float,
+    settings: VerifySettings = DEFAULT,
+    after: float = 0.0,
+) -> float | None:
+    """Where the way through configurations, from a place on, first comes within `blend` of a goal: a row plus
+    the share of the way to the next. None if it is not seen to at places `LOOKS` of the blend apart."""
+    places, way = looked_at(q, LOOKS * blend, after)
+    for i in np.flatnonzero(_near(robot, goal, way, blend, settings)):
+        if goal_error(robot, goal, way[i], settings, blend) is None:
+            return float(places[i])
+    return None
+
+
+def looked_at(
+    q: Float[ndarray, "n dof"], step: float, after: float = 0.0
+) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
+    """Places at most a step [rad, joint-space L2] apart on the way through configurations, from a place on:
+    rows plus shares of the way to the next; and the configurations there."""
+    steps = np.linalg.norm(np.diff(q, axis=0), axis=1)
+    counts = np.maximum(np.ceil(steps / step), 1).astype(int)
+    shares = [np.arange(count) / count for count in counts]
+    places = np.append(np.repeat(np.arange(len(counts)), counts) + np.concatenate([[], *shares]), len(counts))
+    places, rows = places[places >= after], np.arange(len(q))
+    return places, np.column_stack([np.interp(places, rows, joint) for joint in q.T])
+
+
+def _near(
+    robot: Robot, goal: Goal, q: Float[ndarray, "n dof"], blend: float, settings: VerifySettings
+) -> Bool[ndarray, "n"]:
+    """Which configurations may be within `blend` of a goal, by position alone."""
+    if isinstance(goal, AnyGoal):
+        return np.any([_near(robot, one, q, blend, settings) for one in goal.goals], axis=0)
+    if isinstance(goal, PosesGoal):
+        return np.all([_near(robot, one, q, blend, settings) for one in goal.poses], axis=0)
+    if isinstance(goal, JointGoal):
+        differences = goal.positions[:, None] - q
+        differences -= robot.turns(differences)
+        reach = blend + settings.goal_tolerance * np.sqrt(robot.dof)
+        return (np.linalg.norm(differences, axis=2) <= reach).any(axis=0)
+    xyz = goal.xyz_tolerance
+    room = settings.goal_distance if xyz is None else float(np.linalg.norm(xyz + settings.goal_slack))
+    apart = link_origins(robot, q, goal.frame) - goal.T_base_frame[:3, 3]
+    return np.linalg.norm(apart, axis=1) <= room + blend
+
+
+def _within(values: ndarray, tolerance: ndarray, slack: float) -> bool:
+    return bool((np.abs(values) <= tolerance + slack).all())
+
+
+def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
+    """Whether roll, pitch and yaw are within the tolerance, by either of the two ways to give a rotation."""
+    roll, pitch, yaw = rpy_from_rotation(rotation)
+    other = np.array([roll + np.pi, np.pi - pitch, yaw + np.pi])
+    ways = np.array([roll, pitch, yaw]), (other + np.pi) % (2 * np.pi) - np.pi
+    return any(_within(way, tolerance, slack) for way in ways)

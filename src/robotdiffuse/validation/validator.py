@@ -1,0 +1,379 @@
+"""The judge: is a motion free of collision, within limits, and from the start to the goal?
+
+Collision between waypoints is settled by a certificate, not by sampling: see collision/motions.py. The rates
+of a trajectory are those of its positions over its times, whatever it says of itself: see rates.py. The judge
+knows nothing of planners.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numba import njit
+from numpy import ndarray
+
+from robotdiffuse.core.bounds import LARGEST, within
+from robotdiffuse.collision.convex_geometry import describe_contact
+from robotdiffuse.collision.motions import Contact, ContinuousCollision
+from robotdiffuse.core.errors import InputError, joined
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
+from robotdiffuse.robots.dynamics import Dynamics
+from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, goal_error, passes
+from robotdiffuse.validation.torques import Pieces, first_beyond, pieces_held, pieces_of
+from robotdiffuse.core.types import Path, Trajectory
+
+if TYPE_CHECKING:  # what most problems do not need is imported where one does
+    from robotdiffuse.collision.moving_obstacles import MovingCollision, TimedContact
+    from robotdiffuse.problems.compiled_constraints import PathConstraints
+
+LONGEST = 1e5
+"""Motion that is judged [s], about a day."""
+
+
+@dataclass(frozen=True)
+class Violation:
+    """The first thing along the motion that is wrong."""
+
+    kind: str
+    """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, waypoint or
+    goal; for trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
+    time: float
+    """Where: for a path, waypoint index plus fraction of the segment; for a trajectory, seconds."""
+    message: str
+    """One line."""
+    subject: str | None = None
+    """The link that collides or is constrained, or the joint that is out of limits."""
+    other: str | None = None
+    """The obstacle, the other link or the kind of constraint."""
+    excess: float | None = None
+    """By how much: the greatest depth until the contact ends [m], the greatest value of a constraint until it
+    is kept; beyond the limit, or off the goal, in its unit."""
+
+
+@dataclass(frozen=True)
+class Report:
+    """The verdict."""
+
+    valid: bool
+    violation: Violation | None
+    """None if and only if the motion is valid."""
+    scene_clearance: float | None
+    """No point of a moving link comes nearer to an obstacle than this [m]: a lower bound over the whole
+    motion, at most 1 m. None for an invalid motion."""
+    self_clearance: float | None
+    """The same to the links that it is checked against."""
+    found: tuple[Violation, ...] = ()
+    """All that was seen to be wrong, the first of its kind; see `violations` for every contact."""
+
+    @property
+    def min_clearance(self) -> float | None:
+        """The smaller of both clearances [m]."""
+        if self.scene_clearance is None or self.self_clearance is None:
+            return None
+        return min(self.scene_clearance, self.self_clearance)
+
+
+def verify(problem: Problem, path: Path, settings: VerifySettings = DEFAULT) -> Report:
+    """Judge a path for a problem. It has no times, so obstacles that move are left to `verify_trajectory`.
+    Raises InputError if its joints are not those of the robot."""
+    return verifier(problem, settings).path(path)
+
+
+def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
+    """Judge a trajectory with its rates and times, and among obstacles that move from its first row to its
+    last. Its velocities and accelerations must be those of its positions, from rest, or the problem's start
+    velocity, to rest; for what is between the rows see `VerifySettings.chord`."""
+    return verifier(problem, settings).trajectory(trajectory)
+
+
+class Verifier:
+    """Judges motions for one problem; what the robot and the scene need is prepared once."""
+
+    def __init__(self, problem: Problem, settings: VerifySettings = DEFAULT) -> None:
+        self.problem, self.settings, self.robot = problem, settings, problem.robot
+
+    def path(self, path: Path) -> Report:
+        """See `verify`."""
+        self._check_shape(path.joint_names, path.positions)
+        found = []
+        if self.dynamics is not None and within(path.positions):
+            clock = np.arange(len(path.positions), dtype=float)
+            found = self._torques(clock, pieces_held(path.positions), " to hold the payload")
+        return self._report(path.positions, None, found)
+
+    def trajectory(self, trajectory: Trajectory) -> Report:
+        """See `verify_trajectory`."""
+        self._check_shape(trajectory.joint_names, trajectory.positions)
+        rows = (trajectory.times, trajectory.velocities, trajectory.accelerations)
+        for name, values in zip(("times", "velocities", "accelerations"), rows, strict=True):
+            if len(values) != len(trajectory.positions):
+                raise InputError(
+                    f"trajectory.{name} has {len(values)} rows; positions has {len(trajectory.positions)}"
+                )
+        if not all(np.isfinite(values).all() for values in rows):
+            violation = Violation("not_finite", 0.0, "the trajectory holds values that are not finite")
+            return Report(False, violation, None, None)
+        backwards = np.flatnonzero(np.diff(trajectory.times) <= 0)
+        if len(backwards):
+            at = float(trajectory.times[backwards[0] + 1])
+            message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
+            return Report(False, Violation("time", at, message), None, None)
+        if trajectory.duration - trajectory.times[0] > LONGEST:
+            message = f"the motion takes {trajectory.duration:.6g} s; at most {LONGEST:g} s can be judged"
+            return Report(False, Violation("time", float(trajectory.times[0]), message), None, None)
+        if not within(trajectory.positions):
+            return self._report(trajectory.positions, trajectory.times, [])
+        found = [
+            Violation(wrong.kind, wrong.time, wrong.message, wrong.joint, None, wrong.excess)
+            for wrong in wrong_rates(
+                self.robot, trajectory, self._rate_tolerances, self.problem.start_velocity
+            )
+        ]
+        rows = trajectory.times, trajectory.positions
+        times, positions = rows if found else between_rows(trajectory, self.settings.chord)
+        still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
+        along = None
+        if not found and self.dynamics is not None:
+            found += self._torques(trajectory.times, pieces_of(trajectory), ", with the payload")
+        if self.constraints is not None:
+            found += self._too_fast(trajectory)
+            along = between_rows(trajectory, self.settings.constraint_chord) if not found else None
+        return self._report(positions, times, found, np.isin(times, trajectory.times[still]), along)
+
+    def collision_free(self, path: Path) -> bool:
+        """Whether a path is certified free of collision and keeps path constraints; neither its ends nor
+        limits are looked at."""
+        self._check_shape(path.joint_names, path.positions)
+        if self.constraints is not None and self.constraints.first(path.positions) is not None:
+            return False
+        return self._continuous.sweep(path.positions).contact is None
+
+    def _check_shape(self, joint_names: tuple[str, ...], positions: ndarray) -> None:
+        if tuple(joint_names) != self.robot.joint_names:
+            given, right = joined(joint_names), joined(self.robot.joint_names)
+            raise InputError(f"path.joint_names is {given}; the robot's planned joints are {right}")
+        if positions.ndim != 2 or positions.shape[1] != self.robot.dof or len(positions) == 0:
+            raise InputError(
+                f"path.positions has shape {positions.shape}; it must be n x {self.robot.dof} with n >= 1"
+            )
+
+    def _report(
+        self,
+        q: ndarray,
+        times: ndarray | None,
+        found: list[Violation],
+        at_rest: ndarray | None = None,
+        along: tuple[ndarray, ndarray] | None = None,
+    ) -> Report:
+        """The verdict on waypoints; `found` are violations known already. The earliest one is reported.
+
+        `at_rest`: at which rows a timed motion stands still. `along`: times and positions of one for path
+        constraints.
+        """
+        bad = np.flatnonzero(~(np.abs(q) <= LARGEST).all(axis=1))
+        if len(bad):
+            at = float(bad[0] if times is None else times[bad[0]])
+            message = f"waypoint {bad[0]} holds values that are not finite, or not within ±{LARGEST:g}"
+            return Report(False, Violation("not_finite", at, message), None, None)
+        clock = np.arange(len(q), dtype=float) if times is None else times
+        limits = self._limits(q, clock, "waypoint {:g}" if times is None else "{:.3f} s")
+        every = (self._start(q), limits, *found, self._twitch(q, clock), self._constrained(q, clock, along))
+        found = [violation for violation in every if violation is not None]
+        first = min(found, key=lambda violation: violation.time, default=None)
+        last = len(q) - 1 if first is None else int(np.searchsorted(clock, first.time))
+        sweep = self._continuous.sweep(q[: last + 1])
+        collision = None
+        moving = None
+        if times is not None and self.problem.moving:
+            moving = self._moving.sweep(times[: last + 1], q[: last + 1])
+        if sweep.contact is not None:
+            collision = collision_violation(
+                sweep.contact, float(np.interp(sweep.contact.at, np.arange(len(clock)), clock))
+            )
+        ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
+        hit = None if moving is None or moving.contact is None else _hit(moving.contact)
+        every = [v for v in (first, collision, hit, *ends) if v is not None]
+        violation = min(every, key=lambda v: v.time, default=None)
+        valid = violation is None
+        scene, itself = (sweep.scene_clearance, sweep.self_clearance) if valid else (None, None)
+        if scene is not None and moving is not None:
+            scene = min(scene, moving.clearance)
+        return Report(valid, violation, scene, itself, tuple(dict.fromkeys((*found, *every))))
+
+    def _start(self, q: ndarray) -> Violation | None:
+        difference = np.abs(q[0] - self.problem.start)
+        if (difference <= self.settings.start_tolerance).all():
+            return None
+        j = int(difference.argmax())
+        name, excess = self.robot.joint_names[j], float(difference[j])
+        message = (
+            f"the motion begins at {name} = {q[0, j]:.6g}; the problem's start is {self.problem.start[j]:.6g}"
+        )
+        return Violation("start", 0.0, message, name, None, excess)
+
+    def _limits(self, q: ndarray, clock: ndarray, place: str) -> Violation | None:
+        excess = np.maximum(self.robot.lower - q, q - self.robot.upper)
+        excess[:, self.robot.continuous] = 0.0
+        bad = np.flatnonzero((excess > self.settings.limit_slack).any(axis=1))
+        if not len(bad):
+            return None
+        i, j = int(bad[0]), int(excess[bad[0]].argmax())
+        name, low, high = self.robot.joint_names[j], self.robot.lower[j], self.robot.upper[j]
+        at = place.format(clock[i])
+        message = f"{name} is {q[i, j]:.6g} at {at}; its limits are {low:.6g} to {high:.6g}"
+        return Violation("limits", float(clock[i]), message, name, None, float(excess[i, j]))
+
+    def _constrained(
+        self, q: ndarray, clock: ndarray, along: tuple[ndarray, ndarray] | None
+    ) -> Violation | None:
+        """Where the motion is first not proved to keep the path constraints."""
+        if self.constraints is None:
+            return None
+        chord = 0.0 if along is None else self.settings.constraint_chord
+        clock, q = (clock, q) if along is None else along
+        wrong = self.constraints.first(q, chord)
+        if wrong is None:
+            return None
+        at = float(np.interp(wrong.at, np.arange(len(clock)), clock))
+        one = wrong.constraint
+        return Violation("constraint", at, wrong.message, one.frame, one.kind, wrong.excess)
+
+    def _too_fast(self, trajectory: Trajectory) -> list[Violation]:
+        """Where a frame is first faster than its constraint allows."""
+        assert self.constraints is not None
+        speeds = self.constraints.speeds(trajectory.positions, trajectory.velocities)
+        excess = speeds - self.constraints.most_speeds * (1 + self.settings.rate_slack)
+        bad = np.flatnonzero((excess > 0).any(axis=1))
+        if not len(bad):
+            return []
+        i, k = int(bad[0]), int(excess[bad[0]].argmax())
+        one, at = self.constraints.paced[k], float(trajectory.times[bad[0]])
+        most = self.constraints.most_speeds[k]
+        message = f"{one.frame} moves at {speeds[i, k]:.4g} m/s; {one.kind} allows {most:.4g} m/s"
+        return [Violation("speed", at, message, one.frame, one.kind, float(excess[:, k].max()))]
+
+    def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> list[Violation]:
+        """Where a joint's torque is first not proved to be within its effort limit, with the payload."""
+        assert self.dynamics is not None
+        beyond = first_beyond(self.dynamics, pieces, self.settings.rate_slack)
+        if beyond is None:
+            return []
+        at, name = (
+            float(np.interp(beyond.place, np.arange(len(clock)), clock)),
+            self.robot.joint_names[beyond.joint],
+        )
+        message = self.dynamics.words(beyond.joint, beyond.torque) + what
+        return [Violation("torque", at, message, name, None, beyond.excess)]
+
+    def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
+        """More sharp reversals than allowed, counted on waypoints at least `reversal_step` apart."""
+        settings = self.settings
+        if not len(q) > settings.reversals + 2:
+            return None
+        kept = _apart(np.ascontiguousarray(q, np.float64), settings.reversal_step)
+        steps = np.diff(q[kept], axis=0)
+        steps /= np.linalg.norm(steps, axis=1, keepdims=True)
+        cosines = (steps[1:] * steps[:-1]).sum(axis=1)
+        sharp = np.flatnonzero(cosines < np.cos(settings.reversal_angle))
+        if len(sharp) <= settings.reversals:
+            return None
+        at = float(clock[kept[sharp[settings.reversals] + 1]])
+        message = (
+            f"the motion twitches: {len(sharp)} sharp reversals; at most {settings.reversals} are allowed"
+        )
+        return Violation("twitch", at, message, None, None, float(len(sharp) - settings.reversals))
+
+    def _goal(self, end: ndarray, time: float) -> Violation | None:
+        off = goal_error(self.robot, self.problem.goal, end, self.settings)
+        if off is None:
+            return None
+        return Violation("goal", time, f"the motion ends {off.message}", off.subject, None, off.excess)
+
+    def _waypoints(self, q: ndarray, clock: ndarray, at_rest: ndarray | None) -> Violation | None:
+        """The first waypoint at which the motion does not stop, or that it does not pass within its blend,
+        after those before it."""
+        problem, after = self.problem, 0.0
+        for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
+            if blend:
+                place = passes(self.robot, goal, q, blend, self.settings, after)
+            else:
+                stops = np.arange(len(q)) if at_rest is None else np.flatnonzero(at_rest)
+                late = stops[stops >= after]
+                there = (i for i in late if goal_error(self.robot, goal, q[i], self.settings) is None)
+                place = next(there, None)
+            if place is None:
+                what = f"pass within {blend:g} of" if blend else "stop at"
+                message = f"the motion does not {what} waypoints[{k}] after those before it"
+                return Violation("waypoint", float(clock[-1]), message, f"waypoints[{k}]", None, None)
+            after = float(place)
+        return None
+
+    @cached_property
+    def constraints(self) -> "PathConstraints | None":
+        """The problem's path constraints made ready; None if it has none."""
+        if not self.problem.constraints:
+            return None
+        from robotdiffuse.problems.compiled_constraints import PathConstraints
+
+        return PathConstraints(self.problem)
+
+    @cached_property
+    def dynamics(self) -> Dynamics | None:
+        """Of the robot with the problem's payload; None if it has none."""
+        payload = self.problem.payload
+        return None if payload is None else Dynamics(self.robot, payload, self.problem.T_world_base)
+
+    @property
+    def _rate_tolerances(self) -> RateTolerances:
+        settings = self.settings
+        return RateTolerances(
+            settings.rate_slack, settings.rate_agreement, settings.jump, settings.limit_slack
+        )
+
+    @cached_property
+    def _continuous(self) -> ContinuousCollision:
+        settings = self.settings
+        return ContinuousCollision(self.robot, self.problem.scene, settings.contact, settings.tightness)
+
+    @cached_property
+    def _moving(self) -> "MovingCollision":
+        from robotdiffuse.collision.moving_obstacles import MovingCollision
+
+        settings = self.settings
+        return MovingCollision(self.robot, self.problem.moving, settings.contact, settings.tightness)
+
+
+@njit(cache=True)
+def _apart(q, step):
+    """Indices of rows of q[n, dof] that are each at least `step` from the one before, with the first."""
+    kept, count = np.zeros(len(q), np.int64), 1
+    for i in range(1, len(q)):
+        total = 0.0
+        for j in range(q.shape[1]):
+            total += (q[i, j] - q[kept[count - 1], j]) ** 2
+        if total >= step * step:
+            kept[count] = i
+            count += 1
+    return kept[:count]
+
+
+@lru_cache(maxsize=8)
+def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
+    """The Verifier of a problem; the last few are kept, so that many paths of one problem are judged fast."""
+    return Verifier(problem, settings)
+
+
+def _hit(contact: "TimedContact") -> Violation:
+    link, other, time = contact.link, contact.obstacle, contact.time
+    message = f"{describe_contact(link, other, contact.depth, False)} at {time:.3f} s"
+    return Violation("scene_collision", time, message, link, other, contact.depth)
+
+
+def collision_violation(contact: Contact, time: float) -> Violation:
+    """A contact as a violation at a time."""
+    (link, pair), other = contact.check, contact.other
+    kind = "scene_collision" if pair is None else "self_collision"
+    message = describe_contact(link, other, contact.depth, pair is not None)
+    return Violation(kind, time, message, link, other, contact.depth)

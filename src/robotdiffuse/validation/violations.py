@@ -1,0 +1,48 @@
+"""All that is wrong with a motion, where the judge names what comes first."""
+
+import numpy as np
+
+from robotdiffuse.collision.contacts import contacts
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.validation.rates import between_rows
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.validation.validator import DEFAULT, Report, VerifySettings, Violation, collision_violation, verifier
+
+RATES = ("rest", "rates", "velocity", "acceleration", "jump")
+CONTACTS = ("scene_collision", "self_collision")
+
+
+def violations(
+    problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT
+) -> tuple[Violation, ...]:
+    """Everything that is wrong with a motion, in order; none if it is valid.
+
+    Of contacts each, from where it begins; joint limits for each joint; of all else the first of its kind.
+    """
+    judge = verifier(problem, settings)
+    timed = isinstance(motion, Trajectory)
+    report: Report = judge.trajectory(motion) if timed else judge.path(motion)
+    if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
+        return () if report.violation is None else (report.violation,)
+    still = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
+    found = [w for w in report.found if w.kind != "limits" and not (w.kind in CONTACTS and w.other in still)]
+    q, clock = motion.positions, np.arange(len(motion.positions), dtype=float)
+    if timed:
+        rates = any(wrong.kind in RATES for wrong in found)
+        clock, q = (motion.times, q) if rates else between_rows(motion, settings.chord)
+    for contact in contacts(problem.robot, problem.scene, q, settings.contact):
+        found.append(collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock))))
+    found += _limits(problem, q, clock, settings)
+    return tuple(sorted(found, key=lambda wrong: wrong.time))
+
+
+def _limits(problem: Problem, q: np.ndarray, clock: np.ndarray, settings: VerifySettings) -> list[Violation]:
+    robot, found = problem.robot, []
+    beyond = np.maximum(robot.lower - q, q - robot.upper)
+    beyond[:, robot.continuous] = 0.0
+    for j in np.flatnonzero((beyond > settings.limit_slack).any(axis=0)).tolist():
+        i, most = int(np.argmax(beyond[:, j] > settings.limit_slack)), float(beyond[:, j].max())
+        name, low, high = robot.joint_names[j], robot.lower[j], robot.upper[j]
+        message = f"{name} leaves its limits, {low:.6g} to {high:.6g}, by up to {most:.3g}"
+        found.append(Violation("limits", float(clock[i]), message, name, None, most))
+    return found

@@ -1,0 +1,160 @@
+"""Where to look from: the view that shows most of the arm and its trace, framed tightly."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import ConvexHull
+
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.visualization import style
+from robotdiffuse.visualization.style import Surface
+from robotdiffuse.visualization.rasterizer import draw
+
+AZIMUTHS = 18
+ELEVATIONS = np.radians((15.0, 25.0))
+VERTICAL_FIELD = np.radians(28)
+TRACE_POINTS = 120
+"""Configurations at which a motion is looked at."""
+REACH_OF_FRAME = 1.3
+"""Obstacles count for the framing up to this distance from the middle of the arm [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera that looks at `target`, with z up."""
+
+    eye: Float[ndarray, "3"]
+    target: Float[ndarray, "3"]
+    width: int
+    height: int
+
+    @property
+    def focal(self) -> float:
+        """Focal length [pixels]."""
+        return self.height / (2 * np.tan(VERTICAL_FIELD / 2))
+
+    @property
+    def rotation(self) -> Float[ndarray, "3 3"]:
+        """R_camera_base: right, down, forward."""
+        forward = (self.target - self.eye) / np.linalg.norm(self.target - self.eye)
+        right = np.cross(forward, [0.0, 0.0, 1.0])
+        right /= np.linalg.norm(right)
+        return np.stack([right, np.cross(forward, right), forward])
+
+    def project(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
+        """Pixel x, y and 1 / depth (negative or zero behind the camera)."""
+        x, y, z = ((points - self.eye) @ self.rotation.T).T
+        near = np.where(z > 0.05, 1 / np.maximum(z, 0.05), 0.0)
+        columns = [0.5 * self.width + self.focal * x * near, 0.5 * self.height + self.focal * y * near, near]
+        return np.stack(columns, axis=1).astype(np.float32)
+
+    def rays(self) -> Float[ndarray, "3 3"]:
+        """Matrix from (x, y, 1) in pixels to the direction in the base frame with depth 1."""
+        f = self.focal
+        pixel = np.array([[1 / f, 0, -0.5 * self.width / f], [0, 1 / f, -0.5 * self.height / f], [0, 0, 1]])
+        return self.rotation.T @ pixel
+
+
+def _direction(azimuth: float, elevation: float) -> Float[ndarray, "3"]:
+    c = np.cos(elevation)
+    return np.array([c * np.cos(azimuth), c * np.sin(azimuth), np.sin(elevation)])
+
+
+def framed(
+    points: Float[ndarray, "n 3"],
+    toward: Float[ndarray, "3"],
+    width: int,
+    height: int,
+    free: tuple[float, float],
+) -> Camera:
+    """A camera in the direction `toward` that shows all points as large as they fit.
+
+    `free`: shares of the height that stay free above and below them.
+    """
+    target = 0.5 * (points.min(0) + points.max(0))
+    distance = 1.0
+    tangent = np.tan(VERTICAL_FIELD / 2)
+    top, bottom, side = (
+        -(1 - 2 * free[0]) * tangent,
+        (1 - 2 * free[1]) * tangent,
+        0.93 * tangent * width / height,
+    )
+    for _ in range(4):
+        rotation = Camera(target + toward, target, width, height).rotation
+        x, y, z = ((points - target) @ rotation.T).T
+        distance = max((np.abs(x) / side - z).max(), (y / bottom - z).max(), (y / top - z).max(), 0.3)
+        u, v = x / (z + distance), y / (z + distance)
+        off = 0.5 * np.array([u.min() + u.max(), v.min() + v.max() - top - bottom])
+        target = target + distance * rotation[:2].T @ off
+    return Camera(target + distance * toward, target, width, height)
+
+
+def best_view(
+    arm: Surface,
+    ghosts: Surface,
+    trace: Float[ndarray, "n 3"],
+    obstacles: Surface,
+    width: int,
+    height: int,
+    free: tuple[float, float],
+) -> Camera:
+    """The framed view, out of AZIMUTHS x ELEVATIONS, in which most of the arm and its trace can be seen."""
+    moving = np.concatenate([arm.vertices, ghosts.vertices, trace])
+    middle = 0.5 * (moving.min(0) + moving.max(0))
+    near = np.linalg.norm(obstacles.vertices - middle, axis=1) < REACH_OF_FRAME
+    points = np.concatenate([moving, obstacles.vertices[near]])
+    points = points[ConvexHull(points, qhull_options="QJ").vertices]
+    small = (160, max(1, 160 * height // width))
+    best, best_score = _direction(0.0, ELEVATIONS[0]), -1.0
+    for elevation in ELEVATIONS:
+        for azimuth in np.arange(AZIMUTHS) * (2 * np.pi / AZIMUTHS):
+            camera = framed(points, _direction(azimuth, elevation), *small, free)
+            score = _score(camera, arm, ghosts, trace, obstacles)
+            if score > best_score:
+                best, best_score = _direction(azimuth, elevation), score
+    return framed(points, best, width, height, free)
+
+
+def view_of_motion(
+    robot: Robot,
+    scene: Scene,
+    surfaces: list[Surface],
+    tool: tuple[int, Float[ndarray, "3"]],
+    q: Float[ndarray, "n dof"],
+    width: int,
+    height: int,
+    free: tuple[float, float],
+) -> Camera:
+    """The best view of a motion among obstacles; `surfaces` and `tool` are those of `look`."""
+    q = style.dense(q, TRACE_POINTS)
+    poses = style.frames(robot, q)
+    colored = zip(scene.shapes, style.obstacle_colors(scene), strict=True)
+    obstacles = style.join([style.shape_surface(shape, color) for shape, color in colored])
+    ghosts = style.join([style.posed(surfaces, poses[i]) for i in (0, len(q) // 2)])
+    arm, trace = style.posed(surfaces, poses[-1]), style.trace(robot, tool, q)
+    return best_view(arm, ghosts, trace, obstacles, width, height, free)
+
+
+def _score(
+    camera: Camera, arm: Surface, ghosts: Surface, trace: Float[ndarray, "n 3"], obstacles: Surface
+) -> float:
+    """Shares of the arm and, half as much, the ghosts that can be seen, plus the trace's length."""
+    empty = np.zeros((camera.height, camera.width), np.float32)
+    ident = np.empty(empty.shape, np.int32)
+    hidden = empty.copy()
+    draw(hidden, ident, camera.project(obstacles.vertices), obstacles.faces)
+    score = 0.0
+    for part, weight in ((arm, 1.0), (ghosts, 0.5)):
+        drawn = empty.copy()
+        draw(drawn, ident, camera.project(part.vertices), part.faces)
+        score += weight * float((drawn > hidden).sum() / max(1, (drawn > 0).sum()))
+    pixels = camera.project(trace)
+    column, row = pixels[:, 0].astype(int), pixels[:, 1].astype(int)
+    inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    column, row = column.clip(0, camera.width - 1), row.clip(0, camera.height - 1)
+    seen = inside & (pixels[:, 2] > hidden[row, column])
+    steps = np.linalg.norm(np.diff(pixels[:, :2], axis=0), axis=1)
+    return score + float(steps[seen[1:]].sum()) / camera.height

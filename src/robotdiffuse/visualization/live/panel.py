@@ -1,0 +1,330 @@
+"""The widgets of the page: what they show of a session's state, and what they ask of it."""
+
+import html
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import viser
+from viser import uplot
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.visualization.live.certificate import FREE, NONE, WAITING, WRONG, Certificate
+from robotdiffuse.visualization.live.files import problem_text, replay_page, uploaded_problem
+from robotdiffuse.visualization.live.obstacles import LEAST, MOST, NEW, dimensions
+from robotdiffuse.visualization.live.session import KEEP_TREES, Session, State
+from robotdiffuse.planning import PLANNERS
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.core.types import Path, Trajectory
+
+COLORS = {FREE: "#0f8f6f", WRONG: "#c92f2f", NONE: "#b26a00", WAITING: "#6b7684"}
+"""Of certificates."""
+SERIES = ("#4f7fd9", "#10a37f", "#d97b5c", "#8a63d2", "#c2a23a", "#4fa3b8", "#c96a9a", "#7a8794")
+"""Of joints in the plot."""
+NOTHING = "(none)"
+"""Selected where no obstacle is."""
+PLOTS = ("position", "velocity", "acceleration")
+SHORT = 8.0
+"""Notifications go after this [s]."""
+
+
+@dataclass(frozen=True)
+class Deeds:
+    """What the panel asks of the page rather than of the session."""
+
+    select: Callable[[str], None]
+    seek: Callable[[float], None]
+    play: Callable[[bool], None]
+
+
+class Panel:
+    """See the head of this file."""
+
+    def __init__(self, server: viser.ViserServer, session: Session, deeds: Deeds) -> None:
+        self._server, self._session, self._deeds = server, session, deeds
+        gui = server.gui
+        self._shown: dict[str, Any] = {}
+        self._certificate = gui.add_html("")
+        self._slider = gui.add_slider("Time", min=0.0, max=1.0, step=0.01, initial_value=0.0)
+        self._play = gui.add_button("Play", icon=viser.Icon.PLAYER_PLAY)
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Plan"):
+            self._plan_tab()
+        with tabs.add_tab("Obstacles"):
+            self._obstacles_tab()
+        with tabs.add_tab("Start"):
+            self._joints_box = gui.add_folder("Joints")
+            self._joints: list[viser.GuiInputHandle[float]] = []
+        with tabs.add_tab("Files"):
+            self._files_tab()
+        self._on(self._slider, lambda event: deeds.seek(event.target.value))
+        self._play.on_click(lambda _event: deeds.play(self._play.label == "Play"))
+
+    def _on(self, widget: Any, do: Callable[[Any], object]) -> None:
+        """Call `do` when someone changes a widget; what it refuses becomes a note on the page."""
+
+        @widget.on_update
+        def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                self.guarded(event, lambda: do(event))
+
+    def guarded(self, event: viser.GuiEvent, do: Callable[[], object]) -> None:
+        """Call `do`; InputError becomes a note to who asked."""
+        try:
+            do()
+        except InputError as error:
+            if event.client is not None:
+                event.client.add_notification(
+                    "That cannot be", str(error), auto_close_seconds=SHORT, color="red"
+                )
+
+    # tabs
+
+    def _plan_tab(self) -> None:
+        gui, session, choice = self._server.gui, self._session, self._session.state.choice
+        self._planner = gui.add_dropdown("Planner", tuple(PLANNERS), initial_value=choice.planner)
+        self._limit = gui.add_slider(
+            "Time limit [s]", min=0.05, max=10.0, step=0.05, initial_value=min(choice.time_limit, 10.0)
+        )
+        self._follow = gui.add_checkbox(
+            "Keep planning", initial_value=choice.follow, hint="Plan anew after each change"
+        )
+        self._candidates = gui.add_checkbox(
+            "Candidates",
+            initial_value=choice.candidates,
+            hint="What the network proposes: red where it touches, green with 5 cm of clearance",
+        )
+        self._trees = gui.add_checkbox(
+            "Search trees",
+            initial_value=choice.trees,
+            hint="From the start (blue) and the goal (green), of " + ", ".join(KEEP_TREES),
+        )
+        self._now = gui.add_button("Plan now", icon=viser.Icon.ROUTE)
+        self._stages = gui.add_html("")
+        self._kind = gui.add_dropdown("Plot", PLOTS, initial_value=PLOTS[0])
+        self._plot_box = gui.add_folder("Joints against their limits")
+        self._plot: viser.GuiUplotHandle | None = None
+        self._on(self._planner, lambda event: session.choose(planner=event.target.value))
+        self._on(self._limit, lambda event: session.choose(time_limit=event.target.value))
+        self._on(self._follow, lambda event: session.choose(follow=event.target.value))
+        self._on(self._candidates, lambda event: session.choose(candidates=event.target.value))
+        self._on(self._trees, lambda event: session.choose(trees=event.target.value))
+        self._on(self._kind, lambda _event: self._show_plot(session.state))
+        self._now.on_click(lambda event: self.guarded(event, session.plan_now))
+
+    def _obstacles_tab(self) -> None:
+        gui = self._server.gui
+        nothing: tuple[str, ...] = (NOTHING,)
+        self._selected: Any = gui.add_dropdown("Obstacle", nothing, initial_value=NOTHING)
+        self._sizes_box = gui.add_folder("Size [m]", visible=False)
+        self._sizes: dict[str, Any] = {}
+        self._delete = gui.add_button("Delete", icon=viser.Icon.TRASH, visible=False)
+        self._new = gui.add_dropdown("New obstacle", tuple(NEW), initial_value="sphere")
+        self._add = gui.add_button("Add", icon=viser.Icon.PLUS)
+        self._on(self._selected, lambda event: self._deeds.select(_name(event.target.value)))
+        self._delete.on_click(
+            lambda event: self.guarded(event, lambda: self._session.delete_obstacle(self._selected.value))
+        )
+        self._add.on_click(lambda event: self.guarded(event, self._add_obstacle))
+
+    def _add_obstacle(self) -> None:
+        self._deeds.select(self._session.add_obstacle(self._new.value))
+
+    def _files_tab(self) -> None:
+        gui, session = self._server.gui, self._session
+        load = gui.add_upload_button("Load problem", icon=viser.Icon.UPLOAD, mime_type=".yaml,.yml,.json")
+        save = gui.add_button("Save problem", icon=viser.Icon.DOWNLOAD)
+        share = gui.add_button("Save replay", icon=viser.Icon.SHARE)
+
+        @load.on_upload
+        def _(event: viser.GuiEvent) -> None:
+            file, robot = load.value, session.state.problem.robot
+            self.guarded(event, lambda: session.open(uploaded_problem(file.content, file.name, robot)))
+
+        @save.on_click
+        def _(event: viser.GuiEvent) -> None:
+            def send() -> None:
+                _send(event, "problem.yaml", problem_text(session.state.problem))
+
+            self.guarded(event, send)
+
+        @share.on_click
+        def _(event: viser.GuiEvent) -> None:
+            def send() -> None:
+                state = session.state
+                if state.motion is None:
+                    raise InputError("there is no motion to save yet")
+                names = state.problem.robot.joint_names
+                fan = () if state.candidates is None else state.candidates.positions
+                paths = tuple(Path(names, q) for q in fan)
+                _send(event, "replay.html", replay_page(state.problem, state.motion, paths))
+
+            self.guarded(event, send)
+
+    # what is shown
+
+    def show(self, state: State, certificate: Certificate, selected: str) -> None:
+        """All of a state that has changed."""
+        if self._new_value("certificate", (certificate, state.planning)):
+            self._certificate.content = _certificate_html(certificate, state.planning)
+        if self._new_value("seconds", state.seconds):
+            self._stages.content = _stages_html(state.seconds)
+        for widget, value in (
+            (self._planner, state.choice.planner),
+            (self._follow, state.choice.follow),
+            (self._candidates, state.choice.candidates),
+            (self._trees, state.choice.trees),
+        ):
+            _set(widget, value)
+        if self._new_value("motion", state.motion):
+            self._show_plot(state)
+        if self._new_value("robot", state.problem.robot):
+            self._new_joints(state.problem.robot)
+        if self._new_value("start", state.problem.start):
+            for widget, value in zip(self._joints, state.problem.start, strict=True):
+                _set(widget, round(float(value), 3))
+        self._show_obstacle(state, selected)
+
+    def _new_value(self, what: str, value: object) -> bool:
+        """Whether it is another than the last time."""
+        known = self._shown.get(what)
+        if known is value or (isinstance(value, tuple) and known == value):
+            return False
+        self._shown[what] = value
+        return True
+
+    def _show_obstacle(self, state: State, selected: str) -> None:
+        shapes = {shape.name: shape for shape in state.problem.known_scene.shapes}
+        options: tuple[str, ...] = (NOTHING, *shapes)
+        if self._new_value("options", options):
+            self._selected.options = options
+        name = selected if selected in shapes else NOTHING
+        _set(self._selected, name)
+        shape = shapes.get(selected)
+        self._delete.visible = shape is not None
+        sizes = {} if shape is None else dimensions(shape)
+        self._sizes_box.visible = bool(sizes)
+        if self._new_value("sizes of", (name, *sizes)):
+            for widget in self._sizes.values():
+                widget.remove()
+            with self._sizes_box:
+                self._sizes = {of: self._size_slider(name, of, value) for of, value in sizes.items()}
+        for of, value in sizes.items():
+            _set(self._sizes[of], value)
+
+    def _size_slider(self, name: str, dimension: str, value: float) -> Any:
+        most = max(MOST, value)
+        slider = self._server.gui.add_slider(
+            dimension, min=min(LEAST, value), max=most, step=0.005, initial_value=value
+        )
+        self._on(slider, lambda event: self._session.resize_obstacle(name, dimension, event.target.value))
+        return slider
+
+    def _new_joints(self, robot: Robot) -> None:
+        for widget in self._joints:
+            widget.remove()
+        self._joints = []
+        limits = zip(robot.joint_names, robot.lower, robot.upper, robot.continuous, strict=True)
+        with self._joints_box:
+            for name, low, high, turns in limits:
+                low, high = (-np.pi, np.pi) if turns else (float(low), float(high))
+                low, high = np.floor(100 * low) / 100, np.ceil(100 * high) / 100  # for short labels
+                widget = self._server.gui.add_slider(name, min=low, max=high, step=0.001, initial_value=low)
+                self._on(widget, partial(self._move_joint, len(self._joints)))
+                self._joints.append(widget)
+
+    def _move_joint(self, index: int, event: Any) -> None:
+        problem = self._session.state.problem
+        q = problem.start.copy()
+        q[index] = np.clip(event.target.value, problem.robot.lower[index], problem.robot.upper[index])
+        self._session.set_start(q)
+
+    def show_time(self, at: float, duration: float) -> None:
+        """Where the slider stands."""
+        most = max(np.ceil(100 * duration) / 100, 0.01)
+        if self._slider.max != most:
+            self._slider.max = most
+        self._slider.value = round(at, 2)
+
+    def show_playing(self, playing: bool) -> None:
+        self._play.label = "Pause" if playing else "Play"
+        self._play.icon = viser.Icon.PLAYER_PAUSE if playing else viser.Icon.PLAYER_PLAY
+
+    def _show_plot(self, state: State) -> None:
+        robot, motion = state.problem.robot, state.motion
+        if motion is None or motion.trajectory is None:
+            return
+        data = plotted(robot, motion.trajectory, self._kind.value)
+        names = tuple(robot.joint_names)
+        if self._plot is not None and self._new_value("joints of the plot", names):
+            self._plot.remove()
+            self._plot = None
+        if self._plot is not None:
+            self._plot.data = data
+            return
+        self._shown["joints of the plot"] = names
+        joints = [
+            uplot.Series(label=name, stroke=SERIES[i % len(SERIES)], width=1.5)
+            for i, name in enumerate(names)
+        ]
+        limit = uplot.Series(label="limit", stroke="#c92f2f", width=1, dash=(6, 4))
+        with self._plot_box:
+            self._plot = self._server.gui.add_uplot(
+                data=data,
+                series=(uplot.Series(label="time [s]"), *joints, limit, limit),
+                scales={"x": uplot.Scale(time=False), "y": uplot.Scale(range=(-118.0, 118.0))},
+                axes=(uplot.Axis(label="s"), uplot.Axis(label="% of limit")),
+                legend=uplot.Legend(show=False),
+                height=220,
+            )
+
+
+def plotted(robot: Robot, motion: Trajectory, kind: str) -> tuple[np.ndarray, ...]:
+    """Times, each joint in % of its limits, and the limits: -100 and 100. Of a position, 0 is the middle of
+    the range; for continuous joints, half a turn counts as the limit."""
+    if kind == "velocity":
+        values = motion.velocities / robot.velocity
+    elif kind == "acceleration":
+        values = motion.accelerations / robot.acceleration
+    else:
+        middle = np.where(robot.continuous, 0.0, 0.5 * (robot.lower + robot.upper))
+        half = np.where(robot.continuous, np.pi, 0.5 * (robot.upper - robot.lower))
+        values = (motion.positions - middle) / half
+    limit = np.full(len(motion.times), 100.0)
+    return (motion.times, *(100.0 * values).T, limit, -limit)
+
+
+def _set(widget: Any, value: object) -> None:
+    """Without a message where it has the value already."""
+    if widget.value != value:
+        widget.value = value
+
+
+def _name(option: str) -> str:
+    return "" if option == NOTHING else option
+
+
+def _send(event: viser.GuiEvent, name: str, content: bytes) -> None:
+    if event.client is not None:
+        event.client.send_file_download(name, content, save_immediately=True)
+
+
+def _certificate_html(certificate: Certificate, planning: bool) -> str:
+    lines = "".join(f"<div>{html.escape(line)}</div>" for line in certificate.lines)
+    busy = " · planning" if planning and certificate.kind != WAITING else ""
+    return (
+        f'<div data-certificate="{certificate.kind}" style="margin: 0 0.8em 0.8em; padding: 0.7em 0.9em; '
+        f"border-radius: 8px; color: white; font-size: 0.85em; line-height: 1.4; "
+        f'background: {COLORS[certificate.kind]}; overflow-wrap: anywhere">'
+        f"<b>{html.escape(certificate.headline)}</b>{busy}{lines}</div>"
+    )
+
+
+def _stages_html(seconds: tuple[tuple[str, float], ...]) -> str:
+    rows = "".join(
+        f'<tr><td>{html.escape(stage)}</td><td style="text-align: right">{1e3 * took:.1f} ms</td></tr>'
+        for stage, took in seconds
+    )
+    return f'<table style="margin: 0 0.8em; width: calc(100% - 1.6em); font-size: 0.85em">{rows}</table>'

@@ -1,0 +1,61 @@
+"""A replay in a cell of a notebook."""
+
+import html
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.files import problem_from_record
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.core.results import PlanResult, ResultFile
+from robotdiffuse.visualization.replay_page import write_replay
+
+
+class Replay:
+    """What a notebook shows in a cell."""
+
+    def __init__(self, page: str, height: int) -> None:
+        self._page, self._height = page, height
+
+    def _repr_html_(self) -> str:
+        style = "width: 100%; border: 0; border-radius: 8px"
+        page = html.escape(self._page)
+        return f'<iframe srcdoc="{page}" height="{self._height}" style="{style}"></iframe>'
+
+
+def show(result: PlanResult | ResultFile, problem: Problem | None = None, height: int = 560) -> Replay:
+    """The replay of a solved result, as the value of a notebook's cell shows it; in the middle of a cell,
+    `display(rd.show(result))`.
+
+    problem: what was asked; results of `plan` know it, and result files that were saved with theirs.
+    height: of the cell [pixels].
+
+    Raises InputError outside a notebook, for a result without a motion and where the problem is not known.
+    """
+    if isinstance(result, ResultFile):
+        if problem is None and result.problem is not None:
+            problem = problem_from_record(result.problem)
+        result = result.result
+    problem = problem or result.problem
+    motion = result.trajectory or result.path
+    if motion is None:
+        raise InputError(f"there is no motion to show: {result.status.value} ({result.reason})")
+    if problem is None:
+        raise InputError("the result does not say what was asked; give it: rd.show(result, problem)")
+    if not _in_notebook():
+        raise InputError(
+            "rd.show is for notebooks; elsewhere save the result and use `robotdiffuse view`, or "
+            "robotdiffuse.visualization.write_replay"
+        )
+    robot, scene = problem.standing()
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "replay.html"
+        write_replay(robot, scene, motion, file, result=result)
+        return Replay(file.read_text("utf-8"), height)
+
+
+def _in_notebook() -> bool:
+    """Whether a kernel of Jupyter runs this; IPython is not imported for it."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    return hasattr(shell, "kernel")

@@ -1,0 +1,269 @@
+"""A picture of a motion as a PNG: drawn in memory, without GPU, window or browser."""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import Image, ImageDraw, ImageFont
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.visualization import style
+from robotdiffuse.visualization.camera import Camera, best_view
+from robotdiffuse.visualization.style import GOAL, START, Surface, join
+from robotdiffuse.visualization.rasterizer import blend_ghost, draw, light_lattice, shade
+
+SUPERSAMPLING = 2
+SKY_LIGHTS, SKY_MAP = 60, 320
+KEY_LIGHTS, KEY_MAP = 28, 768
+"""How many directions, and pixels along each side of the map of what each of them reaches."""
+LATTICE = 4
+"""Light is gathered at every fourth pixel of the supersampled image."""
+KEY_DIRECTION = np.array([0.35, -0.45, 0.82])
+"""Toward the main light, in a frame whose x axis points from the scene to the camera."""
+KEY_SPREAD = 0.075
+"""Radius of the main light as seen from the scene [rad]: it makes the shadows soft."""
+TUBE_RADIUS = 0.006
+GROUND_RADIUS = 3.2
+PAPER = (0xF2, 0xF4, 0xF6)
+FREE = (0.05, 0.11)
+"""Shares of the height that stay free above the arm, and below it for the caption."""
+
+
+@dataclass(frozen=True)
+class PictureSettings:
+    """Size and contents of the picture."""
+
+    width: int = 1280
+    """[pixels]"""
+    height: int = 800
+    """[pixels]"""
+    ghosts: int = 5
+    """See-through arms between start and goal, the start included."""
+
+    def __post_init__(self) -> None:
+        if self.width < 16 or self.height < 16:
+            raise InputError(f"picture of {self.width} x {self.height} pixels; each side must be at least 16")
+        if self.ghosts < 0:
+            raise InputError(f"ghosts is {self.ghosts}; it must be 0 or more")
+
+
+def write_picture(
+    robot: Robot,
+    scene: Scene,
+    motion: Path | Trajectory,
+    file: str | FilePath,
+    *,
+    result: PlanResult | None = None,
+    title: str | None = None,
+    settings: PictureSettings | None = None,
+) -> None:
+    """Write a picture of a motion as .png.
+
+    The arm at its end is solid, the poses before it fade towards the start, and a tube follows the tool.
+    `result` adds its figures to the caption. Raises InputError for another ending or a file that cannot be
+    written.
+    """
+    path = check_output(file, (".png",))
+    settings = settings or PictureSettings()
+    pixels, _ = render(robot, scene, motion, settings)
+    image = Image.fromarray(_veiled(pixels))
+    _caption(image, title or robot.name, style.facts(motion, result))
+    buffer = io.BytesIO()
+    image.save(buffer, "PNG", optimize=False)
+    write_atomically(path, buffer.getvalue())
+
+
+def render(
+    robot: Robot, scene: Scene, motion: Path | Trajectory, settings: PictureSettings
+) -> tuple[np.ndarray, Camera]:
+    """The picture without its caption, uint8 [height, width, 3], and the camera that took it."""
+    surfaces = style.robot_surfaces(robot)
+    q = style.dense(motion.positions, 240)
+    poses = style.frames(robot, q)
+    trace = style.trace(robot, style.tool_point(robot, surfaces), q)
+    colors = style.obstacle_colors(scene)
+    obstacles = join([style.shape_surface(s, c) for s, c in zip(scene.shapes, colors, strict=True)])
+    goal = style.posed(surfaces, poses[-1])
+    steps = np.linspace(0, len(q) - 1, settings.ghosts + 1).round().astype(int)[:-1] if len(q) > 1 else []
+    ghosts = [(style.posed(surfaces[1:], poses[i][1:]), i / (len(q) - 1)) for i in steps]
+    faint = join([ghost for ghost, _ in ghosts])
+    camera = best_view(goal, faint, trace, obstacles, settings.width, settings.height, FREE)
+    big = Camera(camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height)
+    image = _paint(big, join([goal, obstacles, _tube(trace)]), ghosts)
+    s = SUPERSAMPLING
+    image = image.reshape(settings.height, s, settings.width, s, 3).mean(axis=(1, 3))
+    return _developed(image), camera
+
+
+def _paint(camera: Camera, solid: Surface, ghosts: list[tuple[Surface, float]]) -> Float[ndarray, "h w 3"]:
+    """Linear light of the solid things with the ghosts over them, the far ones first."""
+    shape = (camera.height, camera.width)
+    image = np.zeros((*shape, 3), np.float32)
+    near, ident = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+    screen = camera.project(solid.vertices)
+    draw(near, ident, screen, solid.faces)
+    view = (camera.eye, camera.rays())
+    height = min(0.0, float(solid.vertices[:, 2].min(initial=0.0)))
+    ground = (height - 1e-4, GROUND_RADIUS, _linear((0xE9, 0xEB, 0xEE)), _linear((0xC3, 0xC9, 0xD1)))
+    background = (_linear((0xF7, 0xF8, 0xFA)), _linear((0xE6, 0xE9, 0xED)))
+    toward = _key_direction(camera)
+    sky = _light_maps(solid, _hemisphere(SKY_LIGHTS), SKY_MAP)
+    key = _light_maps(solid, _cone(toward, KEY_LIGHTS), KEY_MAP)
+    light = (np.array([0.72, 0.70, 0.66]), np.array([0.80, 0.82, 0.86]), np.array([0.16, 0.15, 0.14]))
+    colors = _linear_array(solid.colors)
+    seen = (near, ident, screen, solid.faces, solid.normals)
+    lattice = light_lattice(LATTICE, *seen, view, ground[0], sky, key)
+    shade(image, lattice, LATTICE, *seen, colors, view, ground, background, sky, key, light)
+    ghosts = sorted(ghosts, key=lambda g: -float(np.linalg.norm(g[0].vertices.mean(0) - camera.eye)))
+    for ghost, s in ghosts:
+        own, shown = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+        screen = camera.project(ghost.vertices)
+        draw(own, shown, screen, ghost.faces)
+        tint = _linear(START) * (1 - s) + _linear(GOAL) * s
+        alpha = 0.50 if s == 0 else 0.26
+        blend_ghost(
+            image, near, own, shown, screen, ghost.faces, ghost.normals, _linear_array(ghost.colors),
+            view, toward, tint, alpha,
+        )  # fmt: skip
+    return image
+
+
+def _key_direction(camera: Camera) -> Float[ndarray, "3"]:
+    back = -camera.rotation[2] * [1, 1, 0]
+    back /= np.linalg.norm(back)
+    toward = KEY_DIRECTION[0] * back + KEY_DIRECTION[1] * np.cross([0, 0, 1], back)
+    toward[2] = KEY_DIRECTION[2]
+    return toward / np.linalg.norm(toward)
+
+
+def _hemisphere(count: int) -> Float[ndarray, "n 3"]:
+    """Even directions over the upper half sphere (Fibonacci lattice)."""
+    i = np.arange(count)
+    z = (i + 0.5) / count
+    angle = i * np.pi * (3 - np.sqrt(5))
+    return np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
+
+
+def _cone(toward: Float[ndarray, "3"], count: int) -> Float[ndarray, "n 3"]:
+    """Even directions within KEY_SPREAD of one (sunflower)."""
+    i = np.arange(count)
+    radius = KEY_SPREAD * np.sqrt((i + 0.5) / count)
+    angle = i * np.pi * (3 - np.sqrt(5))
+    right, up, _ = _axes(toward)
+    around = np.cos(angle)[:, None] * right + np.sin(angle)[:, None] * up
+    directions = toward + radius[:, None] * around
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _axes(toward: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+    """Right-handed axes whose third is the direction."""
+    right = np.cross([0.0, 1.0, 0.0] if abs(toward[1]) < 0.9 else [1.0, 0.0, 0.0], toward)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(toward, right), toward])
+
+
+def _light_maps(solid: Surface, toward: Float[ndarray, "n 3"], size: int) -> tuple:
+    """Orthographic maps of what each light reaches first, in the layout of `raster.shade`."""
+    center = np.zeros(3)
+    radius = 0.1
+    if len(solid.vertices):
+        low, high = solid.vertices.min(0).clip(-2.5, 2.5), solid.vertices.max(0).clip(-2.5, 2.5)
+        center = 0.5 * (low + high)
+        away = np.linalg.norm(solid.vertices - center, axis=1)
+        radius = max(radius, min(3.0, float(away.max())))
+    scale = 0.49 * size / radius
+    axes = np.stack([_axes(d) for d in toward])
+    maps = np.zeros((len(toward), size, size), np.float32)
+    ident = np.zeros((size, size), np.int32)
+    for k in range(len(toward)):
+        x, y, z = ((solid.vertices - center) @ axes[k].T).T
+        screen = np.stack(
+            [scale * x + 0.5 * size, scale * y + 0.5 * size, z + 100.0], axis=1, dtype=np.float32
+        )
+        draw(maps[k], ident, screen, solid.faces)
+    return maps, axes, scale, center, size, 2.0 / scale
+
+
+def _tube(points: Float[ndarray, "n 3"], sides: int = 10) -> Surface:
+    """A round tube along a polyline, coloured from START to GOAL, with balls at both ends."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    balls = [
+        Surface(
+            point + 2.2 * TUBE_RADIUS * ball.vertices,
+            np.array(ball.vertices),
+            np.tile(np.array(color) / 255.0, (len(ball.vertices), 1)),
+            np.asarray(ball.faces, np.int64),
+        )
+        for point, color in ((points[0], START), (points[-1], GOAL))
+    ]
+    n = len(points)
+    if n < 2:
+        return join(balls)
+    along = np.gradient(points, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    across = np.empty_like(points)
+    previous = _axes(along[0])[0]
+    for i in range(n):
+        # Carried along with the least twist, so that the tube does not pinch where it turns.
+        previous = previous - along[i] * (along[i] @ previous)
+        previous = previous / max(float(np.linalg.norm(previous)), 1e-9)
+        across[i] = previous
+    angle = np.arange(sides) * (2 * np.pi / sides)
+    normals = (
+        np.cos(angle)[:, None] * across[:, None] + np.sin(angle)[:, None] * np.cross(along, across)[:, None]
+    )
+    t = np.linspace(0, 1, n)[:, None, None]
+    colors = np.broadcast_to(((1 - t) * START + t * GOAL) / 255.0, normals.shape)
+    i, j = np.arange(n - 1)[:, None] * sides, np.arange(sides)
+    quad = [i + j, i + (j + 1) % sides, i + sides + j, i + sides + (j + 1) % sides]
+    faces = np.concatenate([np.stack(quad[:3], -1).reshape(-1, 3), np.stack(quad[1:], -1).reshape(-1, 3)])
+    vertices = points[:, None] + TUBE_RADIUS * normals
+    tube = Surface(vertices.reshape(-1, 3), normals.reshape(-1, 3), colors.reshape(-1, 3), faces)
+    return join([tube, *balls])
+
+
+def _linear(rgb: tuple[int, int, int]) -> Float[ndarray, "3"]:
+    return _linear_array(np.array(rgb) / 255.0)
+
+
+def _linear_array(srgb: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def _developed(image: Float[ndarray, "h w 3"]) -> np.ndarray:
+    """Linear light to sRGB bytes; what is brighter than white rolls off smoothly."""
+    knee = 0.75
+    over = np.maximum(image - knee, 0)
+    image = np.minimum(image, knee) + (1 - knee) * (1 - np.exp(-over / (1 - knee)))
+    srgb = np.where(image <= 0.0031308, 12.92 * image, 1.055 * np.maximum(image, 1e-9) ** (1 / 2.4) - 0.055)
+    return np.round(255 * srgb.clip(0, 1)).astype(np.uint8)
+
+
+def _veiled(pixels: np.ndarray) -> np.ndarray:
+    """The picture with its lower edge fading towards the paper, so that the caption can be read."""
+    rise = (np.linspace(0, 1, len(pixels)) - 0.84).clip(0, None)[:, None, None] / 0.16
+    cover = 0.8 * rise * rise * (3 - 2 * rise)
+    return (pixels + cover * (np.array(PAPER) - pixels)).round().astype(np.uint8)
+
+
+def _caption(image: Image.Image, title: str, facts: list[tuple[str, str]]) -> None:
+    """Title and figures in the lower left corner."""
+    scale = image.width / 1600
+    pen = ImageDraw.Draw(image)
+    big, small = ImageFont.load_default(max(8, 30 * scale)), ImageFont.load_default(max(7, 19 * scale))
+    left, bottom = 44 * scale, image.height - 40 * scale
+    pen.text((left, bottom - 30 * scale), title, fill=(0x22, 0x2B, 0x38), font=big, anchor="ls")
+    for label, value in facts:
+        for text, fill, gap in ((label, (0x8A, 0x93, 0xA0), 7), (value, (0x3A, 0x45, 0x54), 22)):
+            pen.text((left, bottom), text, fill=fill, font=small, anchor="ls")
+            left += small.getlength(text) + gap * scale

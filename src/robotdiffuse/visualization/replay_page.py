@@ -1,0 +1,204 @@
+"""A replay of a motion as one HTML file: 3D, offline, in any browser with WebGL."""
+
+import base64
+import html
+import json
+import re
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.visualization import style
+from robotdiffuse.visualization.camera import TRACE_POINTS, VERTICAL_FIELD, view_of_motion
+from robotdiffuse.visualization.style import GOAL, START, Surface
+
+RATE = 60.0
+"""Most rows of the motion that are kept for each second; the page interpolates between them."""
+MOST_ROWS = 3000
+VIEW = (1600, 1000)
+FREE = (0.09, 0.15)
+"""Shares of the window's height that the first view leaves free for the panels."""
+
+
+def write_replay(
+    robot: Robot,
+    scene: Scene,
+    motion: Path | Trajectory,
+    file: str | FilePath,
+    *,
+    result: PlanResult | None = None,
+    title: str | None = None,
+    candidates: Sequence[Path] = (),
+) -> None:
+    """Write a replay of a motion as .html; it holds all that it needs and opens without network.
+
+    `result` adds its figures to the header; of `candidates` (other paths of the same robot) the traces of
+    the tool are shown. A path without times moves at a constant speed in joint space.
+    Raises InputError for another ending or a file that cannot be written.
+    """
+    target = check_output(file, (".html", ".htm"))
+    title = title or f"{robot.name} · {len(scene.shapes)} obstacle{'' if len(scene.shapes) == 1 else 's'}"
+    data = json.dumps(
+        _page_data(robot, scene, motion, result, candidates), separators=(",", ":"), allow_nan=False
+    )
+    page = files("robotdiffuse.visualization") / "page"
+    parts = {
+        "title": html.escape(title),
+        "style": (page / "replay.css").read_text("utf-8"),
+        # In JSON a '<' stands only in strings, and escaped it cannot end the script element.
+        "data": data.replace("<", "\\u003c"),
+        "three": (page / "three.min.js").read_text("utf-8"),
+        "script": (page / "replay.js").read_text("utf-8"),
+    }
+    template = (page / "replay.html").read_text("utf-8")
+    write_atomically(target, re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], template))
+
+
+def _page_data(
+    robot: Robot,
+    scene: Scene,
+    motion: Path | Trajectory,
+    result: PlanResult | None,
+    candidates: Sequence[Path],
+) -> dict[str, Any]:
+    surfaces = style.robot_surfaces(robot)
+    frame, point = tool = style.tool_point(robot, surfaces)
+    times, positions = _thinned(*style.timed(motion))
+    colors = style.obstacle_colors(scene)
+    return {
+        "robot": {
+            "name": robot.name,
+            "joints": list(robot.joint_names),
+            "offsets": [_rounded(offset[:3].reshape(-1), 9) for offset in robot.frame_offsets],
+            "parents": robot.parents.tolist(),
+            "prismatic": list(robot.prismatic),
+            "frames": [_packed(surface) if len(surface.faces) else None for surface in surfaces],
+            "spheres": _spheres(robot),
+            "tool": {"frame": frame, "point": _rounded(point, 5)},
+        },
+        "scene": [_shape(shape, color) for shape, color in zip(scene.shapes, colors, strict=True)],
+        "ground": _ground(scene, colors),
+        "timed": isinstance(motion, Trajectory),
+        "times": _rounded(times, 4),
+        "positions": [_rounded(row, 5) for row in positions],
+        "candidates": [_candidate(robot, tool, path) for path in candidates],
+        "start_color": START,
+        "goal_color": GOAL,
+        "facts": style.facts(motion, result),
+        "camera": _camera(robot, scene, surfaces, tool, motion.positions),
+    }
+
+
+def _thinned(
+    times: Float[ndarray, "n"], positions: Float[ndarray, "n dof"]
+) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
+    """At most RATE rows a second and MOST_ROWS in all; short motions keep theirs."""
+    most = int(min(MOST_ROWS, max(2, np.ceil(RATE * times[-1]) + 1)))
+    if len(times) <= most:
+        return times, positions
+    at = np.linspace(0, times[-1], most)
+    return at, np.stack([np.interp(at, times, positions[:, j]) for j in range(positions.shape[1])], axis=1)
+
+
+def _spheres(robot: Robot) -> list[list[float | int]]:
+    """Frame, x, y, z, radius of the covering spheres."""
+    rows = []
+    for link, spheres in robot.spheres.items():
+        T = robot.T_frame_link(link)
+        rows += [
+            [robot.link_frame(link), *_rounded(T[:3, :3] @ s[:3] + T[:3, 3], 4), round(float(s[3]), 4)]
+            for s in spheres
+        ]
+    return rows
+
+
+def _candidate(robot: Robot, tool: tuple[int, ndarray], path: Path) -> list[list[float]]:
+    points = style.trace(robot, tool, style.dense(path.positions, TRACE_POINTS))
+    return [_rounded(point, 4) for point in points]
+
+
+def _camera(
+    robot: Robot,
+    scene: Scene,
+    surfaces: list[Surface],
+    tool: tuple[int, ndarray],
+    q: Float[ndarray, "n dof"],
+) -> dict[str, Any]:
+    camera = view_of_motion(robot, scene, surfaces, tool, q, *VIEW, FREE)
+    return {
+        "eye": _rounded(camera.eye, 4),
+        "target": _rounded(camera.target, 4),
+        "field": round(float(np.degrees(VERTICAL_FIELD)), 3),
+        "aspect": VIEW[0] / VIEW[1],
+    }
+
+
+def _ground(scene: Scene, colors: list[tuple[int, int, int]]) -> float:
+    lows = [
+        style.shape_surface(s, c).vertices[:, 2].min(initial=0.0)
+        for s, c in zip(scene.shapes, colors, strict=True)
+    ]
+    return round(float(min([0.0, *lows])), 4)
+
+
+def _shape(shape: Shape, color: tuple[int, int, int]) -> dict[str, Any]:
+    """What the page needs to draw an obstacle: its fields, or packed geometry."""
+    record: dict[str, Any] = {"kind": shape.kind, "name": shape.name, "color": color}
+    if isinstance(shape, PointCloud):
+        low, step, points = _quantised(style.thinned(shape.points))
+        return record | {"radius": shape.point_radius, "low": low, "step": step, "points": points}
+    if isinstance(shape, Triangulated):
+        surface = _packed(style.shape_surface(shape, color), colored=False)
+        return record | {"kind": "mesh", "surface": surface}
+    for name in ("center", "size", "wxyz"):
+        if hasattr(shape, name):
+            record[name] = _rounded(getattr(shape, name), 6)
+    for name in ("radius", "height"):
+        if hasattr(shape, name):
+            record[name] = round(getattr(shape, name), 6)
+    return record
+
+
+def _packed(surface: Surface, colored: bool = True) -> dict[str, Any]:
+    """Geometry in base64: 16-bit vertices, 8-bit normals and colours."""
+    low, step, vertices = _quantised(surface.vertices)
+    wide = len(surface.vertices) >= 2**16
+    packed = {
+        "low": low,
+        "step": step,
+        "vertices": vertices,
+        "normals": _base64(np.round(127 * surface.normals).astype(np.int8)),
+        "faces": _base64(surface.faces.astype("<u4" if wide else "<u2")),
+        "wide": wide,
+    }
+    return (
+        packed | {"colors": _base64(np.round(255 * surface.colors).astype(np.uint8))} if colored else packed
+    )
+
+
+def _quantised(points: Float[ndarray, "n 3"]) -> tuple[list[float], float, str]:
+    """Lowest corner, step and the points as 16-bit multiples of the step in base64."""
+    if len(points) == 0:
+        return [0.0, 0.0, 0.0], 1.0, ""
+    low = points.min(0)
+    step = max(float(np.ptp(points, axis=0).max()), 1e-6) / 65535
+    return low.tolist(), step, _base64(np.round((points - low) / step).astype("<u2"))
+
+
+def _base64(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
+
+
+def _rounded(values: np.ndarray, digits: int) -> list[float]:
+    return np.round(values, digits).tolist()

@@ -1,0 +1,191 @@
+"""The certificate's bounds along short motions against what dense sampling finds there."""
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy import ndarray
+
+from helpers.box_arm import box_mesh
+from helpers.example_robots import example_robot
+from robotdiffuse.collision.checker import CollisionChecker
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.collision.convex_geometry import checks_of, hulls_of, solid_arrays, solids_of
+from robotdiffuse.collision.kernels import convex_bounds
+from robotdiffuse.collision.kernels import motion_certificate
+from robotdiffuse.collision.kernels.motion_certificate import Motion, Pieces
+from robotdiffuse.collision.kernels.swept_spheres import make_swept_spheres
+from robotdiffuse.collision.motions import ContinuousCollision
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
+
+LINKS = {
+    "awkward": (("turret", "arm", "wrist", "flange", "tool"),),
+    "two_arms": (
+        ("torso", "left_upper", "left_lower", "left_hand"),
+        ("torso", "right_upper", "right_lower", "right_hand"),
+    ),
+}
+"""The links of each arm."""
+
+
+@cache
+def clad_arm(name: str) -> Robot:
+    """Skew joints, one of them prismatic; each link is two boxes side by side, covered by spheres."""
+    rng, robot = np.random.default_rng(0), example_robot(name)
+    meshes, spheres = {}, {}
+    for link in dict.fromkeys(link for arm in LINKS[name] for link in arm):
+        low, parts, covers = rng.uniform(-0.06, 0.0, 3), [], []
+        for _ in range(2):
+            size = rng.uniform(0.02, 0.1, 3)
+            parts.append(box_mesh(low, low + size))
+            covers.append([*(low + size / 2), 0.5 * float(np.linalg.norm(size)) + 1e-6])
+            low = low + np.array([size[0], 0.0, 0.0])
+        meshes[link], spheres[link] = tuple(parts), np.array(covers)
+    near = frozenset(frozenset(pair) for arm in LINKS[name] for pair in pairwise(arm))
+    return replace(robot, meshes=meshes, spheres=spheres, allowed_collisions=near)
+
+
+def scene_of(rng: np.random.Generator, cloud: bool) -> Scene:
+    """One shape of each kind at random places, and maybe some points."""
+
+    def somewhere() -> ndarray:
+        return rng.uniform([-0.6, -0.6, -0.2], [0.6, 0.6, 0.9])
+
+    def some_turn() -> ndarray:
+        wxyz = rng.normal(size=4)
+        return wxyz / np.linalg.norm(wxyz)
+
+    size = rng.uniform(0.005, 0.2, 6)
+    shapes = [
+        Sphere(somewhere(), size[0]),
+        Box(somewhere(), size[1:4], some_turn()),
+        Cylinder(somewhere(), size[4], 0.3, some_turn()),
+        Capsule(somewhere(), size[5], 0.3, some_turn()),
+    ]
+    if cloud:
+        shapes.append(PointCloud(somewhere() + rng.normal(0, 0.1, (40, 3)), 0.01))
+    return Scene(shapes)
+
+
+def curve(rng: np.random.Generator, robot: Robot, width: float) -> ndarray:
+    """Waypoints along a bent way about so long, some twice."""
+    t = np.linspace(-1, 1, 9)[:, None]
+    middle = rng.uniform(robot.lower, robot.upper)
+    bend = np.abs(t) if rng.random() < 0.3 else t**2
+    rows = middle + width * (t * rng.normal(size=robot.dof) + 0.3 * bend * rng.normal(size=robot.dof))
+    return np.repeat(np.clip(rows, robot.lower, robot.upper), rng.integers(1, 3, 9), axis=0)
+
+
+seeds = st.integers(0, 2**31)
+
+
+robots = st.sampled_from(list(LINKS))
+
+
+@given(robots, seeds, st.sampled_from([0.01, 0.05, 0.2]), st.booleans())
+def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, cloud: bool) -> None:
+    rng, robot = np.random.default_rng(seed), clad_arm(name)
+    scene, q = scene_of(rng, cloud), curve(rng, robot, width)
+    judge, checker, exact = (
+        ContinuousCollision(robot, scene, 1e-4, 0.5),
+        CollisionChecker(robot, scene),
+        ExactCollision(robot, scene),
+    )
+    motion = Motion(q, motion_certificate.way_along(q, judge.checks.levers))
+    whole = Pieces(
+        np.zeros(1), np.full(1, motion.way[-1]), np.ones((1, len(checks_of(robot))), dtype=np.bool_)
+    )
+    best = np.ones(2)
+    found = motion_certificate.by_spheres(
+        judge.arm,
+        judge.scene_arrays,
+        motion,
+        judge.checks,
+        whole,
+        best,
+        make_swept_spheres(judge.arm.spheres, judge.scene_arrays),
+    )
+    places = np.linspace(0, motion.way[-1], 41)
+    dense = motion_certificate.configurations(motion, places)
+    apart = np.hstack([checker.link_clearances(dense), checker.pair_clearances(dense)])
+    # towards points the checker's clearances are themselves bounds, up to the size of a voxel
+    slack = 0.02 if cloud else 1e-6
+    assert (found.lower[0] <= apart.min(axis=0) + slack).all()
+    assert (found.clearance[0] <= apart[20] + slack).all()
+    posture = convex_bounds.make_posture(judge.arm.hulls, judge.solids, robot.dof)
+    found.clearance[:], found.lower[:] = -np.inf, -np.inf
+    motion_certificate.by_hulls(judge.arm, judge.solids, motion, judge.checks, found, np.ones(2), 0.5, 1e-4, posture)
+    rows = [(*exact.link_distances(row), *exact.pair_distances(row)) for row in dense[::4]]
+    distances = np.array([[d.distance for d in row] for row in rows])
+    assert (found.lower[0] <= distances.min(axis=0) + 1e-6).all()
+    assert (found.clearance[0] <= distances[5] + 1e-6).all()
+
+
+@given(robots, seeds)
+def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
+    """From any guess; 2 % is where the search for the plane ends."""
+    rng, robot = np.random.default_rng(seed), clad_arm(name)
+    scene = scene_of(rng, False)
+    q = rng.uniform(robot.lower, robot.upper)
+    exact, arrays, (arm, parts) = (
+        ExactCollision(robot, scene),
+        solid_arrays(solids_of(scene)),
+        hulls_of(robot),
+    )
+    posture = convex_bounds.make_posture(arm, arrays, robot.dof)
+    slides = np.array(robot.prismatic, np.bool_)
+    offsets, parents = np.ascontiguousarray(robot.frame_offsets), robot.branching
+    convex_bounds.pose(offsets, parents, slides, q, np.zeros(robot.dof), posture)
+    for found in exact.link_distances(q):
+        guess = rng.normal(size=3)
+        planes = [
+            convex_bounds.best_plane(arm, p, arrays, o, 0, np.inf, guess / np.linalg.norm(guess), posture)
+            for p in parts[found.link]
+            for o in range(len(scene.shapes))
+        ]
+        least = min(middle for middle, _, _ in planes)
+        assert all(middle == along or middle == -np.inf for middle, along, _ in planes)
+        assert least <= found.distance + 1e-6
+        assert least >= 0.98 * found.distance - 1e-6 if found.distance > 1e-5 else least <= 2e-5
+
+
+@given(robots, seeds, st.booleans())
+def test_the_certificate_of_curved_motions(name: str, seed: int, cloud: bool) -> None:
+    """Among them those of links of several parts, of which the first alone may be clear: bounds that were
+    read off it settled pieces in which the others hit."""
+    rng, robot = np.random.default_rng(seed), clad_arm(name)
+    scene = scene_of(rng, cloud)
+    q = np.concatenate([curve(rng, robot, 0.15), curve(rng, robot, 0.02)])
+    found = ContinuousCollision(robot, scene, 1e-4, 0.5).sweep(q)
+    exact = ExactCollision(robot, scene)
+    at = np.linspace(0, len(q) - 1, 30 * len(q))
+    dense = np.stack([np.interp(at, np.arange(len(q)), column) for column in q.T], axis=1)
+    hits = exact.collides(dense)
+    if found.contact is None:
+        assert not hits.any()
+        rows = dense[::40]
+        links = min(d.distance for row in rows for d in exact.link_distances(row))
+        pairs = min(d.distance for row in rows for d in exact.pair_distances(row))
+        assert 0 < found.scene_clearance <= links + 1e-6
+        assert 0 < found.self_clearance <= pairs + 1e-6
+        return
+    here = np.stack([np.interp(found.contact.at, np.arange(len(q)), column) for column in q.T])
+    distances = (*exact.link_distances(here), *exact.pair_distances(here))
+    assert min(d.distance for d in distances if d.link == found.contact.check.link) <= 1.01e-4
+    # located to 1 mm of motion: nothing deeper lies well before it
+    before = dense[at < found.contact.at - 0.3]
+    assert not exact.collides(before).any()
+
+
+@pytest.mark.parametrize("count", [1, 5])
+def test_a_motion_that_stays_where_it_is(count: int) -> None:
+    robot = clad_arm("awkward")
+    q = np.tile(0.5 * (robot.lower + robot.upper), (count, 1))
+    found = ContinuousCollision(robot, Scene(), 1e-4, 0.5).sweep(q)
+    assert found.scene_clearance == pytest.approx(1.0, abs=1e-4)

@@ -1,0 +1,203 @@
+"""The certificate in time, against Coal at many moments; and what obstacles that move refuse."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.collision.moving_obstacles import FIRST_CONTACT, MovingCollision
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.types import Trajectory
+
+PANDA = rd.load_robot("panda")
+START, END = np.array([-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]), np.array([0.6, 0.2, 0, -2.0, 0, 2.2, 0.2])
+STEP = 0.01
+"""Between the moments that Coal looks at [s] ..."""
+MOVED = 0.02
+"""... in which nothing here moves more than that [m]."""
+AXIS = np.array([0.0, 0.6, 0.8])
+
+
+def swing(duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """There and back, evenly."""
+    return np.linspace(0.0, duration, 3), np.stack([START, END, START])
+
+
+def obstacle(k: int, rng: np.random.Generator) -> rd.MovingObstacle:
+    """Of each shape and each known motion in turn."""
+    at, velocity = rng.uniform([-0.2, -0.8, 0.2], [0.9, 0.8, 1.0]), 0.4 * rng.normal(size=3)
+    shape = [
+        rd.Sphere(at, 0.08),
+        rd.Box(at, [0.1, 0.15, 0.2]),
+        rd.Capsule(at, 0.05, 0.2),
+        rd.Cylinder(at, 0.07, 0.2),
+        rd.Mesh(np.vstack([np.eye(3), np.zeros(3)]) * 0.2, [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]], at),
+    ][k % 5]
+    if k % 2:
+        return rd.MovingObstacle(shape, velocity=velocity)
+    times = np.arange(4.0)
+    poses = [transform(at + velocity * t, rotation_about(AXIS, 0.5 * t)) for t in times]
+    return rd.MovingObstacle(shape, times=times, poses=poses)
+
+
+def as_coal_sees(moves: rd.MovingObstacle, times: np.ndarray, q: np.ndarray) -> tuple[float | None, float]:
+    """The first of the moments at which they touch, and the least distance at those looked at until then.
+
+    Where they are far apart, those are left out at which they cannot be nearer than MOVED.
+    """
+    moments, k, least = np.arange(0.0, times[-1], STEP), 0, np.inf
+    while k < len(moments):
+        now = moments[k]
+        row = np.array([np.interp(now, times, column) for column in q.T])
+        near = min(d.distance for d in ExactCollision(PANDA, rd.Scene([moves.at(now)])).link_distances(row))
+        least = min(least, near)
+        if near <= 0:
+            return now, least
+        k += max(1, int(near / MOVED) - 1)
+    return None, least
+
+
+def test_certificate_is_coals_verdict() -> None:
+    rng, (times, q) = np.random.default_rng(3), swing(3.0)
+    found = []
+    for k in range(30):
+        moves = obstacle(k, rng)
+        sweep = MovingCollision(PANDA, [moves], 1e-4, 0.5).sweep(times, q)
+        touching, least = as_coal_sees(moves, times, q)
+        if touching is not None:
+            assert sweep.contact is not None
+            assert sweep.contact.time <= touching + FIRST_CONTACT, "later than Coal"
+            assert sweep.contact.time >= touching - 2 * STEP
+            assert sweep.clearance == 0.0
+        elif least > 0.005:  # nearer than that, something may have happened between two moments
+            assert sweep.contact is None
+            assert 0 < sweep.clearance <= least
+        found.append(sweep.contact is not None)
+    assert 0 < sum(found) < 30
+
+
+def test_what_is_unknown_is_anywhere_that_it_can_be() -> None:
+    """At rest beside a ball that may come at 0.1 m/s, the arm is free until that can be there."""
+    ball = rd.Sphere([0.3, 0.0, 1.4], 0.1)
+    gap = min(d.distance for d in ExactCollision(PANDA, rd.Scene([ball])).link_distances(START))
+    judge = MovingCollision(PANDA, [rd.MovingObstacle(ball, max_speed=0.1)], 1e-4, 0.5)
+    free = judge.sweep(np.array([0.0, 0.99 * gap / 0.1]), np.stack([START, START]))
+    hit = judge.sweep(np.array([0.0, 1.5 * gap / 0.1]), np.stack([START, START]))
+    assert free.contact is None
+    assert hit.contact is not None
+    assert hit.contact.time == pytest.approx(gap / 0.1, abs=0.01)
+
+
+def test_one_that_goes_faster_is_not_missed_between_rows() -> None:
+    """A ball at 80 m/s is in the arm for a few milliseconds between two rows."""
+    ball = rd.MovingObstacle(rd.Sphere([0.35, -40.0, 0.5], 0.05), velocity=[0, 80, 0])
+    sweep = MovingCollision(PANDA, [ball], 1e-4, 0.5).sweep(np.array([0.0, 1.0]), np.stack([START, START]))
+    assert sweep.contact is not None
+    assert sweep.contact.time == pytest.approx(0.5, abs=0.01)
+
+
+def test_judge_names_link_obstacle_and_time() -> None:
+    from robotdiffuse.validation.validator import verify_trajectory
+
+    ball = rd.MovingObstacle(rd.Sphere([0.45, -0.8, 0.5], 0.1, name="ball"), velocity=[0, 0.4, 0])
+    problem = rd.Problem(PANDA, rd.Scene(), START, START, moving=[ball])
+    times = np.array([0.0, 3.0])
+    still = Trajectory(PANDA.joint_names, times, np.stack([START, START]), *np.zeros((2, 2, 7)))
+    violation = verify_trajectory(problem, still).violation
+    assert violation is not None
+    assert violation.kind == "scene_collision"
+    assert violation.other == "ball"
+    assert violation.subject in PANDA.link_names
+    assert 0.5 < violation.time < 3.0
+    assert violation.message.endswith(f"at {violation.time:.3f} s")
+
+
+BALL = rd.Sphere([0.5, 0.5, 0.5], 0.1)
+STANDS = transform(BALL.center)
+
+
+@pytest.mark.parametrize(
+    ("motion", "message"),
+    [
+        ({}, "it must have exactly one of velocity"),
+        ({"velocity": [0, 1, 0], "max_speed": 1.0}, "it must have exactly one of velocity"),
+        ({"velocity": [0, np.nan, 0]}, r"sphere.velocity is .* it must be 3 finite numbers"),
+        ({"velocity": [0, 1]}, r"sphere.velocity is .* it must be 3 finite numbers"),
+        ({"max_speed": -0.1}, "sphere.max_speed is -0.1; it must be a speed from 0 to 100 m/s"),
+        ({"max_speed": np.inf}, "sphere.max_speed is inf; it must be a speed"),
+        ({"times": [0.0], "poses": [STANDS]}, "sphere.times .* two or more times"),
+        ({"times": [0.0, 1.0], "poses": [STANDS]}, "sphere.poses is .*; it must be 2 transforms"),
+        (
+            {"times": [1.0, 1.0], "poses": [STANDS] * 2},
+            r"sphere.times\[1\] is 1 after 1; times must increase",
+        ),
+        ({"times": [0.0, np.nan], "poses": [STANDS] * 2}, "sphere.times .* two or more times"),
+        (
+            {"times": [0.0, 0.01], "poses": [STANDS, transform(BALL.center + 2)]},
+            r"sphere.poses\[1\] is a jump: from 0 s to 0.01 s a point moves at 346 m/s",
+        ),
+        (
+            {"times": [0.0, 1.0], "poses": [transform(BALL.center + 1)] * 2},
+            r"sphere.poses\[0\] is at .*; the shape must stand there",
+        ),
+        ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is no rigid transform"),
+    ],
+)
+def test_motions_that_are_none(motion: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        rd.MovingObstacle(BALL, **motion)
+
+
+def test_clouds_have_no_frame_to_move() -> None:
+    with pytest.raises(InputError, match="point_cloud"):
+        rd.MovingObstacle(rd.PointCloud([[0.5, 0, 0.5]]), velocity=[0, 1, 0])
+
+
+@pytest.mark.parametrize("base", [None, transform(np.array([0, 0, 0.7]), rotation_about(AXIS, 0.5))])
+def test_files_hold_every_motion(tmp_path: Path, base: np.ndarray | None) -> None:
+    turned = transform(BALL.center + 0.1, rotation_about(AXIS, 0.4))
+    moving = [
+        rd.MovingObstacle(BALL, velocity=[0, 0.3, 0]),
+        rd.MovingObstacle(rd.Box(BALL.center, [0.1] * 3), times=[0, 1], poses=[STANDS, turned]),
+        rd.MovingObstacle(rd.Capsule([0.4, 0, 1.2], 0.05, 0.1, name="hand"), max_speed=0.5),
+    ]
+    problem = rd.Problem(PANDA, rd.Scene([BALL]), START, END, T_world_base=base, moving=moving)
+    assert [one.name for one in problem.moving] == ["sphere_2", "box", "hand"], "names are unique in a scene"
+    save_problem(problem, tmp_path / "p.yaml")
+    for again in (load_problem(tmp_path / "p.yaml"), problem_from_record(problem_record(problem))):
+        for one, other in zip(problem.moving, again.moving, strict=True):
+            assert one.name == other.name
+            assert one.max_speed == other.max_speed
+            for time in (0.0, 0.5, 2.0):
+                assert np.allclose(one.pose(time), other.pose(time), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({}, r"moving is .*; it must be a list"),
+        ([3], r"moving\[0\] is 3; it must be a shape and its motion"),
+        (
+            [{"sphere": {"center": [0, 0, 1], "radius": 0.1}, "speed": 1}],
+            r"moving\[0\] has the fields .* max_speed",
+        ),
+        ([{"sphere": {"center": [0, 0, 1], "radius": 0.1}}], r"moving\[0\]: .* has no motion"),
+        ([{"sphere": {"center": [0, 0, 1], "radius": -1}, "max_speed": 1}], r"moving\[0\].*radius"),
+    ],
+)
+def test_files_name_the_field(entry: object, message: str) -> None:
+    record = problem_record(rd.Problem(PANDA, rd.Scene(), START, END))
+    with pytest.raises(InputError, match=message):
+        problem_from_record(record | {"moving": entry})
+
+
+def test_moving_obstacles_stand_beside_neither_blends_nor_start_velocities() -> None:
+    ball = rd.MovingObstacle(BALL, velocity=[0, 1, 0])
+    with pytest.raises(InputError, match="moving cannot be had beside blend: the motion stops"):
+        rd.Problem(PANDA, rd.Scene(), START, END, waypoints=[END], moving=[ball], blend=0.1)
+    with pytest.raises(InputError, match="start_velocity cannot be had beside moving"):
+        rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], start_velocity=[0.1] * 7)

@@ -1,0 +1,87 @@
+"""Time that large scenes take counts, and what there is no time for is named."""
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.collision import kernel_arrays
+from robotdiffuse.collision import exact_meshes
+from robotdiffuse.core.deadline import OutOfTimeError, check_time, deadline
+from robotdiffuse.planning.planner import one_of_each
+from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.core.types import Status
+
+PANDA = rd.load_robot("panda")
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+
+
+def wall(sides: int = 20) -> rd.Mesh:
+    """A wall in the way, of two triangles for each square."""
+    x, z = np.meshgrid(np.linspace(0.3, 0.6, sides), np.linspace(0.0, 0.5, sides))
+    vertices = np.stack([x.ravel(), 0 * x.ravel(), z.ravel()], axis=1)
+    at = (np.arange(sides - 1)[:, None] * sides + np.arange(sides - 1)).ravel()
+    faces = np.concatenate(
+        [np.stack([at, at + 1, at + sides], 1), np.stack([at + 1, at + sides + 1, at + sides], 1)]
+    )
+    return rd.Mesh(vertices, faces, name="wall")
+
+
+def problem(*shapes: rd.Mesh | rd.PointCloud) -> rd.Problem:
+    return rd.Problem(PANDA, rd.Scene(list(shapes)), LEFT, RIGHT)
+
+
+def test_steps_are_begun_while_there_is_time_and_long_ones_if_it_is_enough() -> None:
+    check_time("anything", 1e9)
+    with deadline(lambda: 1.0):
+        check_time("a short step")
+        check_time("a long step", 0.9)
+        with pytest.raises(OutOfTimeError, match=r"a longer step, which takes about 1\.1 s"):
+            check_time("a longer step", 1.1)
+    with deadline(lambda: 1e-3):
+        check_time("a short step", 0.1)
+    with deadline(lambda: -1e-3), pytest.raises(OutOfTimeError, match=r"^a short step$"):
+        check_time("a short step")
+    check_time("anything", 1e9)
+
+
+def test_a_grid_of_too_many_points_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_arrays, "GRID_SECONDS", 1e3)
+    result = RRTConnect().plan(problem(wall()), time_limit=20.0)
+    assert result.status is Status.TIMEOUT
+    assert "time limit of 20 s is too short to prepare the scene" in result.reason
+    assert "the grid of" in result.reason
+
+
+def test_meshes_end_with_the_time() -> None:
+    meshes = [wall(sides) for sides in (3, 4, 5)]
+    with deadline(iter([1.0, 1.0, -1.0]).__next__), pytest.raises(OutOfTimeError, match="1 of 3 meshes"):
+        kernel_arrays.compile_scene_for(PANDA, rd.Scene(meshes))
+
+
+@pytest.mark.parametrize("cloud", [False, True])
+def test_a_tree_of_the_judge_that_takes_too_long_is_refused(
+    cloud: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Here the exact meshes are to say where the start collides."""
+    tip = link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
+    vertices = wall().vertices - wall().vertices.mean(axis=0) + tip
+    asked = problem(rd.PointCloud(vertices, 0.01) if cloud else rd.Mesh(vertices, wall().faces))
+    monkeypatch.setattr(exact_meshes, "TREE_SECONDS", 1e3)
+    refused = RRTConnect().plan(asked, time_limit=20.0)
+    assert refused.status is Status.TIMEOUT
+    assert "the judge's tree over the" in refused.reason
+    monkeypatch.undo()
+    assert RRTConnect().plan(asked, time_limit=20.0).status is Status.INVALID_START
+
+
+def test_warming_up_prepares_no_large_scene() -> None:
+    cloud = rd.PointCloud(wall().vertices, 0.01)
+    small = one_of_each(
+        rd.Scene([wall(), wall(), cloud, rd.Sphere([1, 1, 1], 0.1), rd.Box([2, 2, 2], [1, 1, 1])])
+    )
+    mesh, points, sphere, box = small.shapes
+    assert isinstance(mesh, rd.Mesh) and len(mesh.faces) == 1
+    assert isinstance(points, rd.PointCloud) and len(points.points) == 1
+    assert isinstance(sphere, rd.Sphere) and isinstance(box, rd.Box)

@@ -1,0 +1,183 @@
+"""Files that others wrote: every door answers in one line, whatever stands behind it."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
+from robotdiffuse.core.input_files import (
+    LONGEST_NAME,
+    input_file,
+    is_file,
+    parse_json,
+    parse_xml,
+    parse_yaml,
+    read_text,
+    read_triangles,
+)
+
+DEEP = 100_000
+BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+def one_line(call: Callable[[], object]) -> str:
+    with pytest.raises(InputError) as raised:
+        call()
+    message = str(raised.value)
+    assert "\n" not in message
+    assert message.isprintable()
+    assert len(message) < 500
+    return message
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * DEEP, "more than 64 levels deep"),
+        ("[" * DEEP + "]" * DEEP, "more than 64 levels deep"),
+        ('{"a":' * DEEP, "more than 64 levels deep"),
+        ('"' + "[" * DEEP, "is not valid JSON"),
+        ("9" * 5000, "integer 9999"),
+        ("[1, 2", "line 1, column 6"),
+    ],
+)
+def test_json_that_is_no_json(text: str, message: str) -> None:
+    assert message in one_line(lambda: parse_json(text, "it"))
+
+
+def test_brackets_in_texts_are_no_nesting() -> None:
+    value = ["[" * 500, '\\"{' * 500, {"a": [[1]]}]
+    assert parse_json(json.dumps(value), "it") == value
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * DEEP, "more than 64 levels deep"),
+        ("- " * DEEP, "more than 64 levels deep"),
+        ("? " * DEEP, "a key is no plain text"),
+        (BOMB, "stands for more than 2,000,000 values in line 7"),
+        ("a: &a [*a]", "alias 'a' has no anchor before it in line 1"),
+        ("a: !!int foo", "tag 'tag:yaml.org,2002:int' is not supported"),
+        ("a: !!python/object/apply:os.system [ls]", "is not supported in line 1"),
+        ("? [1, 2]\n: 3", "a key is no plain text in line 1"),
+        ("9" * 5000, "integer 9999"),
+        ("a: 1\n---\nb: 2", "more than one document"),
+        ("a: [1, 2", "in line 2"),
+        ("\0", "is not valid YAML"),
+        ("\ud800", "surrogate"),
+    ],
+)
+def test_yaml_that_is_no_yaml(text: str, message: str) -> None:
+    assert message in one_line(lambda: parse_yaml(text, "it"))
+
+
+def test_what_yaml_means() -> None:
+    text = "{a: 1e-3, b: [0x10, -2, yes, ~, 1:30, 2001-13-45], c: &x {d: .inf}, e: *x, f: '1', g: 1.5e3}"
+    assert parse_yaml(text, "it") == {
+        "a": 0.001,
+        "b": [16, -2, True, None, 90, "2001-13-45"],
+        "c": {"d": np.inf},
+        "e": {"d": np.inf},
+        "f": "1",
+        "g": 1500.0,
+    }
+    assert parse_yaml("", "it") is None
+    assert parse_yaml("{1: a, on: b, ~: c}", "it") == {"1": "a", "on": "b", "~": "c"}
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers(-(10**20), 10**20) | st.floats(allow_nan=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+)
+
+
+@given(values)
+def test_what_is_written_is_read_back(value: object) -> None:
+    assert parse_json(json.dumps(value), "it") == value
+    text = yaml.dump(value, Dumper=yaml.CSafeDumper)
+    assert parse_yaml(text, "it") == value
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_value_or_one_line(content: bytes) -> None:
+    text = content.decode("latin-1")
+    for parse in (parse_json, parse_yaml, lambda text, where: parse_xml(text.encode(), where)):
+        try:
+            parse(text, "it")
+        except InputError as error:
+            assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (b"<a>" * DEEP + b"</a>" * DEEP, "more than 64 levels deep"),
+        (b'<?xml version="1.0" encoding="klingon"?><robot/>', "unknown encoding"),
+        (b"", "no element found"),
+    ],
+)
+def test_xml_that_is_no_xml(text: bytes, message: str) -> None:
+    assert message in one_line(lambda: parse_xml(text, "it"))
+
+
+def test_files_that_are_none(tmp_path: Path) -> None:
+    pipe, link, large, closed = (tmp_path / name for name in ("pipe", "link", "large", "closed"))
+    os.mkfifo(pipe)
+    link.symlink_to("/dev/zero")
+    large.touch()
+    os.truncate(large, 2**40)
+    (tmp_path / "latin").write_bytes(b"gr\xfc\xdfe")
+    for file, message in [
+        (pipe, "a device or a pipe; it must be a file"),
+        (link, "a device or a pipe"),
+        ("/dev/zero", "a device or a pipe"),
+        (tmp_path, "is a folder"),
+        (large, "is too large: it has 1048576 MB"),
+        (tmp_path / "none", "does not exist"),
+        (tmp_path / "latin" / "below", "cannot be read: Not a directory"),
+        (tmp_path / "latin", "byte 2 is not UTF-8"),
+        ("a\0b", "no file can have this name"),
+        ("\ud800", "no file can have this name"),
+        ("x" * 1000, "File name too long"),
+    ]:
+        assert message in one_line(lambda file=file: read_text(file, "robot file"))
+    assert not any(map(is_file, (pipe, link, tmp_path, "a\0b", "\ud800", "x" * 1000)))
+    with pytest.MonkeyPatch.context() as patch:
+        closed.touch()
+        patch.setattr(os, "access", lambda *_: False)  # root may read everything
+        assert "permission denied" in one_line(lambda: input_file(closed))
+    long = tmp_path / ("y" * 200)
+    assert str(long) in one_line(lambda: input_file(long)) or len(str(long)) > LONGEST_NAME
+
+
+def test_a_broken_mesh_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    broken = {"a.stl": b"solid", "b.obj": b"f 1 2 3", "c.ply": b"ply\nformat", "d.glb": b"x"}
+    for name, content in broken.items():
+        (tmp_path / name).write_bytes(content)
+        assert "mesh file" in one_line(lambda name=name: read_triangles(tmp_path / name))
+    assert capfd.readouterr().err == ""
+
+
+def test_messages_quote_sixty_characters() -> None:
+    for value in ("x" * 10**6, [1] * 10**6, 10**5000, np.zeros(10**6), "\x1b[31m\n\ud800", {"a": "b" * 100}):
+        assert len(shown(value)) <= 60
+        assert shown(value).isprintable()
+    inside: list[object] = []
+    for _ in range(10**5):
+        inside = [inside]
+    assert shown(inside) == "a very long list"
+    error = unknown_name("joint", "j" * 10**4, [f"joint_{i}" for i in range(10**4)])
+    assert "and 9900 more" in str(error)
+    spaced = "{a: " * 1000  # no word of it is long
+    assert joined([spaced, "b"]) == f"{spaced[:57]}..., b"
+    assert len(str(InputError("x" * 10**4))) == 60

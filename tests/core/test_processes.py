@@ -1,0 +1,107 @@
+"""Processes that plan for another: a new one for one that died, and none that outlives it."""
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+
+import pytest
+
+from robotdiffuse.core.processes import LoneWorker, end
+
+ROOT = Path(__file__).parents[1]
+HELD = 60
+"""Longer than a worker may outlive its parent [s]."""
+
+
+def nothing() -> None:
+    pass
+
+
+class AliveWhenAsked(multiprocessing.get_context("spawn").Process):
+    """It has ended, and been waited for, as soon as it said that it runs."""
+
+    def is_alive(self) -> bool:
+        alive = super().is_alive()
+        self.join()
+        return alive
+
+
+def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
+    worker = LoneWorker(nothing, ())
+    try:
+        first = worker.call(os.getpid)
+        with pytest.raises(BrokenProcessPool):
+            worker.call(os.kill, first, signal.SIGKILL)
+        second = worker.call(os.getpid)
+        worker.end(signal.SIGKILL)
+        third = worker.call(os.getpid)
+        assert len({first, second, third, os.getpid()}) == 4
+        sent = worker.submit(time.sleep, HELD)
+        os.kill(third, signal.SIGTERM)
+        with pytest.raises(BrokenProcessPool):
+            sent.result(HELD)
+    finally:
+        worker.close()
+    with pytest.raises(BrokenProcessPool, match="closed"):
+        worker.call(os.getpid)
+
+
+def test_a_process_that_ends_on_its_own_meanwhile_is_no_error() -> None:
+    """`LoneWorker.close` raised ProcessLookupError where the pool's thread had waited for the process."""
+    process = AliveWhenAsked(target=nothing)
+    process.start()
+    end([process], signal.SIGTERM, patience=float(HELD))
+    assert process.exitcode == 0
+
+
+@pytest.mark.skipif(not hasattr(os, "O_ASYNC"), reason="the system cannot tell of a pipe that closes")
+def test_a_worker_in_compiled_code_does_not_outlive_a_parent_that_is_killed() -> None:
+    paths = os.pathsep.join((str(ROOT / "src"), str(ROOT / "tests")))
+    with subprocess.Popen(
+        [sys.executable, "-m", "helpers.deaf_worker", str(HELD)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"PYTHONPATH": paths},
+    ) as parent:
+        assert parent.stdout is not None
+        worker = Path("/proc", parent.stdout.readline().strip())
+        assert parent.stdout.readline() == "begun\n" and worker.exists()
+        time.sleep(0.5)  # for the call to begin
+        parent.kill()
+        until = time.monotonic() + HELD / 4
+        while worker.exists():
+            assert time.monotonic() < until, "it lives as long as its call"
+            time.sleep(0.02)
+
+
+SWALLOWING = """
+import ctypes, signal, time
+from robotdiffuse.core.processes import interrupts_at_once
+with interrupts_at_once(lambda: print("tidy", flush=True)):
+    try:
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+        time.sleep(0.1)
+    except BaseException:
+        pass
+    print("lives", flush=True)
+"""
+
+
+def test_ctrl_c_is_not_lost_in_callbacks() -> None:
+    """`robot add` went on for minutes after a Ctrl-C that came while compiled code was loaded."""
+    # which jobs in the background ignore
+    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    ended = subprocess.run([sys.executable, "-c", heard + SWALLOWING], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (130, "tidy\n", "robotdiffuse: stopped\n")
+
+
+def test_ctrl_c_that_is_ignored_stays_ignored() -> None:
+    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)" + SWALLOWING
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, "lives\n")

@@ -1,0 +1,212 @@
+"""Result and trajectory files: what is written comes back; what is damaged is refused in one line."""
+
+import csv
+import json
+from dataclasses import fields, replace
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import check_output
+from robotdiffuse.core.results import PlanResult, load_result
+from robotdiffuse.core.types import Path, Status, Trajectory
+
+NAMES = ("shoulder", "elbow")
+
+
+@pytest.fixture
+def trajectory() -> Trajectory:
+    rng = np.random.default_rng(0)
+    times = np.cumsum(np.array([0.0, 0.1, 0.1, 0.07]))
+    return Trajectory(NAMES, times, *(rng.normal(size=(4, 2)) for _ in range(3)))
+
+
+@pytest.fixture
+def solved(trajectory: Trajectory) -> PlanResult:
+    return PlanResult(
+        status=Status.SOLVED,
+        reason="found by a straight line",
+        planner="rrt_connect",
+        robot="panda",
+        planning_time=0.01,
+        seed=3,
+        stage="straight line",
+        path=Path(NAMES, trajectory.positions[[0, 3]]),
+        trajectory=trajectory,
+        min_clearance=0.02,
+        scene_clearance=0.02,
+        self_clearance=0.05,
+        notes=("start clamped",),
+        progress=((0.002, 3.5), (0.008, 3.0)),
+        refused="scene_collision",
+    )
+
+
+@pytest.fixture
+def failed() -> PlanResult:
+    return PlanResult(Status.TIMEOUT, "no path in 1 s", "rrt_connect", "panda", 1.0, 0)
+
+
+def test_solved_result_round_trip(solved: PlanResult, tmp_path: FilePath) -> None:
+    file = tmp_path / "result.json"
+    solved.save(file, {"robot": "panda", "scene": []})
+    read = load_result(file)
+    assert read.problem == {"robot": "panda", "scene": []}
+    for field in fields(PlanResult):
+        if field.name not in ("path", "trajectory"):
+            assert getattr(read.result, field.name) == getattr(solved, field.name), field.name
+    assert read.result.path_length == solved.path_length
+    assert read.result.path is not None and solved.path is not None
+    assert np.array_equal(read.result.path.positions, solved.path.positions)
+    for name in ("times", "positions", "velocities", "accelerations"):
+        assert np.array_equal(getattr(read.result.trajectory, name), getattr(solved.trajectory, name))
+
+
+def test_fields_are_those_that_the_design_promises(solved: PlanResult, tmp_path: FilePath) -> None:
+    solved.save(str(tmp_path / "r.json"))
+    record = json.loads((tmp_path / "r.json").read_text())
+    promised = (
+        "status reason planner robot joint_names times positions velocities accelerations path_length "
+        "min_clearance scene_clearance self_clearance planning_time verified seed"
+    )
+    assert set(promised.split()) <= set(record)
+    assert record["verified"] is True and record["status"] == "solved"
+    assert len(record["times"]) == len(record["positions"]) == len(record["accelerations"]) == 4
+
+
+def test_progress_and_refused_survive_save_and_load(solved: PlanResult, tmp_path: FilePath) -> None:
+    """They were lost."""
+    for result in (solved, replace(solved, progress=(), refused="")):
+        result.save(tmp_path / "r.json")
+        read = load_result(tmp_path / "r.json").result
+        assert (read.progress, read.refused) == (result.progress, result.refused)
+
+
+def test_results_of_earlier_versions_lack_fields(solved: PlanResult, tmp_path: FilePath) -> None:
+    file = tmp_path / "r.json"
+    solved.save(file)
+    record = json.loads(file.read_text())
+    for name in ("scene_clearance", "self_clearance", "progress", "refused"):
+        del record[name]
+    file.write_text(json.dumps(record))
+    read = load_result(file).result
+    assert (read.min_clearance, read.scene_clearance, read.self_clearance) == (0.02, None, None)
+    assert (read.progress, read.refused) == ((), "")
+
+
+def test_failed_result_round_trip(failed: PlanResult, tmp_path: FilePath) -> None:
+    file = tmp_path / "result.json"
+    failed.save(str(file))
+    read = load_result(file).result
+    assert read.status is Status.TIMEOUT and read.path is None and read.trajectory is None
+    assert json.loads(file.read_text())["verified"] is False
+    with pytest.raises(InputError, match=r"no trajectory to write \(timeout\)"):
+        failed.save(str(tmp_path / "result.csv"))
+
+
+def test_csv_holds_every_number_exactly(trajectory: Trajectory, tmp_path: FilePath) -> None:
+    file = tmp_path / "motion.csv"
+    trajectory.save(str(file))
+    with file.open(newline="") as stream:
+        header, *rows = csv.reader(stream)
+    assert header[:3] == ["time", "shoulder_position", "elbow_position"]
+    assert header[3:5] == ["shoulder_velocity", "elbow_velocity"] and len(header) == 7
+    values = np.array(rows, dtype=float)
+    assert np.array_equal(values[:, 0], trajectory.times)
+    assert np.array_equal(values[:, 1:3], trajectory.positions)
+    assert np.array_equal(values[:, 5:], trajectory.accelerations)
+
+
+def test_trajectory_json(trajectory: Trajectory, tmp_path: FilePath) -> None:
+    trajectory.save(str(tmp_path / "motion.json"))
+    record = json.loads((tmp_path / "motion.json").read_text())
+    assert record["joint_names"] == list(NAMES) and record["positions"] == trajectory.positions.tolist()
+
+
+def test_unknown_ending_lists_the_known_ones(trajectory: Trajectory, tmp_path: FilePath) -> None:
+    with pytest.raises(InputError, match=r"unknown ending '.txt'; known: .json, .csv"):
+        trajectory.save(tmp_path / "motion.txt")
+
+
+def test_unwritable(solved: PlanResult, tmp_path: FilePath) -> None:
+    with pytest.raises(InputError, match="nowhere does not exist"):
+        solved.save(tmp_path / "nowhere" / "r.json")
+    (tmp_path / "folder.json").mkdir()
+    with pytest.raises(InputError, match="is a folder"):
+        solved.save(tmp_path / "folder.json")
+
+
+def test_a_failed_write_keeps_the_old_file(
+    solved: PlanResult, tmp_path: FilePath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "r.json"
+    file.write_text("old")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(FilePath, "replace", full)
+    with pytest.raises(InputError, match="No space left on device"):
+        solved.save(file)
+    assert file.read_text() == "old" and list(tmp_path.iterdir()) == [file]
+
+
+def test_not_finite_is_never_written(solved: PlanResult, tmp_path: FilePath) -> None:
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        replace(solved, min_clearance=float("nan")).save(tmp_path / "r.json")
+    assert not list(tmp_path.iterdir())
+
+
+DAMAGE = [
+    ({"status": "fine"}, "status is 'fine'; known: solved, timeout"),
+    ({"verified": False}, "verified is False, but status is 'solved'"),
+    ({"times": [0.0, 0.1, 0.1, 0.2]}, "times must start at 0 and strictly increase"),
+    ({"positions": [[0.0, 0.0]]}, r"positions has shape 1x2; it must be 4x2"),
+    ({"velocities": [[0.0]] * 4}, r"velocities has shape 4x1; it must be 4x2"),
+    ({"accelerations": "none"}, "accelerations must be rows of numbers"),
+    ({"waypoints": None}, "waypoints has shape none; it must be nx2"),
+    ({"waypoints": [[0.0, None]]}, "waypoints holds numbers that are not finite"),
+    ({"joint_names": [1, 2]}, r"joint_names is \[1, 2\]; it must be a list of texts"),
+    ({"planning_time": "soon"}, "planning_time is 'soon'; it must be a finite number"),
+    ({"progress": [[0.1]]}, r"progress has shape 1x1; it must be nx2"),
+    ({"reason": 7}, "reason is 7; it must be text"),
+    ({"problem": [1]}, "problem is a list; it must be an object"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), DAMAGE, ids=[next(iter(change)) for change, _ in DAMAGE])
+def test_damaged_result_is_refused(
+    change: dict, message: str, solved: PlanResult, tmp_path: FilePath
+) -> None:
+    file = tmp_path / "r.json"
+    solved.save(file)
+    file.write_text(json.dumps(json.loads(file.read_text()) | change))
+    with pytest.raises(InputError, match=message) as caught:
+        load_result(file)
+    assert str(caught.value).startswith(str(file)) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "is not valid JSON"),
+        ("[]", "must hold one JSON object"),
+        ("{}", "status, reason, planner"),
+    ],
+)
+def test_not_a_result_file(text: str, message: str, tmp_path: FilePath) -> None:
+    file = tmp_path / "r.json"
+    file.write_text(text)
+    with pytest.raises(InputError, match=message):
+        load_result(file)
+
+
+def test_missing_result_file(tmp_path: FilePath) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        load_result(tmp_path / "missing.json")
+
+
+def test_check_output_takes_capitals(tmp_path: FilePath) -> None:
+    assert check_output(tmp_path / "A.JSON", (".json",)).name == "A.JSON"

@@ -1,0 +1,175 @@
+"""RopDataset: every row once, scaled by the limits, with clouds on its obstacles."""
+
+import pickle
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+import robotdiffuse as rd
+from helpers.box_arm import box_arm
+from helpers.stores import manifest_of, random_arrays, write_store
+from robotdiffuse.datasets.loader import RopBatch, RopDataset
+from robotdiffuse.datasets.manifest import write_manifest
+from robotdiffuse.datasets.rows import resample
+from robotdiffuse.datasets.shards import SPLITS, read_shard, shard_path, split_of, write_shard
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
+
+ARM, WAYPOINTS, SIZES = box_arm(), 20, (150, 0, 130, 40)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rop")
+    write_store(folder, ARM, SIZES, WAYPOINTS)
+    return folder
+
+
+def joined(batches) -> RopBatch:
+    parts = list(batches)
+    return RopBatch(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(RopBatch)))
+
+
+def stored(store, name):
+    return np.concatenate([read_shard(store, i)[name] for i in range(len(SIZES))])
+
+
+def test_every_row_of_a_split_once(store):
+    split = split_of(PackedScenes(stored(store, "obstacle_kinds"), stored(store, "obstacle_params")))
+    q, pose = stored(store, "trajectories"), stored(store, "target_pose")
+    scaled = (q - (ARM.upper + ARM.lower) / 2) / ((ARM.upper - ARM.lower) / 2)
+    for i, name in enumerate(SPLITS):
+        data = RopDataset(store, name, points=8)
+        batch = joined(data.batches(32, shuffle=False))
+        assert len(data) == (split == i).sum() == len(batch) > 0
+        np.testing.assert_allclose(batch.trajectories, scaled[split == i], atol=1e-6)
+        np.testing.assert_array_equal(batch.target_pose, pose[split == i])
+        torch.testing.assert_close(batch.start, batch.trajectories[:, 0], atol=0, rtol=0)
+        goals, index = stored(store, "goals")[split == i], stored(store, "goal_index")[split == i]
+        goal = data.normalizer.to_unit(goals[np.arange(len(goals)), index])
+        np.testing.assert_allclose(batch.goal, goal, atol=1e-6)
+        shuffled = joined(data.batches(32))
+        assert not torch.equal(shuffled.target_pose, batch.target_pose)
+        ours, theirs = (np.lexsort(part.target_pose.numpy().T) for part in (shuffled, batch))
+        for field in fields(RopBatch)[:-1]:
+            a, b = getattr(shuffled, field.name)[ours], getattr(batch, field.name)[theirs]
+            torch.testing.assert_close(a, b, atol=0, rtol=0)
+
+
+@pytest.mark.parametrize("view", ["full", "partial"])
+@pytest.mark.parametrize("sort_points", [False, True])
+def test_clouds_lie_on_the_obstacles(store, view, sort_points):
+    batch = joined(RopDataset(store, points=50, view=view, sort_points=sort_points).batches(64))
+    assert batch.points.shape == (len(batch), 50, 3)
+    local = batch.points[:, :, None] - batch.obstacle_params[:, None, :, :3]  # boxes in stores are not turned
+    sphere = (local.norm(dim=-1) - batch.obstacle_params[:, None, :, 3]).abs()
+    box = (local.abs() - batch.obstacle_params[:, None, :, 3:6] / 2).amax(-1).abs()
+    kinds = batch.obstacle_kinds[:, None]
+    far = torch.where(kinds == SPHERE, sphere, torch.where(kinds == BOX, box, torch.inf)).amin(-1)
+    drawn = batch.points.any(-1)
+    assert far[drawn].max() < 1e-5
+    assert drawn.float().mean() > 0.95
+    if view == "partial":
+        assert batch.points[..., 2].min() >= 0
+    if sort_points:
+        assert (batch.points[:, 1:, 0] >= batch.points[:, :-1, 0]).all()
+
+
+def test_the_same_epoch_from_the_same_generator(store):
+    data, threads = RopDataset(store, points=16), torch.get_num_threads()
+
+    def epoch(seed):
+        return joined(data.batches(50, generator=torch.Generator().manual_seed(seed)))
+
+    first = epoch(0)
+    torch.set_num_threads(3)
+    try:
+        second = epoch(0)
+        assert torch.get_num_threads() == 3, "the threads that make batches have numbers of their own"
+    finally:
+        torch.set_num_threads(threads)
+    for field in fields(RopBatch):
+        torch.testing.assert_close(getattr(first, field.name), getattr(second, field.name), atol=0, rtol=0)
+    other = epoch(1)
+    assert not torch.equal(first.target_pose, other.target_pose)
+    generator = torch.Generator().manual_seed(0)
+    epochs = [joined(data.batches(50, generator=generator)) for _ in range(2)]
+    assert not torch.equal(epochs[0].points, epochs[1].points)
+    stopped = data.batches(10)
+    next(stopped)
+    stopped.close()  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_standard_loader(store, workers):
+    data = RopDataset(store, "validation", points=12)
+    batches = list(DataLoader(data, batch_size=5, num_workers=workers))
+    q = torch.cat([batch["trajectories"] for batch in batches])
+    expected = joined(data.batches(5, shuffle=False))
+    torch.testing.assert_close(q, expected.trajectories, atol=0, rtol=0)
+    assert batches[0]["points"].shape == (5, 12, 3)
+    assert data[-1].keys() == {field.name for field in fields(RopBatch)}
+    torch.testing.assert_close(data[-1]["trajectories"], q[-1], atol=0, rtol=0)
+    with pytest.raises(IndexError, match=f"there are {len(data)} items"):
+        data[len(data)]
+
+
+def test_resampling():
+    q = np.array([[[0.0, 0.0], [1.0, 0.0], [3.0, 0.0], [3.0, 1.0]], [[1.0, 2.0]] * 4], np.float32)
+    even = resample(q, 5)
+    np.testing.assert_allclose(even[0], [[0, 0], [1, 0], [2, 0], [3, 0], [3, 1]], atol=1e-6)
+    np.testing.assert_array_equal(even[1], q[1, [0] * 5])
+    assert resample(q[:0], 5).shape == (0, 5, 2)
+    assert (resample(q[1:], 3) == q[1, 0]).all()
+    long = np.random.default_rng(0).standard_normal((4, 254, 3)).cumsum(1).astype(np.float32)
+    long[2, 40:80] = long[2, 40]
+    for exact in (False, True):
+        for path, found in zip(long, resample(long, 48, exact), strict=True):
+            at = np.concatenate([[0], np.linalg.norm(np.diff(path, axis=0), axis=1).cumsum(dtype=np.float64)])
+            wanted = [np.interp(np.linspace(0, at[-1], 48), at, path[:, j]) for j in range(3)]
+            np.testing.assert_allclose(found, np.stack(wanted, 1), atol=1e-5)
+            np.testing.assert_array_equal(found[[0, -1]], path[[0, -1]])
+            if exact:
+                np.testing.assert_array_equal(found, np.stack(wanted, 1).astype(np.float32))
+
+
+def test_pickled_without_the_trajectories(store):
+    data = RopDataset(store, points=4)
+    content = pickle.dumps(data)
+    assert len(content) < 2000
+    again = joined(pickle.loads(content).batches(50))
+    torch.testing.assert_close(again.points, joined(data.batches(50)).points, atol=0, rtol=0)
+
+
+def test_one_line():
+    assert rd.RopDataset is RopDataset
+
+
+def test_bad_input(store, tmp_path):
+    for arguments, message in [
+        ({"split": "tests"}, "unknown split 'tests'; known: test, train, validation"),
+        ({"view": "half"}, "unknown view 'half'; known: full, partial"),
+        ({"points": 0}, "points is 0; it must be at least 1"),
+        ({"robot": replace(ARM, spheres={})}, "use the robot of the data"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            RopDataset(store, **arguments)
+    assert len(RopDataset(store, robot=ARM)) > 0
+    with pytest.raises(InputError, match="batch_size is 0"):
+        RopDataset(store).batches(0)
+    with pytest.raises(InputError, match="no data set"):
+        RopDataset(tmp_path)
+    write_manifest(tmp_path, manifest_of(ARM, WAYPOINTS))
+    with pytest.raises(InputError, match="holds no shard"):
+        RopDataset(tmp_path)
+    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), WAYPOINTS + 1), {})
+    with pytest.raises(InputError, match=r"shard_00000\.zarr, array trajectories has rows of shape"):
+        RopDataset(tmp_path)
+    write_shard(tmp_path, 0, random_arrays(ARM, 5, np.random.default_rng(0), WAYPOINTS), {})
+    file = next(p for p in (shard_path(tmp_path, 0) / "trajectories" / "c").rglob("*") if p.is_file())
+    file.write_bytes(b"")
+    with pytest.raises(InputError, match=r"shard_00000\.zarr, array trajectories is damaged"):
+        RopDataset(tmp_path)

@@ -1,0 +1,346 @@
+"""The data set on disk: same bytes for the same arrays, nothing half-written, clear words about damage."""
+
+import builtins
+import errno
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+from zarr.codecs import ZstdCodec
+
+from helpers.box_arm import box_arm
+from helpers.stores import manifest_of, random_arrays, write_store
+from robotdiffuse.datasets import shards
+from robotdiffuse.datasets.manifest import read_manifest, write_manifest
+from robotdiffuse.datasets.shards import (
+    ARRAYS,
+    SPLITS,
+    check_shard,
+    read_shard,
+    remove_leftovers,
+    shard_indices,
+    shard_path,
+    split_of,
+    write_shard,
+)
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+
+ARM, WAYPOINTS = box_arm(), 12
+
+
+@pytest.fixture
+def arrays():
+    return random_arrays(ARM, 7, np.random.default_rng(0), WAYPOINTS)
+
+
+@pytest.fixture
+def store(tmp_path):
+    write_store(tmp_path, ARM, (7, 3), WAYPOINTS)
+    return tmp_path
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def test_what_is_written_is_read(tmp_path, arrays):
+    write_shard(tmp_path, 3, arrays, {"tried": 9, "solved": 7})
+    shard = read_shard(tmp_path, 3)
+    assert len(shard) == 7
+    assert shard.counts == {"tried": 9, "solved": 7}
+    assert set(shard.arrays) == ARRAYS.keys() - {"times"}
+    for name, array in arrays.items():
+        assert shard[name].dtype == np.dtype(ARRAYS[name][0])
+        np.testing.assert_array_equal(shard[name], array)
+    assert isinstance(shard["trajectories"], np.memmap)
+    assert not shard["trajectories"].flags.writeable
+    assert set(read_shard(tmp_path, 3, ("cost", "seed")).arrays) == {"cost", "seed"}
+    assert shard_indices(tmp_path) == [3]
+    check_shard(tmp_path, 3, manifest_of(ARM, WAYPOINTS))
+
+
+def test_times_and_no_rows(tmp_path, arrays):
+    timed = {name: array[:0] for name, array in arrays.items()} | {"times": np.zeros((0, WAYPOINTS))}
+    write_shard(tmp_path, 0, timed, {})
+    shard = check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS, timing="time"))
+    assert len(shard) == 0
+    assert shard["trajectories"].shape == (0, WAYPOINTS, ARM.dof)
+    with pytest.raises(InputError, match="array times: it must be there only where timing is time"):
+        check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))
+
+
+def test_the_store_is_plain_zarr(store):
+    group = zarr.open_group(shard_path(store, 0), mode="r")
+    assert group.metadata.zarr_format == 3
+    assert dict(group.attrs)["format"] == 1
+    for name, array in group.arrays():
+        assert array.nchunks == 1, name
+        assert (array.compressors == ()) == (name == "trajectories")
+
+
+def test_same_arrays_same_bytes(tmp_path, arrays):
+    counts = {"tried": 2, "solved": 1}
+    write_shard(tmp_path / "a", 0, arrays, counts)
+    write_shard(tmp_path / "b", 0, dict(reversed(arrays.items())), dict(reversed(counts.items())))
+    write_shard(tmp_path / "b", 0, arrays, counts)  # once more in its place
+    assert files(tmp_path / "a") == files(tmp_path / "b")
+    assert [p.name for p in (tmp_path / "b").iterdir()] == ["shard_00000.zarr"]
+
+
+def test_a_compressed_or_divided_array_is_read_too(tmp_path, arrays):
+    write_shard(tmp_path, 0, arrays, {})
+    group = zarr.open_group(shard_path(tmp_path, 0), mode="a")
+    prints = dict(group["trajectories"].attrs)
+    for rows, compressors in ((2, None), (7, ZstdCodec())):
+        group.create_array(
+            "trajectories",
+            data=arrays["trajectories"],
+            chunks=(rows, WAYPOINTS, ARM.dof),
+            compressors=compressors,
+            attributes=prints,
+            overwrite=True,
+        )
+        q = check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))["trajectories"]
+        assert not isinstance(q, np.memmap)
+        np.testing.assert_array_equal(q, arrays["trajectories"])
+
+
+def test_a_full_disk(tmp_path, arrays, monkeypatch):
+    """zarr writes some arrays, then the disk is full: the error names the shard, and nothing stays."""
+    write_shard(tmp_path, 0, arrays, {})
+    before = files(tmp_path)
+    create, made = zarr.Group.create_array, []
+
+    def full(self, name, **how):
+        made.append(name)
+        if len(made) > 4:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return create(self, name, **how)
+
+    monkeypatch.setattr(zarr.Group, "create_array", full)
+    for index in (0, 1):
+        with pytest.raises(InputError, match=rf"cannot write .*shard_0000{index}\.zarr: No space left"):
+            write_shard(tmp_path, index, arrays, {})
+    assert files(tmp_path) == before
+    assert [p.name for p in tmp_path.iterdir()] == ["shard_00000.zarr"]
+
+
+def test_a_killed_writer_leaves_nothing_that_counts(store):
+    """Killed between two arrays: the shard that was there stays whole; the rest is cleared away."""
+    before = files(store)
+    code = f"""
+import os, sys
+sys.path.insert(0, {str(Path(__file__).parents[1])!r})
+import numpy as np, zarr
+from helpers.box_arm import box_arm
+from helpers.stores import random_arrays
+from robotdiffuse.datasets.shards import write_shard
+create = zarr.Group.create_array
+def die(self, name, **how):
+    create(self, name, **how)
+    if name == "goals":
+        os.kill(os.getpid(), 9)
+zarr.Group.create_array = die
+write_shard({str(store)!r}, 1, random_arrays(box_arm(), 3, np.random.default_rng(5), {WAYPOINTS}), {{}})
+"""
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -9
+    assert shard_indices(store) == [0, 1]
+    assert set(files(store)) > set(before)
+    (store / ".manifest.json.123").write_text("{")
+    remove_leftovers(store)
+    assert files(store) == before
+
+
+def test_arrays_that_do_not_fit(tmp_path, arrays):
+    with pytest.raises(InputError, match=r"unknown arrays .*'costs'"):
+        write_shard(tmp_path, 0, arrays | {"costs": arrays["cost"]}, {})
+    with pytest.raises(InputError, match="unequal rows"):
+        write_shard(tmp_path, 0, arrays | {"cost": arrays["cost"][:3]}, {})
+    assert list(tmp_path.iterdir()) == []
+
+
+def rewrite(store, name, change):
+    """Replace an array of shard 0 behind the back of its fingerprints."""
+    group = zarr.open_group(shard_path(store, 0), mode="a")
+    prints, data = dict(group[name].attrs), change(zarr.open_array(shard_path(store, 0) / name)[...])
+    group.create_array(name, data=data, chunks=data.shape, attributes=prints, overwrite=True)
+
+
+def chunk(store, name):
+    return next(p for p in (shard_path(store, 0) / name / "c").rglob("*") if p.is_file())
+
+
+def damage(store, case):
+    shard = shard_path(store, 0)
+    if case == "missing array":
+        shutil.rmtree(shard / "goals")
+    elif case == "truncated map":
+        file = chunk(store, "trajectories")
+        file.write_bytes(file.read_bytes()[:-4])
+    elif case == "truncated chunk":
+        file = chunk(store, "start")
+        file.write_bytes(file.read_bytes()[:-4])
+    elif case == "no chunk":
+        chunk(store, "cost").unlink()
+    elif case == "broken metadata":
+        (shard / "seed" / "zarr.json").write_text("{")
+    elif case == "no metadata":
+        (shard / "seed" / "zarr.json").unlink()
+    elif case == "broken group":
+        (shard / "zarr.json").write_text("{")
+    elif case == "rows":
+        rewrite(store, "detour", lambda a: a[:-1])
+    elif case == "type":
+        rewrite(store, "detour", lambda a: a.astype(np.float64))
+    elif case == "shape":
+        rewrite(store, "obstacle_params", lambda a: a[..., :9])
+    elif case == "bit":
+        file = chunk(store, "trajectories")
+        data = bytearray(file.read_bytes())
+        data[50] ^= 1
+        file.write_bytes(data)
+    elif case == "version":
+        zarr.open_group(shard, mode="a").attrs["format"] = 2
+    elif case == "moved":
+        zarr.open_group(shard, mode="a").attrs["index"] = 4
+
+
+@pytest.mark.parametrize(
+    ("case", "message"),
+    [
+        ("missing array", r"shard .*shard_00000\.zarr, array goals: missing"),
+        ("truncated map", r"shard_00000\.zarr, array trajectories is damaged: its chunk has 1,004 bytes"),
+        ("truncated chunk", r"shard_00000\.zarr, array start is damaged"),
+        ("no chunk", r"shard_00000\.zarr, array cost is damaged: a chunk is missing"),
+        ("broken metadata", r"shard_00000\.zarr, array seed is damaged"),
+        ("no metadata", r"shard_00000\.zarr, array seed is damaged"),
+        ("broken group", r"shard .*shard_00000\.zarr is damaged"),
+        ("rows", r"shard_00000\.zarr is damaged: its arrays have unequal numbers of rows"),
+        ("type", r"array detour is <f8 with 1 axes; it must be <f4 with 1"),
+        ("shape", r"array obstacle_params has rows of shape \(4, 9\); the manifest says \(4, 10\)"),
+        ("bit", r"array trajectories is damaged: its fingerprint is not the one that was written"),
+        ("version", r"shard_00000\.zarr: format is 2; this version reads 1"),
+        ("moved", r"shard_00000\.zarr is damaged: its attributes are not those of shard 0"),
+    ],
+)
+def test_damage_gives_one_line(store, case, message):
+    damage(store, case)
+    with pytest.raises(InputError, match=message) as caught:
+        check_shard(store, 0, read_manifest(store))
+    assert "\n" not in str(caught.value)
+    check_shard(store, 1, read_manifest(store))
+
+
+def test_numbers_that_are_not_finite(tmp_path, arrays):
+    arrays["trajectories"][1, 2, 0] = np.nan
+    write_shard(tmp_path, 0, arrays, {})
+    with pytest.raises(InputError, match="array trajectories holds numbers that are not finite"):
+        check_shard(tmp_path, 0, manifest_of(ARM, WAYPOINTS))
+
+
+def test_manifest(tmp_path):
+    with pytest.raises(InputError, match=r"there is no .*manifest\.json; make one with: robotdiffuse data"):
+        read_manifest(tmp_path / "nothing")
+    manifest = manifest_of(ARM)
+    write_manifest(tmp_path, manifest)
+    assert read_manifest(tmp_path) == manifest
+    data = json.loads((tmp_path / "manifest.json").read_text())
+    assert (data["format"], data["dof"], data["waypoints"]) == (1, 3, 254)
+    for change, message in [
+        ({"format": 2}, r"manifest\.json: format is 2; this version reads 1"),
+        ({"wings": 2}, r"manifest\.json is damaged: .*wings"),
+        ({"lower": [0.0]}, r"manifest\.json is damaged: joint_names, lower and upper"),
+        ({"timing": "even"}, r"manifest\.json is damaged: timing is 'even'"),
+        ({"floors": {}}, r"manifest\.json is damaged: floors are of \[\]; they must be of \['rop'\]"),
+        ({"floors": {"rop": {"size": [2.0, 2.0, 0.1]}}}, r"manifest\.json is damaged: .*center"),
+    ]:
+        (tmp_path / "manifest.json").write_text(json.dumps(data | change))
+        with pytest.raises(InputError, match=message):
+            read_manifest(tmp_path)
+    (tmp_path / "manifest.json").write_text("{")
+    with pytest.raises(InputError, match=r"manifest\.json is damaged"):
+        read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("families", "size"),
+    [
+        ({"rop": {}, "shelf": {}}, [[2.0, 2.0, 0.1], [3.0, 3.0, 0.1]]),
+        ({"rop": {"floor": True, "floor_size": 4.0, "floor_thickness": 0.2}}, [[4.0, 4.0, 0.2]]),
+        ({"rop": {"floor": False}}, [None]),
+    ],
+)
+def test_old_manifests_have_the_floors_of_their_families(tmp_path, families, size):
+    """Those that were written before floors were kept in them."""
+    write_manifest(tmp_path, manifest_of(ARM))
+    data = json.loads((tmp_path / "manifest.json").read_text()) | {"families": families}
+    del data["floors"]
+    (tmp_path / "manifest.json").write_text(json.dumps(data))
+    manifest = read_manifest(tmp_path)
+    floors = [manifest.floor(i) for i in range(len(families))]
+    assert [floor and floor.size.tolist() for floor in floors] == size
+    assert all(floor is None or floor.bounds[1, 2] == pytest.approx(0, abs=1e-12) for floor in floors)
+    data["families"] = {"rap": {}}
+    (tmp_path / "manifest.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match=r"manifest\.json is damaged: .*'rap'"):
+        read_manifest(tmp_path)
+
+
+def test_the_robot_must_be_that_of_the_data():
+    manifest = manifest_of(ARM)
+    manifest.check_robot(replace(ARM, name="renamed"))
+    longer = replace(ARM, spheres=ARM.spheres | {"l1": ARM.spheres["l1"] + 0.01})
+    with pytest.raises(InputError, match=r"the data are of the robot .* use the robot of the data"):
+        manifest.check_robot(longer)
+
+
+def test_robot_fingerprint():
+    code = "from robotdiffuse.robots import load_robot\nfrom robotdiffuse.robots.fingerprint import *\n"
+    done = subprocess.run(
+        [sys.executable, "-c", code + "print(robot_fingerprint(load_robot('panda')))"],
+        capture_output=True,
+        text=True,
+    )
+    panda = load_robot("panda")
+    mine = robot_fingerprint(panda)
+    assert done.stdout.strip() == mine
+    assert len(mine) == 16
+    joint = next(j for j in panda.joints if j.name == panda.joint_names[0])
+    slower = tuple(replace(j, velocity=1.0) if j is joint else j for j in panda.joints)
+    others = [replace(panda, joints=slower), replace(panda, meshes={}), load_robot("panda").with_locked({})]
+    assert [robot_fingerprint(other) == mine for other in others] == [False, False, True]
+
+
+def test_splits_keep_scenes_together():
+    rng = np.random.default_rng(0)
+    arrays = random_arrays(ARM, 4000, rng, 2)
+    scenes = PackedScenes(arrays["obstacle_kinds"], arrays["obstacle_params"])
+    split = split_of(scenes)
+    shares = np.bincount(split, minlength=len(SPLITS)) / len(split)
+    # three standard errors of 5 % of 4000
+    np.testing.assert_allclose(shares, [0.9, 0.05, 0.05], atol=3 * np.sqrt(0.05 * 0.95 / 4000))
+    order = rng.permutation(4000)
+    np.testing.assert_array_equal(split_of(scenes[order]), split[order])
+
+
+def test_without_zarr(tmp_path, arrays, monkeypatch):
+    original = builtins.__import__
+
+    def missing(name, *rest):
+        if name == "zarr":
+            raise ImportError(name)
+        return original(name, *rest)
+
+    monkeypatch.setattr(builtins, "__import__", missing)
+    for call in (lambda: write_shard(tmp_path, 0, arrays, {}), lambda: shards.read_shard(tmp_path, 0)):
+        with pytest.raises(InputError, match=r'pip install "robotdiffuse\[data\]"'):
+            call()

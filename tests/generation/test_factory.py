@@ -1,0 +1,333 @@
+"""The data factory: the same data whatever happens, and motions that are what they claim to be."""
+
+import fcntl
+import json
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy import ndarray
+
+from helpers.clearances import least_clearance
+from helpers.factory_runs import contents, in_this_process
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.datasets.manifest import read_manifest
+from robotdiffuse.datasets.shards import check_shard, path_of, problem_of, read_shard
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.generation import GenerationSettings, generate
+from robotdiffuse.generation import factory
+from robotdiffuse.generation.shard_maker import NUMBERS, draw, make_shard
+from robotdiffuse.problems.families import family
+from robotdiffuse.problems.families import rop
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion
+from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.validation.validator import verify
+
+MIX = {"rop": 0.5, "rop_dense": 0.5}
+SETTINGS = GenerationSettings(trajectories=12, shard=4, waypoints=32, seed=3, mix=MIX, goals=4)
+PANDA = load_robot("panda")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out, seen = tmp_path_factory.mktemp("data") / "new", []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(factory, "on_this_machine", in_this_process)
+        assert generate(SETTINGS, out, progress=lambda *at: seen.append(at)) == 12
+    assert seen == [(0, 12), (4, 12), (8, 12), (12, 12)]
+    return out
+
+
+@pytest.fixture
+def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(factory, "on_this_machine", in_this_process)
+
+
+def rows_of(folder: Path) -> dict[str, ndarray]:
+    shards = [read_shard(folder, index) for index in range(SETTINGS.shards)]
+    return {name: np.concatenate([shard[name] for shard in shards]) for name in shards[0].arrays}
+
+
+def test_the_same_data_with_more_workers_and_after_an_interruption(folder: Path, tmp_path: Path) -> None:
+    """What a killed run leaves: a manifest, a finished shard, half of another and half a manifest."""
+    shutil.copy(folder / "manifest.json", tmp_path)
+    shutil.copytree(folder / "shard_00001.zarr", tmp_path / "shard_00001.zarr")
+    kept = (tmp_path / "shard_00001.zarr").stat().st_mtime_ns
+    half = tmp_path / ".shard_00002.zarr.abc" / "new"
+    half.mkdir(parents=True)
+    (half / "zarr.json").write_text("{")
+    (tmp_path / ".manifest.json.77").write_text("{")
+    seen: list[tuple[int, int]] = []
+    assert generate(SETTINGS, tmp_path, 2, progress=lambda *at: seen.append(at)) == 12
+    assert seen == [(4, 12), (8, 12), (12, 12)]
+    assert contents(tmp_path) == contents(folder)
+    assert (tmp_path / "shard_00001.zarr").stat().st_mtime_ns == kept
+
+
+@pytest.mark.usefixtures("no_processes")
+def test_a_finished_folder_is_left_as_it_is(folder: Path) -> None:
+    before = {file: file.stat().st_mtime_ns for file in folder.rglob("*")}
+    assert generate(SETTINGS, folder) == 12
+    assert {file: file.stat().st_mtime_ns for file in folder.rglob("*")} == before
+
+
+def test_shards_are_whole_and_what_the_manifest_says(folder: Path) -> None:
+    manifest = read_manifest(folder)
+    assert (manifest.trajectories, manifest.shard, manifest.slots) == (12, 4, 12)
+    assert tuple(manifest.families) == tuple(MIX)
+    assert set(manifest.versions) == {"robotdiffuse", "python", "numpy", "numba", "zarr"}
+    for index in range(SETTINGS.shards):
+        shard = check_shard(folder, index, manifest)
+        assert len(shard) == 4
+        counts = dict(shard.counts)
+        assert counts["solved"] == 4 and counts.pop("tried") == sum(counts.values())
+        # numbers of problems rise, and no other shard has them
+        assert (np.diff(shard["seed"].astype(np.int64)) > 0).all()
+        assert (shard["seed"] // NUMBERS == index).all()
+
+
+def checked_problem(row: dict[str, Any]) -> tuple[Problem, CollisionChecker]:
+    """The problem of a row's own number, drawn again: it is the one that the row says."""
+    rng = np.random.default_rng([SETTINGS.seed, int(row["seed"])])
+    number, drawn = draw(SETTINGS, PANDA, rng)
+    assert row["family"] == number
+    floor = list(SETTINGS.families.values())[number].floor
+    packed = PackedScenes.pack([drawn.scene], SETTINGS.slots, floor is not None)
+    np.testing.assert_array_equal(row["obstacle_kinds"], packed.kinds[0])
+    np.testing.assert_array_equal(row["obstacle_params"], packed.params[0])
+    np.testing.assert_array_equal(row["start"], drawn.start)
+    k = len(drawn.goals)
+    np.testing.assert_array_equal(row["goals"][:k], drawn.goals)
+    assert np.isnan(row["goals"][k:]).all() and np.isnan(row["goal_costs"][k:]).all()
+    assert not np.isnan(row["goal_costs"][:k]).any()
+    return drawn.problem(PANDA), CollisionChecker(PANDA, drawn.scene)
+
+
+@pytest.mark.parametrize("i", range(12))
+def test_every_trajectory_is_what_it_claims_to_be(i: int, folder: Path) -> None:
+    row: dict[str, Any] = {name: values[i] for name, values in rows_of(folder).items()}
+    problem, checker = checked_problem(row)
+    q = np.array(row["trajectories"])
+    goal = row["goals"][row["goal_index"]]
+    np.testing.assert_array_equal(q[0], row["start"])
+    np.testing.assert_array_equal(q[-1], goal)
+    assert ((q >= PANDA.lower - 1e-6) & (q <= PANDA.upper + 1e-6)).all()
+    assert verify(problem, Motion(PANDA.joint_names, q.astype(float))).valid
+    fine = np.concatenate([a + np.linspace(0, 1, 20)[:, None] * (b - a) for a, b in pairwise(q)])
+    assert least_clearance(checker, fine.astype(float)).min() > -1e-3
+
+    # costs: of the best goal, not shorter than the line, and hardly longer than the waypoints
+    assert row["cost"] == row["goal_costs"][row["goal_index"]] == np.nanmin(row["goal_costs"])
+    straight = np.linalg.norm(q[-1] - q[0])
+    lines = np.linalg.norm(row["goals"] - row["start"], axis=1)
+    assert (np.isnan(lines) | (row["goal_costs"] >= lines * (1 - 1e-5))).all()
+    length = np.linalg.norm(np.diff(q, axis=0), axis=1)
+    assert length.sum() <= row["cost"] * (1 + 1e-5) and length.sum() > 0.97 * row["cost"]
+    # even, but for waypoints that cut a corner
+    assert length.max() <= row["cost"] / 31 * (1 + 1e-4)
+    np.testing.assert_allclose(row["detour"], row["cost"] / straight, rtol=1e-5)
+
+    # difficulty: by other means than the search's
+    line = q[0] + np.linspace(0, 1, 400)[:, None] * (q[-1] - q[0])
+    deepest = least_clearance(checker, line.astype(float)).min()
+    assert deepest > -0.01 if row["line_free"] else deepest < 0.01
+    assert row["line_free"] or row["detour"] > 1 + 1e-4
+    links = checker.link_clearances(fine.astype(float)).min(axis=1)
+    np.testing.assert_allclose(row["clearance"], checker.link_clearances(q).min(), atol=1e-6)
+    assert links.min() <= row["clearance"] + 1e-6
+    promised = min(row["safety_distance"], links[0], links[-1])
+    assert row["clearance"] > promised - 0.015
+
+
+def test_target_position_holds_for_all_goals(folder: Path) -> None:
+    rows = rows_of(folder)
+    for goals, target in zip(rows["goals"], rows["target_pose"], strict=True):
+        poses = [link_pose(PANDA, q.astype(float), PANDA.tip) for q in goals if np.isfinite(q).all()]
+        np.testing.assert_allclose([T[:3, 3] for T in poses], [target[4:]] * len(poses), atol=1e-3)
+        wxyz = quaternion_from_rotation(poses[0][:3, :3])
+        np.testing.assert_allclose(abs(wxyz @ target[:4]), 1.0, atol=1e-6)
+
+
+def test_target_pose_holds_for_all_goals() -> None:
+    arrays, _ = make_shard(replace(SETTINGS, trajectories=3, target="pose"), 0)
+    several = 0
+    for goals, target in zip(arrays["goals"], arrays["target_pose"], strict=True):
+        rotation = rotation_from_quaternion(target[:4].astype(float))
+        for q in goals[np.isfinite(goals).all(axis=1)]:
+            T = link_pose(PANDA, q.astype(float), PANDA.tip)
+            np.testing.assert_allclose(T[:3, 3], target[4:], atol=1e-3)
+            np.testing.assert_allclose(T[:3, :3], rotation, atol=5e-3)
+            several += 1
+    assert several > 3
+
+
+def test_thinning_leaves_out_what_the_line_solves_and_nothing_else() -> None:
+    whole = replace(SETTINGS, trajectories=8, shard=8, mix={"rop_dense": 1.0})
+    arrays, counts = make_shard(whole, 0)
+    assert counts["thinned"] == 0
+    hard = ~arrays["line_free"]
+    assert 0 < hard.sum() < 8
+    thin, counts = make_shard(replace(whole, trajectories=int(hard.sum()), trivial_share=0.0), 0)
+    assert counts["thinned"] > 0
+    for name, values in arrays.items():
+        np.testing.assert_array_equal(thin[name], values[hard], err_msg=name)
+
+
+def test_frames_in_time_keep_the_velocity_limits() -> None:
+    arrays, _ = make_shard(replace(SETTINGS, trajectories=3, timing="time"), 0)
+    times, q = arrays["times"].astype(float), arrays["trajectories"].astype(float)
+    assert times.shape == (3, 32) and (times[:, 0] == 0).all() and (np.diff(times) > 0).all()
+    np.testing.assert_allclose(np.diff(times, 2), 0, atol=1e-5)
+    rates = np.abs(np.diff(q, axis=1)) / np.diff(times)[..., None]
+    assert (rates <= PANDA.velocity * 1.01).all()
+    # some joint is near a limit of it, or the motion would take longer than it needs
+    assert (rates / PANDA.velocity).max(axis=(1, 2)).min() > 0.2
+    np.testing.assert_array_equal(q[:, 0], arrays["start"])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("trajectories", 0),
+        ("seed", -1),
+        ("shard", 0),
+        ("goals", 0),
+        ("goals", 128),
+        ("waypoints", 1),
+        ("trivial_share", -0.1),
+        ("trivial_share", float("nan")),
+    ],
+)
+def test_bad_settings_are_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"{name} is {value}"):
+        replace(SETTINGS, **{name: value})
+
+
+@pytest.mark.parametrize(("name", "known"), [("target", "pose, position"), ("timing", "arc, time")])
+def test_unknown_kinds_are_refused_with_those_known(name: str, known: str) -> None:
+    with pytest.raises(InputError, match=f"{name}.*posse.*{known}"):
+        replace(SETTINGS, **{name: "posse"})
+
+
+def test_scenes_out_of_reach_are_refused() -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(rop, "ROP", replace(rop.ROP, tip_x=(5.0, 5.1)))
+        patch.setattr(family, "SCENES", 2)
+        with pytest.raises(InputError, match="no free start and goal in 2 scenes of Rop for panda"):
+            make_shard(replace(SETTINGS, mix={"rop": 1.0}), 0)
+
+
+def change_manifest(folder: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    data = json.loads((folder / "manifest.json").read_text())
+    change(data)
+    (folder / "manifest.json").write_text(json.dumps(data))
+
+
+def test_other_settings_are_refused_by_name(folder: Path) -> None:
+    search = replace(SETTINGS.search, safety_distance=0.02)
+    for changed, message in (
+        (replace(SETTINGS, seed=4), "seed 3, not 4"),
+        (replace(SETTINGS, trajectories=13), "trajectories 12, not 13"),
+        (replace(SETTINGS, mix={"rop": 1.0}), r'mix .*"rop_dense".*, not {"rop": 1.0}'),
+        (replace(SETTINGS, mix=dict(reversed(SETTINGS.mix.items()))), r"mix .*, not "),
+        (replace(SETTINGS, search=search), r"search\.safety_distance 0\.05, not 0\.02"),
+    ):
+        before = contents(folder)
+        with pytest.raises(InputError, match=message):
+            generate(changed, folder)
+        assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda data: data["versions"].update(numba="0.1"), "begun with numba 0.1; this is"),
+        (lambda data: data["versions"].pop("robotdiffuse"), "begun with robotdiffuse None"),
+        (lambda data: data.update(robot_fingerprint="0" * 16), "fingerprint 0000000000000000"),
+        (lambda data: data.update(format=9), "format is 9"),
+    ],
+)
+def test_data_of_other_versions_and_robots_are_refused(
+    change: Callable[[dict[str, Any]], None], message: str, folder: Path, tmp_path: Path
+) -> None:
+    shutil.copy(folder / "manifest.json", tmp_path)
+    change_manifest(tmp_path, change)
+    with pytest.raises(InputError, match=message):
+        generate(SETTINGS, tmp_path)
+
+
+def test_unusable_folders_are_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"cannot use the folder .*file"):
+        generate(SETTINGS, tmp_path / "file")
+    with pytest.raises(InputError, match=r"cannot use the folder .*below"):
+        generate(SETTINGS, tmp_path / "file" / "below")
+    shutil.copytree(folder / "shard_00000.zarr", tmp_path / "shard_00000.zarr")
+    with pytest.raises(InputError, match="holds shards but no manifest"):
+        generate(SETTINGS, tmp_path)
+    (tmp_path / "manifest.json").write_text("{")
+    with pytest.raises(InputError, match=r"manifest\.json is damaged"):
+        generate(SETTINGS, tmp_path)
+
+
+def test_two_cannot_fill_one_folder(tmp_path: Path) -> None:
+    other = os.open(tmp_path, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    try:
+        with pytest.raises(InputError, match="another process is filling"):
+            generate(SETTINGS, tmp_path)
+    finally:
+        os.close(other)
+    assert not contents(tmp_path)
+
+
+def test_workers_and_clusters_that_are_none_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="workers is 0"):
+        generate(SETTINGS, tmp_path / "data", 0)
+    with pytest.raises(InputError, match=r"cluster.*slurm.*ray"):
+        generate(SETTINGS, tmp_path / "data", cluster="slurm")
+    assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
+    ("mix", "message"),
+    [
+        ({}, "mix is empty"),
+        ({"rop": 0.0}, "share of rop is 0"),
+        ({"rop": float("nan")}, "share of rop is nan"),
+        ({"pantry": 1.0}, r"pantry.*rop, rop_dense"),
+    ],
+)
+def test_bad_mixes_are_refused(mix: dict[str, float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        replace(SETTINGS, mix=mix)
+
+
+def test_the_papers_mix_needs_two_slots() -> None:
+    assert GenerationSettings().slots == 2 and SETTINGS.slots == 12
+
+
+def test_furniture_among_the_families(tmp_path: Path) -> None:
+    """Fingers in a compartment, a crate or on a table at both ends; scenes with their own floor."""
+    settings = replace(SETTINGS, mix={"shelf": 1.0, "crate": 1.0, "table": 1.0}, trajectories=6, shard=6)
+    generate(settings, tmp_path, 1)
+    manifest, shard = read_manifest(tmp_path), check_shard(tmp_path, 0, read_manifest(tmp_path))
+    assert manifest.slots == 16 and len(set(shard["family"].tolist())) > 1
+    robot = load_robot("panda")
+    for row in range(6):
+        problem = problem_of(manifest, robot, shard, row)
+        assert problem.scene.shapes[0].name == "floor" and len(problem.scene.shapes) > 4
+        assert verify(problem, path_of(robot, shard, row)).valid
+        pose = shard["target_pose"][row]
+        reached = link_pose(robot, shard["trajectories"][row, -1].astype(float), robot.tip)
+        np.testing.assert_allclose(reached[:3, 3], pose[4:], atol=1e-5)

@@ -1,0 +1,427 @@
+"""What is exported is read again and judged the same; what others write is read, or refused in one line."""
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from helpers.box_arm import box_arm
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.interop import READERS, WRITERS, read_motion, write_motion
+from robotdiffuse.interop.recorded_motion import fitted, own_problem, recorded
+from robotdiffuse.interop.plain_messages import joint_trajectory, motion_of
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.core.types import Trajectory
+from robotdiffuse.validation.validator import verify_trajectory
+
+START, GOAL = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
+
+
+@pytest.fixture(scope="module")
+def planned() -> tuple[Problem, Trajectory]:
+    shapes = [
+        rd.Sphere([0.5, 0.0, 0.5], 0.2, "ball"),
+        rd.Box([0.5, 0, -0.06], [2, 2, 0.1], name="table"),
+        rd.Capsule([0, 0.9, 0.4], 0.05, 0.3),
+        rd.Cylinder([0, -0.9, 0.4], 0.05, 0.3),
+        rd.Mesh([[-1, 0, 0], [-1, 0.1, 0], [-1, 0, 0.1]], [[0, 1, 2]]),
+        rd.PointCloud([[-0.9, 0.0, 0.1], [-0.9, 0.1, 0.1]]),
+    ]
+    problem = Problem(rd.load_robot("panda"), Scene(shapes), START, GOAL)
+    result = rd.load_planner("rrt_connect").plan(problem, time_limit=5.0)
+    assert result.trajectory is not None
+    return problem, result.trajectory
+
+
+@pytest.mark.parametrize("ending", [ending for ending in (*WRITERS, ".csv", ".json") if ending in READERS])
+def test_what_is_exported_is_read_again_and_judged_the_same(
+    ending: str, planned: tuple[Problem, Trajectory], tmp_path: Path
+) -> None:
+    problem, trajectory = planned
+    file = tmp_path / f"motion{ending}"
+    for _ in range(2):  # a file that is there is replaced
+        write_motion(problem, trajectory, file)
+    found = fitted(read_motion(file), problem.robot)
+    assert found.notes == ()
+    assert isinstance(found.motion, Trajectory)
+    np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
+    np.testing.assert_array_equal(found.motion.velocities, trajectory.velocities)
+    np.testing.assert_allclose(found.motion.times, trajectory.times, atol=1e-9)  # messages count nanoseconds
+    here, there = (verify_trajectory(problem, motion) for motion in (trajectory, found.motion))
+    assert (here.valid, here.violation) == (there.valid, there.violation)
+    assert there.min_clearance == pytest.approx(here.min_clearance, rel=1e-6)
+    assert [path.name for path in tmp_path.iterdir()] == [file.name]
+
+
+def test_mcap_holds_scene_urdf_frames_and_joint_states(
+    planned: tuple[Problem, Trajectory], tmp_path: Path
+) -> None:
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    problem, trajectory = planned
+    write_motion(problem, trajectory, tmp_path / "m.mcap")
+    with (tmp_path / "m.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None and summary.statistics is not None
+        counts = {summary.channels[i].topic: n for i, n in summary.statistics.channel_message_counts.items()}
+        [(_, _, _, scene)] = reader.iter_decoded_messages(topics=["/scene"])
+        transforms = [found for *_, found in reader.iter_decoded_messages(topics=["/tf"])]
+        attached = {attachment.name: attachment.data for attachment in reader.iter_attachments()}
+    rows = len(trajectory.times)
+    assert counts["/tf"] == counts["/joint_states"] == rows
+    assert counts["/joint_trajectory"] == counts["/points/point_cloud"] == 1
+    entities = {entity.id: entity for entity in scene.entities}
+    assert entities["ball"].spheres[0].size.x == 0.4
+    assert entities["table"].frame_id == "panda_link0"
+    assert {"capsule", "cylinder", "mesh"} <= entities.keys()
+    assert any(name.startswith("panda_link5/") for name in entities)
+    frames = {transform.child_frame_id for transform in transforms[0].transforms}
+    assert {entity.frame_id for entity in scene.entities} <= frames | {"panda_link0"}
+    again = json.loads(attached["problem.json"])
+    assert again["start"] == START
+
+
+def test_mcap_knows_where_the_base_stands(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+    from mcap_protobuf.decoder import DecoderFactory
+
+    from robotdiffuse.interop.mcap_file import problem_in
+
+    problem, trajectory = planned
+    T = np.eye(4)
+    T[:3, 3] = [1.0, 2.0, 3.0]
+    raised = replace(problem, T_world_base=T)
+    write_motion(raised, trajectory, tmp_path / "m.mcap")
+    with (tmp_path / "m.mcap").open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        first = next(found for *_, found in reader.iter_decoded_messages(topics=["/tf"]))
+    [base] = [found for found in first.transforms if found.parent_frame_id == "world"]
+    assert base.child_frame_id == "panda_link0"
+    assert (base.translation.x, base.translation.y, base.translation.z) == (1.0, 2.0, 3.0)
+    again = problem_in(tmp_path / "m.mcap")
+    assert again is not None
+    assert verify_trajectory(again, trajectory).valid
+
+
+def test_a_urdf_goes_along(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    urdf = tmp_path / "arm.urdf"
+    inertial = '<geometry><box size="0.1 0.1 0.3"/></geometry><origin xyz="0 0 0.15"/>'
+    urdf.write_text(
+        '<robot name="arm"><link name="base"/><link name="tip"><collision>'
+        f"{inertial}</collision></link>"
+        '<joint name="j" type="revolute"><parent link="base"/><child link="tip"/><axis xyz="0 1 0"/>'
+        '<limit lower="-1" upper="1" velocity="1" effort="1"/></joint></robot>'
+    )
+    problem = Problem(rd.load_robot(str(urdf)), Scene(), [0.0], [0.5])
+    result = rd.load_planner("rrt_connect").plan(problem, time_limit=5.0)
+    assert result.trajectory is not None
+    write_motion(problem, result.trajectory, tmp_path / "m.mcap")
+    with (tmp_path / "m.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        assert urdf.read_bytes() in [attachment.data for attachment in reader.iter_attachments()]
+        [(schema, _, _)] = reader.iter_messages(topics=["/robot_description"])
+        assert schema is not None and schema.name == "std_msgs/msg/String"
+
+
+def test_joint_states_are_a_motion_too(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+    problem, trajectory = planned
+    write_motion(problem, trajectory, tmp_path / "m.mcap")
+    found = fitted(read_motion(tmp_path / "m.mcap", "/joint_states"), problem.robot)
+    assert isinstance(found.motion, Trajectory)
+    assert "panda_finger_joint1, panda_finger_joint2 stand still where the robot holds them" in found.notes
+    np.testing.assert_array_equal(found.motion.positions, trajectory.positions)
+    assert verify_trajectory(problem, found.motion).valid
+    with pytest.raises(InputError, match=r"topic '/tf' holds no motion; topics: .*/joint_trajectory"):
+        read_motion(tmp_path / "m.mcap", "/tf")
+
+
+def test_rerun_recordings_hold_the_joints(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    problem, trajectory = planned
+    write_motion(problem, trajectory, tmp_path / "m.rrd")
+    chunks = {str(chunk.entity_path): chunk for chunk in RrdReader(tmp_path / "m.rrd").stream().to_chunks()}
+    assert {"/scene/ball", "/scene/capsule", "/scene/mesh", "/robot/panda_link5"} <= chunks.keys()
+    for j, name in enumerate(trajectory.joint_names):
+        batch = chunks[f"/joints/{name}/positions"].to_record_batch()
+        values = [row[0] for row in batch.column("Scalars:scalars").to_pylist()]
+        np.testing.assert_array_equal(values, trajectory.positions[:, j])
+
+
+def panda_record(**changes: Any) -> dict[str, Any]:
+    names = [f"panda_joint{i}" for i in range(1, 8)]
+    points = [
+        {"positions": START, "velocities": [0.0] * 7, "time_from_start": {"sec": 0, "nanosec": 0}},
+        {"positions": START, "velocities": [0.0] * 7, "time_from_start": {"sec": 1, "nanosec": 0}},
+    ]
+    return {"joint_names": names, "points": points} | changes
+
+
+def test_joints_are_put_into_order_by_name() -> None:
+    record = panda_record()
+    record["joint_names"].reverse()
+    for point in record["points"]:
+        point["positions"] = point["positions"][::-1]
+    found = fitted(motion_of(record, "it"), rd.load_robot("panda"))
+    assert found.motion.positions[0].tolist() == START
+    assert "joints were put into the robot's order by their names" in found.notes
+    assert "no accelerations are given: those of the velocities are judged" in found.notes
+
+
+def test_all_forms_of_messages_hold_the_same_motion() -> None:
+    record = panda_record()
+    old = panda_record(
+        points=[
+            point | {"time_from_start": {"secs": i, "nsecs": 0}} for i, point in enumerate(record["points"])
+        ]
+    )
+    forms = (
+        record,
+        old,
+        {"joint_trajectory": record, "multi_dof_joint_trajectory": {"points": []}},
+        {"trajectory": [{"joint_trajectory": record}], "model_id": "panda"},
+        {"trajectory": {"joint_trajectory": record}},
+    )
+    for form in forms:
+        found = motion_of(form, "it")
+        assert found.times is not None
+        assert found.times.tolist() == [0, 1]
+        assert found.positions[1].tolist() == START
+
+
+def test_times_that_begin_later_and_no_times() -> None:
+    found = recorded(["a"], [[0.0], [1.0]], [0.5, 1.0])
+    assert found.times is not None and found.times.tolist() == [0.0, 0.5]
+    assert found.notes == ("times begin at 0.5 s, counted from there",)
+    assert recorded(["a"], [[0.0], [1.0]], [0, 0]).times is None
+    assert recorded(["a"], [[0.0], [1.0]]).times is None
+
+
+def test_positions_and_times_alone_are_judged_on_the_smoothest_curve() -> None:
+    robot, t = box_arm(), np.linspace(0, 2, 41)
+    s = 10 * (t / 2) ** 3 - 15 * (t / 2) ** 4 + 6 * (t / 2) ** 5
+    q = np.outer(s, [0.5, -0.4, 0.3])
+    found = fitted(recorded(robot.joint_names, q, t), robot)
+    assert isinstance(found.motion, Trajectory)
+    report = verify_trajectory(Problem(robot, Scene(), q[0], q[-1]), found.motion)
+    assert report.valid, report.violation
+    hasty = fitted(recorded(robot.joint_names, q, t / 10), robot).motion
+    assert isinstance(hasty, Trajectory)
+    refused = verify_trajectory(Problem(robot, Scene(), q[0], q[-1]), hasty).violation
+    assert refused is not None and refused.kind in ("velocity", "acceleration", "jump")
+
+
+REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+    "no joints": (lambda: recorded([], [[]]), "joint_names is \\[\\]; it must be a list of names"),
+    "twice": (lambda: recorded(["a", "a"], [[0, 0]]), "joint_names has a more than once"),
+    "no rows": (lambda: recorded(["a"], []), "positions is empty: a motion has at least one row"),
+    "ragged": (lambda: recorded(["a"], [[0], [0, 1]]), "positions is not rows of numbers"),
+    "nan": (lambda: recorded(["a"], [[0], [float("nan")]]), r"positions\[1\] is \[nan\]; its numbers"),
+    "huge": (lambda: recorded(["a"], [[1e30]]), "must be finite and within ±10000"),
+    "short rates": (lambda: recorded(["a"], [[0], [1]], [0, 1], [[0]]), "velocities has 1 rows"),
+    "nan time": (lambda: recorded(["a"], [[0], [1]], [0, float("nan")]), r"times\[1\] is nan"),
+    "backwards": (lambda: recorded(["a"], [[0], [1]], [1, 1]), "times do not increase: 1 s in row 0, 1 s"),
+    "few times": (lambda: recorded(["a"], [[0], [1]], [0]), "it must be 2 numbers, one for each row"),
+    "another robot": (
+        lambda: fitted(recorded(["shoulder", "elbow"], [[0, 0]]), rd.load_robot("panda")),
+        "the motion lacks panda_joint1, .* and has shoulder, elbow, which panda has not",
+    ),
+    "a joint is missing": (
+        lambda: fitted(
+            motion_of(panda_record(joint_names=[f"panda_joint{i}" for i in range(2, 9)]), "it"),
+            rd.load_robot("panda"),
+        ),
+        "the motion lacks panda_joint1",
+    ),
+    "a finger elsewhere": (
+        lambda: fitted(
+            recorded([f"panda_joint{i}" for i in range(1, 8)] + ["panda_finger_joint1"], [[*START, 0.01]]),
+            rd.load_robot("panda"),
+        ),
+        "has panda_finger_joint1 at 0.01, the problem holds it at 0.04: write `locked: {panda_finger_joint1",
+    ),
+    "a finger moves": (
+        lambda: fitted(
+            recorded(
+                [f"panda_joint{i}" for i in range(1, 8)] + ["panda_finger_joint1"],
+                [[*START, 0.04], [*START, 0.0]],
+            ),
+            rd.load_robot("panda"),
+        ),
+        "moves panda_finger_joint1 from 0 to 0.04, which the problem holds at 0.04",
+    ),
+    "no points": (lambda: motion_of(panda_record(points=[]), "it"), "it: points is empty"),
+    "points of text": (lambda: motion_of(panda_record(points=["x"]), "it"), r"points\[0\] is 'x'"),
+    "no time": (
+        lambda: motion_of(panda_record(points=[{"positions": START, "time_from_start": "soon"}]), "it"),
+        "time_from_start is 'soon'; it must be a duration",
+    ),
+    "a base that drives": (
+        lambda: motion_of(
+            {"joint_trajectory": panda_record(), "multi_dof_joint_trajectory": {"points": [{}]}}, "it"
+        ),
+        "multi_dof_joint_trajectory has points; only arms on a fixed base can be judged",
+    ),
+    "two parts": (lambda: motion_of({"trajectory": [{}, {}]}, "it"), "trajectory holds 2 parts"),
+    "no plan": (
+        lambda: motion_of({"status": "timeout"}, "it"),
+        "it holds no motion: its status is 'timeout'",
+    ),
+    "nothing": (lambda: motion_of({}, "it"), "it holds no motion: it must hold a result"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_bad_motions_are_refused_in_one_line(name: str) -> None:
+    act, wanted = REFUSED[name]
+    with pytest.raises(InputError, match=wanted) as error:
+        act()
+    assert "\n" not in str(error.value)
+
+
+def test_truncated_files_are_one_line(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+    write_motion(*planned, tmp_path / "m.mcap")
+    whole = (tmp_path / "m.mcap").read_bytes()
+    for size in (0, 10, 1000, len(whole) // 2, len(whole) - 20):
+        (tmp_path / "cut.mcap").write_bytes(whole[:size])
+        with pytest.raises(InputError, match=r"is damaged|is empty") as error:
+            read_motion(tmp_path / "cut.mcap")
+        assert "\n" not in str(error.value)
+    write_motion(*planned, tmp_path / "m.rosbag2")
+    [database] = (tmp_path / "m.rosbag2").glob("*.db3")
+    whole = database.read_bytes()
+    for size in (0, 100, len(whole) // 2):
+        database.write_bytes(whole[:size])
+        with pytest.raises(InputError, match=r"damaged|holds no m") as error:
+            read_motion(tmp_path / "m.rosbag2")
+        assert "\n" not in str(error.value)
+    (tmp_path / "m.rosbag2" / "metadata.yaml").unlink()
+    with pytest.raises(InputError, match=r"is no ROS 2 bag: it has no metadata\.yaml"):
+        read_motion(tmp_path / "m.rosbag2")
+    with pytest.raises(InputError, match="is a part of a ROS 2 bag; give the folder"):
+        read_motion(database)
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("", "it is empty"),
+        ("time,a\n", "it has a header and no rows"),
+        ("time,a\n0,1,2\n", "line 2 has 3 cells; the header has 2"),
+        ("time,a\n0,x\n", "line 2: a is 'x'; it must be a number"),
+        ("time,a,a_position\n0,1,1\n", "the header has 'a_position' more than once"),
+        ("time,a,b_velocity\n0,1,1\n", "velocities of other joints"),
+        ("time,a\n0,nan\n", "must be finite"),
+    ],
+)
+def test_bad_csv(text: str, wanted: str, tmp_path: Path) -> None:
+    (tmp_path / "m.csv").write_text(text)
+    with pytest.raises(InputError, match=wanted) as error:
+        read_motion(tmp_path / "m.csv")
+    assert str(error.value).startswith(str(tmp_path / "m.csv"))
+
+
+def test_yaml_as_ros2_topic_echo_prints_it(tmp_path: Path) -> None:
+    (tmp_path / "m.yaml").write_text(
+        "header:\n  stamp: {sec: 0, nanosec: 0}\n  frame_id: ''\njoint_names: [a, b]\npoints:\n"
+        "- positions: [0.0, 1.0]\n  velocities: []\n  accelerations: []\n  effort: []\n"
+        "  time_from_start: {sec: 0, nanosec: 500000000}\n---\n"
+    )
+    found = read_motion(tmp_path / "m.yaml")
+    assert found.joint_names == ("a", "b")
+    assert found.velocities is None
+
+
+def test_a_motion_alone_says_what_it_solves() -> None:
+    names = [f"panda_joint{i}" for i in range(1, 8)] + ["panda_finger_joint1", "panda_finger_joint2"]
+    motion = recorded(names, [[*START, 0.01, 0.02], [*GOAL, 0.01, 0.02]])
+    problem = own_problem(motion, rd.load_robot("panda"), Scene())
+    assert problem.robot.locked == {"panda_finger_joint1": 0.01, "panda_finger_joint2": 0.02}
+    assert fitted(motion, problem.robot).motion.positions[-1].tolist() == GOAL
+
+
+def test_unknown_endings_list_the_known_ones(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"unknown motion format to write '\.foo'; known: \.mcap"):
+        write_motion(*planned, tmp_path / "m.foo")
+    with pytest.raises(InputError, match=r"unknown motion format '\.foo'; known: \.csv"):
+        read_motion(tmp_path / "m.foo")
+    with pytest.raises(InputError, match="does not exist"):
+        write_motion(*planned, tmp_path / "none" / "m.mcap")
+
+
+@pytest.mark.parametrize(
+    ("module", "package", "extra"),
+    [
+        ("rosbags", "rosbags", "ros"),
+        ("mcap", "mcap", "ros"),
+        ("rerun", "rerun-sdk", "rerun"),
+        ("roslibpy", "roslibpy", "ros"),
+    ],
+)
+def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: str) -> None:
+    import subprocess
+    import sys
+
+    modules = {"rosbags": "bag", "mcap": "mcap_file", "rerun": "rerun_file", "roslibpy": "rosbridge"}
+    code = (
+        f"import sys; sys.modules[{module!r}] = None\n"
+        f"try: import robotdiffuse.interop.{modules[module]}\nexcept ValueError as error: print(error)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert package in done.stdout, done.stderr
+    assert f'pip install "robotdiffuse[{extra}]"' in done.stdout
+    assert done.stdout.count("\n") == 1
+
+
+@contextmanager
+def rosbridge() -> Iterator[tuple[int, list[dict[str, Any]]]]:
+    """A small server that speaks as much of rosbridge's protocol as publishers need."""
+    from websockets.sync.server import ServerConnection, serve
+
+    heard: list[dict[str, Any]] = []
+
+    def answer(connection: ServerConnection) -> None:
+        heard.extend(json.loads(text) for text in connection)
+
+    with serve(answer, "127.0.0.1", 0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.socket.getsockname()[1], heard
+        server.shutdown()
+
+
+def test_motions_are_published_to_a_rosbridge(planned: tuple[Problem, Trajectory]) -> None:
+    import time
+
+    from robotdiffuse.interop.rosbridge import publish
+
+    _, trajectory = planned
+    with rosbridge() as (port, heard):
+        publish(trajectory, "127.0.0.1", port, "/arm/joint_trajectory")
+        end = time.monotonic() + 10
+        while len(heard) < 2 and time.monotonic() < end:
+            time.sleep(0.01)
+    advertised, published = heard[:2]
+    assert (advertised["op"], advertised["type"]) == ("advertise", "trajectory_msgs/msg/JointTrajectory")
+    assert (published["op"], published["topic"]) == ("publish", "/arm/joint_trajectory")
+    assert published["msg"] == joint_trajectory(trajectory.joint_names, trajectory)
+    found = fitted(motion_of(published["msg"], "it"), rd.load_robot("panda")).motion
+    np.testing.assert_array_equal(found.positions, trajectory.positions)
+
+
+def test_no_rosbridge_is_one_line(planned: tuple[Problem, Trajectory]) -> None:
+    from robotdiffuse.interop.rosbridge import publish
+
+    with pytest.raises(InputError, match=r"no rosbridge answers at 127\.0\.0\.1:1 within 1 s"):
+        publish(planned[1], "127.0.0.1", 1, timeout=1.0)

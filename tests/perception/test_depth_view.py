@@ -1,0 +1,132 @@
+"""Depth views: points of pixels by hand, clouds as images, what is refused; files of images and clouds."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.perception.depth_view import DepthView, SeenPoints
+from robotdiffuse.perception.depth_view_files import read_depth, read_views, view_entry
+from robotdiffuse.scenes.surface_points import sample_surface
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, transform
+
+K = (50.0, 50.0, 31.5, 23.5)
+T = transform(np.array([1.5, 0.2, 0.8]), rotation_about(np.array([0.6, 0.0, 0.8]), 1.1))
+
+
+def test_points_of_pixels() -> None:
+    depth = np.zeros((48, 64))
+    depth[10, 20], depth[0, 0], depth[1, 1], depth[2, 2] = 2.0, np.nan, np.inf, -1.0
+    view = DepthView(depth, K, T)
+    by_hand = T @ [(20 - 31.5) / 50 * 2, (10 - 23.5) / 50 * 2, 2.0, 1.0]
+    assert np.allclose(view.points(), by_hand[:3])
+
+
+def test_a_cloud_becomes_the_image_that_its_camera_had() -> None:
+    """From a dense cloud of two walls, the nearer one hides the other; the points themselves are kept."""
+    u, v = np.meshgrid(np.linspace(-0.5, 0.5, 200), np.linspace(-0.4, 0.4, 160))
+    near, far = (np.stack([u * z, v * z, np.full_like(u, z)], -1).reshape(-1, 3) for z in (1.0, 2.0))
+    points = np.concatenate([far, near[: len(near) // 2]]) @ T[:3, :3].T + T[:3, 3]
+    view = DepthView.from_cloud(points, T)
+    h, w = view.depth.shape
+    assert view.points() is points and h * w <= 320 * 240
+    upper, lower = view.depth[2 : h // 2 - 2, 2:-2], view.depth[h // 2 + 2 : -2, 2:-2]
+    for half, z in ((upper, 1.0), (lower, 2.0)):
+        assert np.mean(half > 0) > 0.6 and np.allclose(half[half > 0], z, atol=1e-5)
+    with pytest.raises(InputError, match="none of 10 lies ahead"):
+        DepthView.from_cloud(T[:3, 3] - T[:3, 2] + np.zeros((10, 3)), T)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"depth": np.zeros(5)}, "view.depth is an array of 5"),
+        ({"intrinsics": (0.0, 1.0, 0.0, 0.0)}, "fx and fy must be at least"),
+        ({"intrinsics": (1.0, 1.0)}, "view.intrinsics is .* 4 finite numbers"),
+        ({"T_base_camera": 2 * np.eye(4)}, "it must be a rotation"),
+        ({"configuration": [np.nan]}, "view.configuration"),
+    ],
+)
+def test_what_is_refused(change: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        DepthView(**{"depth": np.ones((4, 4)), "intrinsics": K, "T_base_camera": T} | change)
+
+
+def test_depth_files(tmp_path: Path) -> None:
+    image = np.random.default_rng(0).integers(0, 4000, (6, 8)).astype(np.uint16)
+    Image.fromarray(image).save(tmp_path / "a.png")
+    np.save(tmp_path / "a.npy", image / 1000)
+    np.savez(tmp_path / "a.npz", depth=image, other=image)
+    for name in ("a.png", "a.npy", "a.npz"):
+        assert np.allclose(read_depth(tmp_path / name), image / 1000)
+    assert np.allclose(read_depth(tmp_path / "a.png", 0.0001), image / 10000)
+    Image.fromarray(image.astype(np.uint8)).save(tmp_path / "grey.png")
+    np.save(tmp_path / "colour.npy", np.zeros((4, 4, 3)))
+    (tmp_path / "bad.png").write_bytes(b"no image")
+    for name, message in {
+        "grey.png": "grey with 16 bits",
+        "colour.npy": "holds float64 of 4 x 4 x 3",
+        "bad.png": "cannot be read",
+        "none.png": "does not exist",
+        "a.jpg": "unknown depth image format",
+    }.items():
+        with pytest.raises(InputError, match=message):
+            read_depth(tmp_path / name)
+
+
+def test_openexr_depth(tmp_path: Path) -> None:
+    OpenEXR = pytest.importorskip("OpenEXR")
+    image = np.random.default_rng(0).random((6, 8)).astype(np.float32)
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, {"Z": OpenEXR.Channel(image)}).write(str(tmp_path / "a.exr"))
+    assert np.array_equal(read_depth(tmp_path / "a.exr"), image)
+
+
+def test_views_survive_their_files(tmp_path: Path) -> None:
+    image = np.full((6, 8), 1500, np.uint16)
+    Image.fromarray(image).save(tmp_path / "a.png")
+    points = np.random.default_rng(0).random((50, 3)) + T[:3, 3] + 3 * T[:3, 2]
+    np.save(tmp_path / "cloud.npy", points)
+    camera = {"xyz": T[:3, 3].tolist(), "wxyz": quaternion_from_rotation(T[:3, :3]).tolist()}
+    entries = [
+        {"depth": "a.png", "scale": 0.002, "intrinsics": list(K), "camera": camera},
+        {"cloud": "cloud.npy", "camera": camera, "configuration": [0.5, 1.0]},
+    ]
+    views, _ = read_views(entries, tmp_path)
+    assert np.allclose(views[0].depth, 3.0) and views[1].cloud is not None
+    written = [view_entry(view, tmp_path) for view in views]
+    assert [w["depth" if "depth" in w else "cloud"] for w in written] == ["a.png", "cloud.npy"]
+    inline = [DepthView(views[0].depth, K, T), DepthView.from_cloud(points, T)]
+    for view in (
+        *read_views(written, tmp_path)[0],
+        *read_views([view_entry(v, None) for v in inline], tmp_path)[0],
+    ):
+        twin = views[0] if view.cloud is None else views[1]
+        assert np.array_equal(view.depth, twin.depth) and np.allclose(view.points(), twin.points())
+        assert np.allclose(view.T_base_camera, T)
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ({"depth": "a.png", "camera": {}}, r"views\[0\] has no intrinsics"),
+        ({"cloud": "a.ply", "camera": {}, "scale": 1}, r"unknown field of views\[0\]"),
+        ({"cloud": "a.ply", "camera": {"xyz": [0, 0, 0]}}, r"views\[0\].camera has no wxyz"),
+        ({"cloud": "a.ply", "camera": {"xyz": [0, 0], "wxyz": [1, 0, 0, 0]}}, r"views\[0\]: camera.xyz"),
+        ({"cloud": "a.ply", "camera": {"xyz": [0, 0, 0], "wxyz": [1, 0, 0, 0]}}, "a.ply does not exist"),
+        ("a.png", r"views\[0\] is 'a.png'"),
+    ],
+)
+def test_what_is_wrong_in_a_file(entry: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read_views([entry], Path())
+
+
+def test_points_that_were_seen_are_sampled_as_a_cloud() -> None:
+    """The network was asked for a scene with a kind of point cloud, and its surface looked for a mesh."""
+    points = np.random.default_rng(0).uniform(0.2, 0.5, (50, 3))
+    found = sample_surface(Scene([SeenPoints(points, 0.01)]), 20, np.random.default_rng(1))
+    assert len(found) == 20 and all((point == points).all(axis=1).any() for point in found)

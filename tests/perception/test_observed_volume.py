@@ -1,0 +1,157 @@
+"""What depth views tell of the space: views made by hand, a wall most of all."""
+
+import numpy as np
+import pytest
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose, placed_spheres
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
+
+PANDA = load_robot("panda")
+HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+AWAY = np.array([3.0, 0.0, 0.0, -0.1, 0.0, 1.571, 0.785])
+"""The arm stretched upwards, out of the way of what these views look at."""
+WIDTH, HEIGHT, FOCAL = 320, 240, 262.0
+WALL = 0.83
+"""Where the wall stands: x = 1.6 - WALL in the base frame [m]."""
+
+
+def camera(x: float = 1.6, y: float = 0.0, z: float = 0.5, back: bool = False) -> np.ndarray:
+    """T_base_camera: looking along -x; from behind, along x."""
+    T = np.eye(4)
+    sign = -1.0 if back else 1.0
+    T[:3, :3] = np.array([[0, 0, -sign], [sign, 0, 0], [0, -1, 0]])
+    T[:3, 3] = x, y, z
+    return T
+
+
+def view(depth: np.ndarray, T: np.ndarray | None = None, q: np.ndarray = AWAY) -> DepthView:
+    intrinsics = (FOCAL, FOCAL, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+    return DepthView(depth, intrinsics, camera() if T is None else T, q)
+
+
+def flat(depth: float) -> np.ndarray:
+    return np.full((HEIGHT, WIDTH), depth, np.float32)
+
+
+def centers() -> np.ndarray:
+    return np.stack(np.meshgrid(*(np.arange(n) for n in SHAPE), indexing="ij"), -1) * VOXEL + VOXEL / 2 + LOW
+
+
+def ahead(seen: ObservedVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Along x, right ahead of the camera: the places of the voxels, occupied, free, behind."""
+    j, k = (int((at - low) / VOXEL) for at, low in zip((0.01, 0.51), LOW[1:], strict=True))
+    return centers()[:, j, k, 0], seen.occupied[:, j, k], seen.free[:, j, k], seen.behind[:, j, k]
+
+
+def test_before_a_wall_is_free_on_it_occupied_and_behind_unknown() -> None:
+    seen = observe([view(flat(WALL))], PANDA, AWAY)
+    x, occupied, free, behind = ahead(seen)
+    wall = 1.6 - WALL
+    np.testing.assert_array_equal(occupied, np.abs(x - wall) < VOXEL / 2)
+    np.testing.assert_array_equal(free, x > wall + VOXEL / 2)
+    hidden = x < wall - VOXEL / 2
+    np.testing.assert_allclose(behind[hidden], (wall - x)[hidden], atol=1e-5)
+    assert (behind[~hidden] == 0).all()
+    assert not (seen.free & seen.occupied).any()
+
+
+def test_what_is_beside_the_image_is_out_of_view() -> None:
+    seen = observe([view(flat(WALL))], PANDA, AWAY)
+    away = centers() - (1.6, 0.0, 0.5)
+    slopes = np.abs(away[..., 1:]) / -away[..., :1]
+    half = np.array([WIDTH / 2, HEIGHT / 2]) / FOCAL
+    np.testing.assert_array_equal(seen.out_of_view, ((slopes > half) | (away[..., :1] >= 0)).any(axis=-1))
+    assert (seen.unknown | seen.free | seen.occupied).all() and not seen.free[seen.out_of_view].any()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_free_voxels_hold_no_point_of_any_pixel(seed: int) -> None:
+    """Of random discs before a wall: neither do points lie in free voxels, nor does a disc hide a corner."""
+    rng = np.random.default_rng(seed)
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    depth = flat(2.5)
+    for _ in range(30):
+        a, b, r = rng.uniform(0, WIDTH), rng.uniform(0, HEIGHT), rng.uniform(3, 40)
+        depth[(u - a) ** 2 + (v - b) ** 2 < r * r] = rng.uniform(0.6, 2.4)
+    seen = observe([view(depth)], PANDA, AWAY)
+    points = view(depth).points()
+    index = np.floor((points - LOW) / VOXEL).astype(int)
+    inside = ((index >= 0) & (index < SHAPE)).all(axis=1)
+    assert not seen.free[tuple(index[inside].T)].any()
+    corners = np.stack(np.meshgrid(*[[-0.499, 0.499]] * 3, indexing="ij"), -1).reshape(-1, 3) * VOXEL
+    places = (centers()[seen.free][:, None] + corners).reshape(-1, 3)
+    away = places - (1.6, 0.0, 0.5)
+    at = np.rint(np.stack([away[:, 1], -away[:, 2]], 1) / -away[:, :1] * FOCAL + [159.5, 119.5]).astype(int)
+    at = at.clip(0, (WIDTH - 1, HEIGHT - 1))
+    hidden = depth[at[:, 1], at[:, 0]] <= -away[:, 0]
+    assert hidden.mean() < 1e-4, "but for single pixels between two surfaces, which count as flying"
+
+
+def test_several_views_add_up() -> None:
+    front, back = view(flat(WALL)), view(flat(0.82), camera(x=-1.6, back=True))
+    both = observe([front, back], PANDA, AWAY)
+    for one in (observe([front], PANDA, AWAY), observe([back], PANDA, AWAY)):
+        assert both.occupied[one.occupied].all()
+        assert (both.free | both.occupied)[one.free].all()
+    x, occupied, free, behind = ahead(both)
+    assert occupied.sum() == 2 and free[x > 0.8].all() and free[x < -0.81].all()
+    between = ~occupied & ~free
+    least = np.minimum(x + 0.78, 0.77 - x)
+    np.testing.assert_allclose(behind[between], least[between], atol=1e-5)
+
+
+def test_the_arm_is_no_obstacle_and_casts_a_shadow() -> None:
+    spheres = placed_spheres(PANDA, HOME)
+    T = camera()
+    local = (spheres[:, :3] - T[:3, 3]) @ T[:3, :3]
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    rays = np.stack([(u - (WIDTH - 1) / 2) / FOCAL, (v - (HEIGHT - 1) / 2) / FOCAL, np.ones(u.shape)], -1)
+    depth = flat(2.2)
+    for center, radius in zip(local, spheres[:, 3], strict=True):  # by hand: |d ray - center| = radius
+        a, b = (rays**2).sum(-1), rays @ center
+        under = b * b - a * (center @ center - radius**2)
+        depth = np.where(under > 0, np.minimum(depth, (b - np.sqrt(np.maximum(under, 0))) / a), depth)
+    arm = depth < 2.19
+    assert arm.any()
+    seen = observe([view(depth.astype(np.float32), q=HOME)], PANDA, AWAY)
+    assert {*np.nonzero(seen.occupied)[0]} == {int((1.6 - 2.2 - LOW[0]) / VOXEL)}, "the wall behind alone"
+    elsewhere = observe([view(depth.astype(np.float32), q=AWAY)], PANDA, AWAY)
+    assert elsewhere.occupied.sum() > 50, "with the arm elsewhere, the points are an obstacle's"
+    hand = link_pose(PANDA, HOME, "panda_hand")[:3, 3]
+    along = (hand - T[:3, 3]) * 1.4 + T[:3, 3]
+    assert seen.shadow[tuple(((along - LOW) / VOXEL).astype(int))]
+    assert not (seen.shadow & (seen.free | seen.occupied)).any()
+
+
+def test_a_pixel_that_saw_nothing_in_range_is_free_and_one_without_return_says_nothing() -> None:
+    nothing = observe([view(flat(np.inf))], PANDA, AWAY)
+    assert nothing.free.any() and not nothing.occupied.any() and (nothing.behind == 0).all()
+    for lost in (0.0, np.nan, -1.0):
+        blind = observe([view(flat(lost))], PANDA, AWAY)
+        assert blind.unknown.all() and not blind.shadow.any() and (blind.behind == 0).all()
+
+
+def test_missing_returns_and_flying_pixels_change_little() -> None:
+    rng = np.random.default_rng(1)
+    clean = flat(WALL)
+    clean[:, :100] = 2.0
+    clean[:, 100:160] = 1.2
+    exact = observe([view(clean)], PANDA, AWAY)
+    flying, lost = clean.copy(), clean.copy()
+    flying[:, 100] = rng.uniform(1.3, 1.9, HEIGHT)
+    lost[rng.random(lost.shape) < 0.05] = 0
+    for image in (flying, lost):
+        seen = observe([view(image)], PANDA, AWAY)
+        assert not (seen.occupied & ~exact.occupied).any()
+        assert (exact.occupied & ~seen.occupied).mean() < 1e-3
+        assert (seen.free & ~exact.free).mean() < 1e-3 and (exact.free & ~seen.free).mean() < 1e-2
+
+
+def test_no_views_and_another_robots_configuration_are_refused() -> None:
+    with pytest.raises(InputError, match="views is empty"):
+        observe([], PANDA, HOME)
+    with pytest.raises(InputError, match="has 3 numbers; panda plans 7"):
+        observe([view(flat(1.0), q=np.zeros(3))], PANDA, HOME)

@@ -1,0 +1,153 @@
+"""Depth images by rays: they lie on the surfaces, nothing nearer is missed, and another renderer agrees."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.ray_caster import FAR, DepthNoise, looking_at, ray_cast, voxels_within
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+
+PANDA = load_robot("panda")
+SIZE = (64, 48)
+INTRINSICS = (60.0, 60.0, 31.5, 23.5)
+
+
+def distance(shape: Shape, points: np.ndarray) -> np.ndarray:
+    """Signed, by the formulas of each shape."""
+    if isinstance(shape, Sphere):
+        return np.linalg.norm(points - shape.center, axis=-1) - shape.radius
+    assert isinstance(shape, Box | Cylinder | Capsule)
+    local = (points - shape.center) @ shape.rotation
+    if isinstance(shape, Box):
+        beyond = np.abs(local) - shape.size / 2
+    elif isinstance(shape, Capsule):
+        along = np.maximum(np.abs(local[..., 2]) - shape.height / 2, 0)
+        return np.hypot(np.linalg.norm(local[..., :2], axis=-1), along) - shape.radius
+    else:
+        around = np.linalg.norm(local[..., :2], axis=-1) - shape.radius
+        beyond = np.stack([around, np.abs(local[..., 2]) - shape.height / 2], axis=-1)
+    return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(axis=-1), 0)
+
+
+def random_scene(rng: np.random.Generator, count: int = 6) -> Scene:
+    shapes: list[Shape] = []
+    for kind in rng.integers(4, size=count):
+        center, (a, b, c), wxyz = rng.uniform(-0.6, 0.6, 3), rng.uniform(0.05, 0.4, 3), rng.normal(size=4)
+        shapes.append(
+            [Sphere(center, a), Box(center, (a, b, c), wxyz), Cylinder(center, a / 2, b, wxyz)][kind]
+            if kind < 3
+            else Capsule(center, a / 2, b, wxyz)
+        )
+    return Scene(shapes)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000))
+def test_points_lie_on_surfaces_and_nothing_is_nearer(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = random_scene(rng)
+    position = rng.normal(size=3)
+    position *= rng.uniform(1.3, 2.2) / np.linalg.norm(position)
+    T = looking_at(position, rng.uniform(-0.3, 0.3, 3), rng.uniform(-3, 3))
+    view = ray_cast(scene, T, INTRINSICS, SIZE)
+    points = view.points()
+    nearest = np.min([distance(shape, points) for shape in scene.shapes], axis=0)
+    assert np.abs(nearest).max(initial=0) < 5e-5, "float32, at 2 m"
+    # along each ray, up to the surface or to the end, everything is outside of all shapes
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+    fx, fy, cx, cy = INTRINSICS
+    rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
+    ends = np.minimum(view.depth, FAR) - 1e-4
+    between = position + (ends[..., None] * rays)[..., None, :] * np.linspace(0.02, 1, 60)[:, None]
+    assert min(distance(shape, between).min() for shape in scene.shapes) > -5e-5
+
+
+def test_the_arm_is_its_covering_spheres() -> None:
+    q = np.array([0.3, -0.5, 0.0, -2.0, 0.0, 1.5, 0.8])
+    T = looking_at(np.array([1.5, 0.5, 0.6]), np.array([0.0, 0.0, 0.4]))
+    view = ray_cast(Scene(), T, INTRINSICS, SIZE, PANDA, q)
+    spheres = placed_spheres(PANDA, q)
+    gaps = np.linalg.norm(view.points()[:, None] - spheres[:, :3], axis=-1) - spheres[:, 3]
+    assert len(gaps) > 100 and np.abs(gaps.min(axis=1)).max() < 2e-5
+    assert view.configuration is not None and (view.configuration == q).all()
+
+
+def test_cameras_look_where_they_are_told_and_stand_upright() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        position, target = rng.normal(size=(2, 3))
+        T = looking_at(position, target)
+        np.testing.assert_allclose(T[:3, :3].T @ T[:3, :3], np.eye(3), atol=1e-12)
+        assert np.linalg.det(T[:3, :3]) > 0 and T[2, 1] < 0 and abs(T[2, 0]) < 1e-12
+        along = T[:3, :3].T @ (target - position)
+        np.testing.assert_allclose(along[:2], 0, atol=1e-12)
+        assert along[2] > 0
+    down = looking_at(np.array([0.4, 0.0, 1.5]), np.array([0.4, 0.0, 0.0]))
+    np.testing.assert_allclose(down[:3, :3], [[0, -1, 0], [-1, 0, 0], [0, 0, -1]], atol=1e-12)
+
+
+def test_pybullets_camera_sees_the_same() -> None:
+    pytest.importorskip("pybullet")
+    from robotdiffuse.simulation.camera import DepthCamera, render
+    from robotdiffuse.simulation.world import World
+
+    q = np.array([0.3, -0.5, 0.0, -2.0, 0.0, 1.5, 0.8])
+    scene = Scene(
+        [Box((0.5, 0.1, 0.2), (0.2, 0.3, 0.4), (0.9, 0.1, 0.2, 0.3)), Sphere((0.2, 0.5, 0.5), 0.15)]
+    )
+    camera = DepthCamera((1.4, 0.6, 0.9), (0.3, 0.1, 0.3), width=160, height=120)
+    with World(PANDA, scene, look=True) as world:
+        world.place(q)
+        image = render(world, camera)
+    focal = camera.height / 2 / np.tan(camera.field_of_view / 2)
+    T = looking_at(np.array(camera.position), np.array(camera.target))
+    # PyBullet samples at the lower left corner of its pixels: see simulation.camera.PIXEL
+    view = ray_cast(scene, T, (focal, focal, 80.0, 59.0), (160, 120))
+    both = (image.labels > 0) & np.isfinite(view.depth)
+    off = np.abs(image.depth[both] - view.depth[both])
+    assert both.sum() > 1500 and np.median(off) < 1e-3 and np.mean(off > 0.01) < 0.02, "but at edges"
+    alone = (image.labels < 0) & np.isfinite(view.depth)
+    assert alone.mean() < 0.01
+
+
+def test_noise_is_as_its_settings_say() -> None:
+    rng = np.random.default_rng(1)
+    depth = np.full((200, 300), 2.0, np.float32)
+    depth[:, 150:] = 1.0
+    depth[:20] = np.inf
+    view = DepthView(depth, (300.0, 300.0, 150.0, 100.0), np.eye(4))
+    noisy = DepthNoise(spread=0.003, missing=0.05, flying=0.0).applied(view, rng).depth
+    missing, near, far = noisy == 0, noisy[20:, 150:], noisy[20:, :150]
+    assert abs(missing.mean() - 0.05) < 0.005
+    for part, at in ((near[near > 0], 1.0), (far[far > 0], 2.0)):
+        assert abs(part.std() / (0.003 * at**2) - 1) < 0.03 and abs(part.mean() - at) < 1e-3
+    assert not np.isfinite(noisy[:20][~missing[:20]]).any()
+    flying = DepthNoise(spread=0.0, missing=0.0, flying=0.4).applied(view, rng).depth[20:]
+    between = (flying > 1.001) & (flying < 1.999)
+    assert not np.delete(between, 149, axis=1).any() and 0.3 < between[:, 149].mean() < 0.5
+    same = DepthNoise(spread=0.0, missing=0.0, flying=0.0).applied(view, rng).depth
+    np.testing.assert_array_equal(same, depth)
+    with pytest.raises(InputError, match="missing is 1"):
+        DepthNoise(missing=1.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_voxels_that_hold_obstacles(seed: int) -> None:
+    scene = random_scene(np.random.default_rng(seed))
+    low, voxel, shape = (-0.5, -0.6, -0.4), 0.04, (20, 25, 22)
+    found = voxels_within(scene, low, voxel, shape, 0.01)
+    centers = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1) * voxel + voxel / 2 + low
+    nearest = np.min([distance(one, centers) for one in scene.shapes], axis=0)
+    sure = np.abs(nearest - 0.01) > 1e-5
+    np.testing.assert_array_equal(found[sure], (nearest <= 0.01)[sure])
+
+
+def test_what_rays_do_not_know_is_refused() -> None:
+    with pytest.raises(InputError, match="point_cloud is a point_cloud; only spheres, boxes"):
+        ray_cast(Scene([PointCloud(np.zeros((1, 3)))]), np.eye(4), INTRINSICS, SIZE)

@@ -1,0 +1,140 @@
+"""What views add to a problem: points on obstacles alone, whatever noise, arm and known shapes."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float
+from numpy import ndarray
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.perception.seen_points import ARM, BARE_RADIUS, POINT_RADIUS, VOXEL, seen_points
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.perception.depth_view import DepthView, SeenPoints
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.core.transforms import transform
+
+PANDA = load_robot("panda")
+START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+GOAL = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+BALL = Sphere([0.6, 0.0, 0.5], 0.15)
+K = (150.0, 150.0, 79.5, 59.5)
+T = transform(np.array([2.0, 0.0, 0.5]), np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
+
+
+def picture(spheres: Float[ndarray, "n 4"]) -> Float[ndarray, "h w"]:
+    """Depth of spheres from T, pixel by pixel; 0 where there is none."""
+    v, u = np.mgrid[:120, :160]
+    rays = np.stack([(u - K[2]) / K[0], (v - K[3]) / K[1], np.ones_like(u)], -1) @ T[:3, :3].T
+    depth = np.full(u.shape, np.inf)
+    square = (rays**2).sum(-1)
+    for *centre, radius in spheres:
+        away = np.array(centre) - T[:3, 3]
+        along = rays @ away / square
+        rest = radius**2 - (away @ away - along**2 * square)
+        with np.errstate(invalid="ignore"):
+            hit = along - np.sqrt(rest / square)
+        depth = np.where(rest > 0, np.fmin(depth, hit), depth)
+    return np.where(np.isfinite(depth), depth, 0.0)
+
+
+BALL_ROW = np.array([[*BALL.center, BALL.radius]])
+
+
+def view(spheres: Float[ndarray, "n 4"], configuration: ndarray | None = None) -> DepthView:
+    return DepthView(picture(spheres), K, T, configuration)
+
+
+def test_points_lie_on_what_was_seen_and_cover_it() -> None:
+    seen = view(BALL_ROW)
+    points = seen_points([seen], PANDA, START)
+    assert np.abs(np.linalg.norm(points - BALL.center, axis=1) - BALL.radius).max() < 0.004
+    gaps = np.linalg.norm(seen.points()[:, None] - points[None], axis=2).min(axis=1)
+    assert len(points) < len(seen.points()) and gaps.max() < VOXEL * np.sqrt(3)
+
+
+def test_the_arm_is_filtered_as_it_stood_then() -> None:
+    for q, told in ((START, None), (GOAL, GOAL)):
+        arm = placed_spheres(PANDA, q)
+        points = seen_points([view(np.concatenate([arm, BALL_ROW]), told)], PANDA, START)
+        to_arm = np.linalg.norm(points[:, None] - arm[None, :, :3], axis=2) - arm[:, 3]
+        assert len(points) and to_arm.min() > ARM - VOXEL
+        assert np.abs(np.linalg.norm(points - BALL.center, axis=1) - BALL.radius).max() < 0.004
+    assert len(seen_points([view(placed_spheres(PANDA, GOAL), START)], PANDA, START)) > 100
+
+
+def test_flying_pixels_are_removed() -> None:
+    """At the edge between the ball and a wall behind it, pixels anywhere between the two are no points."""
+    depth = picture(BALL_ROW)
+    depth[depth == 0] = 2.4
+    edge = np.argwhere(np.diff((depth < 2).astype(int), axis=1) == 1)
+    depth[edge[:, 0], edge[:, 1]] = np.random.default_rng(0).uniform(1.6, 2.2, len(edge))
+    points = seen_points([DepthView(depth, K, T)], PANDA, START)
+    between = (points[:, 0] > -0.3) & (points[:, 0] < 0.5)
+    assert len(edge) > 20 and between.sum() < 0.15 * len(edge)
+
+
+def test_clouds_and_several_views_add_up() -> None:
+    seen = view(BALL_ROW)
+    cloud = DepthView.from_cloud(seen.points(), T)
+    one, both = seen_points([seen], PANDA, START), seen_points([seen, cloud], PANDA, START)
+    assert len(one) == len(both) and np.linalg.norm(one[:, None] - both, axis=2).min(axis=1).max() < 1e-5
+    many = DepthView.from_cloud(np.random.default_rng(0).uniform(-1, 1, (60_000, 3)), T)
+    assert len(seen_points([many], PANDA, START, 0.005)) > 40_000
+
+
+def test_the_scene_is_what_is_known_and_what_was_seen() -> None:
+    floor = Box([0.0, 0.0, -0.05], [3.0, 3.0, 0.1], name="floor")
+    problem = Problem(PANDA, Scene([floor]), START, GOAL, views=[view(BALL_ROW)], unseen="padded")
+    assert [shape.name for shape in problem.scene.shapes] == ["floor", "seen"]
+    assert problem.known_scene.shapes == (floor,)
+    again = replace(problem, unseen="occupied")
+    assert len(again.scene.shapes) == 2 and again.views == problem.views
+    known = Problem(PANDA, Scene([BALL]), START, GOAL, views=[view(BALL_ROW)])
+    assert known.scene.shapes == (BALL,)
+
+
+def test_points_that_an_end_is_near_are_bare() -> None:
+    """A goal close to an obstacle stays valid: what is added to points for safety must not end it."""
+    sphere = placed_spheres(PANDA, GOAL)[-1]
+    near = np.array([[sphere[0] + sphere[3] + 0.105, *sphere[1:3], 0.1]])
+    problem = Problem(PANDA, Scene(), START, GOAL, views=[view(near)])
+    radii = {s.name: s.point_radius for s in problem.scene.shapes if isinstance(s, SeenPoints)}
+    assert radii == {"seen": POINT_RADIUS, "seen_at_ends": BARE_RADIUS}
+
+
+def test_files_keep_views_and_policy(tmp_path: Path) -> None:
+    problem = Problem(PANDA, Scene(), START, GOAL, views=[view(BALL_ROW, START)], unseen="imagined")
+    save_problem(problem, tmp_path / "problem.json")
+    for again in (load_problem(tmp_path / "problem.json"), problem_from_record(problem_record(problem))):
+        assert again.unseen == "imagined" and np.array_equal(again.views[0].depth, problem.views[0].depth)
+        assert np.array_equal(again.views[0].configuration, START)  # type: ignore[arg-type]
+        [old], [new] = problem.scene.shapes, again.scene.shapes
+        assert np.allclose(old.points, new.points)  # type: ignore[attr-defined]
+    assert "views" not in problem_record(Problem(PANDA, Scene(), START, GOAL))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"unseen": "hopeful"}, "unknown policy in unseen: 'hopeful'; known: imagined, occupied"),
+        ({"views": 3}, "views is 3"),
+        ({"views": [view(BALL_ROW, np.zeros(3))]}, r"views\[0\].configuration has 3 values; panda has 7"),
+    ],
+)
+def test_what_is_refused(fields: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Problem(PANDA, Scene(), START, GOAL, **fields)
+
+
+def test_what_the_arm_holds_is_not_seen_as_an_obstacle() -> None:
+    held = PANDA.attach(Box([0, 0, 0.2], [0.1, 0.1, 0.15], name="parcel"), "panda_hand")
+    spheres = placed_spheres(held, START)
+    alone = DepthView(picture(spheres), K, T)
+    assert not len(seen_points([alone], held, START))
+    assert len(seen_points([alone], PANDA, START)), "the bare arm sees the parcel"

@@ -1,0 +1,432 @@
+"""The diffusion prior of MPD and EDMP, their guides, and the planners around it.
+
+The planners are tested with a prior whose denoiser has a closed form: bumps of a Gaussian process around the
+straight line. So the tests need no trained weights.
+"""
+
+import json
+import os
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from scipy.interpolate import CubicSpline
+from torch import Tensor
+
+from helpers.motion_stores import random_motions, write_motions
+from robotdiffuse.cli import main
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.checkpoint import load_network, save_network
+from robotdiffuse.learning.denoisers.unet import UNetSettings
+from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.batches import Batches, TrajectoryData
+from robotdiffuse.learning.training.configs import planner_training
+from robotdiffuse.learning.training.planner import _Loss, _model_settings
+from robotdiffuse.learning.training.processes import Processes
+from robotdiffuse.learning.training.validation import planning_success
+from robotdiffuse.planning.baselines.edmp import EDMP, ENSEMBLE, EDMPSettings, GuideSettings, quadratic_levels
+from robotdiffuse.planning.baselines.guided_prior import collision_gradient, sample, shared_out
+from robotdiffuse.planning.baselines.mpd import (
+    MPD,
+    MPDSettings,
+    exponential_levels,
+    gaussian_process,
+    state_precision,
+)
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify, verify_trajectory
+
+PANDA = load_robot("panda")
+RANGES = RobotIdentity.of(PANDA)
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
+PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
+CHECKER = CollisionChecker(PANDA, PROBLEM.scene)
+TRAINING = planner_training("trajectory_prior", {"data": "", "batch": 16, "samples": 640})
+SMALL = replace(
+    _model_settings(TRAINING, None), denoiser_settings=UNetSettings(16, (1, 2), condition_width=16)
+)
+WAYPOINTS = 48
+
+
+def bumps(waypoints: int) -> Float[ndarray, "inner inner"]:
+    """Covariance of smooth bumps over the inner waypoints, in normalised joint values."""
+    t = np.linspace(0, 1, waypoints)[1:-1, None]
+    waves = np.concatenate([0.25 / k * np.sin(np.pi * k * t) for k in (1, 2, 3)], 1)
+    return waves @ waves.T + 1e-6 * np.eye(waypoints - 2)
+
+
+class Gaussian(MotionModel):
+    """The exact denoiser of straight lines with such bumps."""
+
+    def denoise(
+        self,
+        features: Float[Tensor, "batch rows features"],
+        level: Float[Tensor, "batch"],
+        condition: Float[Tensor, "batch condition"],
+        dropped: Bool[Tensor, "batch"] | None = None,
+    ) -> Float[Tensor, "batch rows dof"]:
+        at, x = round(float(level[0]) * self.schedule.steps), features.numpy()
+        signal, noise = float(self.schedule.signal[at]), float(self.schedule.noise[at])
+        inner, t = x[:, 1:-1].astype(np.float64), np.linspace(0, 1, x.shape[1])[1:-1, None]
+        line = (1 - t) * x[:, :1] + t * x[:, -1:]
+        total = signal**2 * bumps(x.shape[1]) + noise**2 * np.eye(x.shape[1] - 2)
+        seen = noise * np.linalg.solve(total, inner - signal * line)
+        return torch.nn.functional.pad(torch.from_numpy(seen.astype(np.float32)), (0, 0, 1, 1))
+
+
+@pytest.fixture(scope="module")
+def gaussian() -> Gaussian:
+    return Gaussian(RANGES, SMALL)
+
+
+def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
+    """Lines with bumps, a third of them called trivial, around one ball."""
+    rng = np.random.default_rng(1)
+    t = np.linspace(0, 1, waypoints)[:, None]
+    middle, half = (PANDA.lower + PANDA.upper) / 2, (PANDA.upper - PANDA.lower) / 2
+    ends = middle + half * rng.uniform(-0.6, 0.6, (2, count, 1, PANDA.dof))
+    q = (1 - t) * ends[0] + t * ends[1] + 0.3 * np.sin(np.pi * t) * rng.normal(size=(count, 1, PANDA.dof))
+    scenes = PackedScenes.pack([Scene([BALL])] * count, 1)
+    return TrajectoryData(q.astype(np.float32), scenes, np.arange(count) % 3 == 0, None, "x", 0)
+
+
+def stay(q: ndarray, _left: int) -> ndarray:
+    """No guide."""
+    return q
+
+
+def test_the_loss_falls() -> None:
+    torch.manual_seed(0)
+    network, data, rng = MotionModel(RANGES, SMALL), data_of(32), np.random.default_rng(0)
+    batches = Batches(data, network, lambda _scenes, _q: np.zeros(0), 0.1, None)
+    loss_of = _Loss(network, PANDA, TRAINING, Processes("cpu"))
+    optimizer = torch.optim.AdamW(network.parameters(), lr=4e-3)
+    losses = []
+    for _ in range(40):
+        loss = loss_of(batches.draw(16, rng), 0.0, rng)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    # an untrained network says that there is no noise: the variance of it is 1
+    assert losses[0] == pytest.approx(1.0, abs=0.1)
+    assert np.mean(losses[-5:]) < 0.6
+    assert 0 <= planning_success(network, PANDA, data_of(6), 4, 2, rng) <= 1
+
+
+def test_share_of_trivial_motions() -> None:
+    data, rng = data_of(30), np.random.default_rng(0)
+    drawn = data.draw(4000, 0.2, rng)
+    assert data.trivial[drawn].mean() == pytest.approx(0.2, abs=0.02)
+    assert set(np.unique(drawn)) == set(range(30))
+    for trivial in (np.ones(30, bool), np.zeros(30, bool)):  # of one kind alone
+        assert set(np.unique(replace(data, trivial=trivial).draw(4000, 0.2, rng))) == set(range(30))
+
+
+def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> None:
+    """100 steps without guide; 300 samples of several joints know the variance to a few percent."""
+    starts, goals = (np.repeat(end[None], 300, 0) for end in (LEFT, RIGHT))
+    levels = gaussian.schedule.sampling_levels(100)[:-1]
+    q = sample(gaussian, starts, goals, levels, np.random.default_rng(0), stay)
+    assert q is not None
+    x = gaussian.normalizer.to_unit(q.astype(np.float64))
+    t = np.linspace(0, 1, WAYPOINTS)[:, None]
+    bump = x - ((1 - t) * x[:, :1] + t * x[:, -1:])
+    # joints whose bumps the limits cut off tell nothing about the sampler
+    whole = np.abs(x).max((0, 1)) < 0.99
+    assert whole.sum() >= 2
+    bump = bump[:, 1:-1, whole]
+    variance = np.diag(bumps(WAYPOINTS))
+    assert np.abs(bump.mean((0, 2))).max() < 4 * np.sqrt(variance.max() / (300 * whole.sum()))
+    assert bump.var((0, 2)).mean() == pytest.approx(variance.mean(), rel=0.1)
+
+
+def test_samples_hold_their_ends_exactly() -> None:
+    torch.manual_seed(0)
+    network, rng = MotionModel(RANGES, SMALL), np.random.default_rng(0)
+    starts, goals = (rng.uniform(PANDA.lower, PANDA.upper, (3, PANDA.dof)).astype(np.float32) for _ in "ab")
+
+    def guide(q: ndarray, left: int) -> ndarray:
+        return q + np.float32(0.1 * (left < 2))
+
+    q = sample(network, starts, goals, np.array([255, 100, 20, 1]), rng, guide)
+    assert q is not None and q.dtype == np.float32 and q.shape == (3, WAYPOINTS, PANDA.dof)
+    assert np.array_equal(q[:, 0], starts) and np.array_equal(q[:, -1], goals)
+    assert np.all(q >= PANDA.lower - 1e-5) and np.all(q <= PANDA.upper + 1e-5)
+
+
+def test_the_guide_is_told_the_steps_to_come(gaussian: Gaussian) -> None:
+    told: list[int] = []
+
+    def guide(q: ndarray, left: int) -> ndarray:
+        told.append(left)
+        return q
+
+    ends = LEFT[None], RIGHT[None]
+    sample(gaussian, *ends, np.array([255, 90, 1]), np.random.default_rng(0), guide, quiet_steps=2)
+    assert told == [2, 1, 0, 0, 0]
+    stopped = sample(gaussian, *ends, np.array([255, 1]), np.random.default_rng(0), guide, stop=lambda: True)
+    assert stopped is None and len(told) == 5
+
+
+@pytest.mark.parametrize("levels", [[], [3, 3], [1, 2], [256, 1], [5, 0]])
+def test_levels_must_fall(gaussian: Gaussian, levels: list[int]) -> None:
+    with pytest.raises(InputError, match="must fall from at most 255 to 1"):
+        sample(gaussian, LEFT[None], RIGHT[None], np.array(levels, np.int64), np.random.default_rng(0), stay)
+
+
+@pytest.mark.parametrize("spaced", [exponential_levels, quadratic_levels])
+@pytest.mark.parametrize("steps", [2, 25, 30, 254, 255])
+def test_spaced_levels(spaced, steps: int) -> None:
+    schedule = NoiseSchedule(ScheduleSettings(steps=255))
+    levels = spaced(schedule, steps)
+    assert len(levels) == steps and levels[0] == 255 and levels[-1] >= 1 and np.all(np.diff(levels) < 0)
+    with pytest.raises(InputError, match="between 1 and 255"):
+        spaced(schedule, 256)
+
+
+def test_the_process_is_that_of_natural_splines() -> None:
+    """Its cost is half the least integral of squared accelerations: by SciPy's natural cubic spline."""
+    q = np.random.default_rng(0).normal(size=(3, 12, 2))
+    expected = []
+    for motion in q:
+        second = CubicSpline(np.arange(12), motion, bc_type="natural")(np.arange(12), 2)
+        a, b = second[:-1], second[1:]
+        expected.append(0.5 * ((a * a + a * b + b * b) / 3).sum())
+    assert gaussian_process(12).costs(q) == pytest.approx(expected)
+    line = np.linspace(0, 1, 12)[None, :, None] * np.ones((1, 1, 2))
+    assert gaussian_process(12).costs(line) == pytest.approx([0.0], abs=1e-9)
+
+
+def test_the_precision_is_that_of_the_process() -> None:
+    """Against the covariance of the process propagated from a vague first state."""
+    waypoints, vague = 8, 1e3 * np.eye(2)
+    transition, noise = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
+    covariance = np.zeros((2 * waypoints, 2 * waypoints))
+    covariance[:2, :2] = vague
+    for i in range(1, waypoints):
+        here, before = slice(2 * i, 2 * i + 2), slice(2 * i - 2, 2 * i)
+        covariance[here, : 2 * i] = transition @ covariance[before, : 2 * i]
+        covariance[: 2 * i, here] = covariance[here, : 2 * i].T
+        covariance[here, here] = transition @ covariance[before, before] @ transition.T + noise
+    states = np.linalg.inv(covariance)
+    states[:2, :2] -= np.linalg.inv(vague)
+    assert state_precision(waypoints) == pytest.approx(states, abs=1e-4)
+    positions = np.linalg.inv(covariance[::2, ::2])
+    assert gaussian_process(waypoints).precision == pytest.approx(positions, abs=0.01)
+
+
+def test_gradient_of_the_process() -> None:
+    process, q = gaussian_process(10), np.random.default_rng(0).normal(size=(1, 10, 1))
+    numeric = np.zeros_like(q)
+    for i in range(10):
+        step = np.zeros_like(q)
+        step[0, i] = 1e-4
+        numeric[0, i] = (process.costs(q + step) - process.costs(q - step)) / 2e-4
+    assert process.gradient(q) == pytest.approx(numeric, abs=1e-6)
+
+
+def test_implicit_step_of_the_process() -> None:
+    process, q = gaussian_process(10), np.random.default_rng(0).normal(size=(2, 10, 3))
+    x = process.step(q, 5.0)
+    assert np.array_equal(x[:, [0, -1]], q[:, [0, -1]])
+    assert x[:, 1:-1] == pytest.approx((q - 5.0 * process.gradient(x))[:, 1:-1])
+    assert np.all(process.costs(x) < process.costs(q))
+
+
+def lines(count: int) -> Float[ndarray, "count waypoints dof"]:
+    """From left to right through the ball, with small bumps."""
+    t = np.linspace(0, 1, WAYPOINTS)[:, None]
+    bump = np.sin(np.pi * t) * np.random.default_rng(3).normal(0, 0.1, (count, 1, PANDA.dof))
+    return ((1 - t) * LEFT + t * RIGHT + bump).astype(np.float32)
+
+
+@pytest.mark.parametrize("between", [0, 1, 3])
+def test_gradient_of_the_collision_cost(between: int) -> None:
+    """Along itself; where spheres enter a margin and at corners of boxes it has kinks, hence 3 %."""
+    q = lines(3)
+    costs, gradient = collision_gradient(CHECKER, q, 0.05, 0.01, between)
+    size = np.sqrt((gradient**2).sum((1, 2)))[:, None, None]
+    step = 1e-2 * gradient / size
+    up, _ = collision_gradient(CHECKER, q + step, 0.05, 0.01, between)
+    down, _ = collision_gradient(CHECKER, q - step, 0.05, 0.01, between)
+    assert np.all(costs > 0.1)
+    assert (up - down) / 2e-2 == pytest.approx(size[:, 0, 0], rel=0.03)
+
+
+def test_guidance_lowers_the_collision_cost() -> None:
+    q = lines(12)
+    before, _ = collision_gradient(CHECKER, q, 0.0, 0.0, 0)
+    moved = MPD(MPDSettings()).guided(CHECKER, q)
+    after, _ = collision_gradient(CHECKER, moved, 0.0, 0.0, 0)
+    assert np.all(after < before) and np.array_equal(moved[:, [0, -1]], q[:, [0, -1]])
+    edmp = EDMP(EDMPSettings(samples=12))
+    moved = edmp.guided(CHECKER, q, 0)
+    after, _ = collision_gradient(CHECKER, moved, 0.0, 0.0, 0)
+    assert np.all(after < before) and np.array_equal(moved[:, [0, -1]], q[:, [0, -1]])
+
+
+def test_each_guide_moves_its_share_its_own_way() -> None:
+    edmp = EDMP(EDMPSettings(samples=30))
+    shares = edmp.settings.shares()
+    assert np.array_equal(np.concatenate([np.arange(30)[share] for share in shares]), np.arange(30))
+    assert len(set(ENSEMBLE)) == len(shares) == 12
+    same = np.repeat(lines(1), 30, 0)
+    moved = edmp.guided(CHECKER, same, 10)
+    first = [moved[share][0] for share in shares]
+    for i, one in enumerate(first):
+        assert all(np.array_equal(one, row) for row in moved[shares[i]])
+        assert not any(np.array_equal(one, other) for other in first[:i])
+    # before any guide begins
+    late = EDMP(EDMPSettings(guides=tuple(replace(guide, guided_share=0.4) for guide in ENSEMBLE)))
+    assert np.array_equal(late.guided(CHECKER, same[:24], 12), same[:24])
+
+
+def test_margins_fall_towards_the_last_step() -> None:
+    guide = GuideSettings(between=0, far_margin=0.1, near_margin=0.02, weight=0.1, guided_share=0.5)
+    assert guide.margin(25, 50) is None and guide.margin(0, 50) == pytest.approx(0.02)
+    margins = [guide.margin(left, 50) for left in range(25)]
+    assert margins == sorted(margins, key=lambda margin: margin or 0.0) and (margins[-1] or 1.0) < 0.1
+
+
+def test_goals_take_turns() -> None:
+    goals = np.stack([RIGHT, LEFT + 0.1, LEFT + 0.2])
+    starts, shared = shared_out(LEFT, goals, 8)
+    assert np.all(starts == LEFT) and np.array_equal(shared, np.stack([goals[1], goals[2]] * 4))
+    assert np.all(shared_out(LEFT, goals, 3)[1] == goals[1])
+
+
+@pytest.fixture(params=["mpd", "edmp"])
+def planner(request: pytest.FixtureRequest, gaussian: Gaussian, monkeypatch: pytest.MonkeyPatch):
+    made = MPD() if request.param == "mpd" else EDMP()
+    monkeypatch.setattr(made, "network", lambda _robot: gaussian)
+    return made
+
+
+def test_solved_means_verified(planner: MPD | EDMP) -> None:
+    result = planner.plan(PROBLEM, time_limit=120.0)
+    assert result.solved and result.path is not None and result.trajectory is not None
+    assert result.planner == planner.name
+    assert verify(PROBLEM, result.path).valid and verify_trajectory(PROBLEM, result.trajectory).valid
+    assert np.array_equal(result.path.positions[[0, -1]], np.stack([LEFT, RIGHT]))
+    again = planner.plan(PROBLEM, time_limit=120.0)
+    assert again.path is not None and np.array_equal(again.path.positions, result.path.positions)
+    other = planner.plan(PROBLEM, time_limit=120.0, seed=1)
+    assert other.path is not None and not np.array_equal(other.path.positions, result.path.positions)
+
+
+def test_failure_says_what_was_wrong(planner: MPD | EDMP, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Samples that all go through the ball."""
+    drawn = lines(planner.settings.samples)
+    monkeypatch.setattr(planner, "draw", lambda *_arguments: drawn)
+    planner.plan(PROBLEM, time_limit=0.1)  # compiles and loads
+    result = planner.plan(PROBLEM, time_limit=2.0)
+    assert result.status is Status.TIMEOUT and result.path is None
+    assert result.refused == "scene_collision" and "samples" in result.reason
+
+
+def test_no_time_for_a_batch(planner: MPD | EDMP) -> None:
+    result = planner.plan(PROBLEM, time_limit=1e-3)
+    assert result.status is Status.TIMEOUT and "time ran out" in result.reason and not result.refused
+
+
+@pytest.mark.parametrize("kind", [MPD, EDMP])
+def test_missing_weights(kind: type[MPD | EDMP], tmp_path) -> None:
+    settings = (MPDSettings if kind is MPD else EDMPSettings)(weights=str(tmp_path))
+    with pytest.raises(InputError, match="train planner --config trajectory_prior"):
+        kind(settings).plan(PROBLEM, time_limit=1.0)  # type: ignore[arg-type]
+
+
+def test_weights_survive_a_file(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = MotionModel(RANGES, SMALL)
+    torch.nn.init.normal_(network.denoiser.out.weight, std=0.1)
+    save_network("trajectory_prior", network, tmp_path, {})
+    loaded = load_network("trajectory_prior", str(tmp_path), PANDA)
+    assert isinstance(loaded, MotionModel) and loaded.settings == SMALL
+    given = torch.randn(2, WAYPOINTS, PANDA.dof), torch.full((2,), 0.3), torch.zeros(2, 1)
+    with torch.no_grad():
+        assert torch.allclose(loaded.denoise(*given), network.denoise(*given), atol=0.05)
+    assert MPD(MPDSettings(weights=str(tmp_path))).network(PANDA) is loaded
+
+
+def test_a_prior_that_was_a_class_of_its_own_is_read(tmp_path: Path) -> None:
+    network = MotionModel(RANGES, SMALL)
+    save_network("trajectory_prior", network, tmp_path, {})
+    file = tmp_path / "trajectory_prior.json"
+    about = json.loads(file.read_text())
+    now = about["settings"]
+    about["settings"] = {"frames": 48, "unet": now["denoiser_settings"], "schedule": now["schedule"]}
+    about["settings"] |= {"trivial_share": 0.1}
+    file.write_text(json.dumps(about))
+    assert load_network("trajectory_prior", str(tmp_path), PANDA).settings == SMALL
+
+
+def test_training_stopped_and_continued_ends_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_motions(tmp_path / "data", PANDA, random_motions(PANDA, 40))
+    asked = ["train", "baseline", "trajectory_prior", "--data", str(tmp_path / "data")]
+    asked += ["--samples", "80", "--batch", "8"]
+    original, steps = _Loss.__call__, 0
+
+    def interrupted(self: _Loss, *given):
+        nonlocal steps
+        steps += 1
+        if steps == 5:
+            os.kill(os.getpid(), signal.SIGINT)
+        return original(self, *given)
+
+    assert main([*asked, "--out", str(tmp_path / "whole")]) == 0
+    monkeypatch.setattr(_Loss, "__call__", interrupted)
+    assert main([*asked, "--out", str(tmp_path / "parts")]) == 130
+    assert main([*asked, "--out", str(tmp_path / "parts")]) == 0
+    assert "success" in capsys.readouterr().out
+    whole, parts = (
+        load_network("trajectory_prior", str(tmp_path / name), PANDA).state_dict()
+        for name in ("whole", "parts")
+    )
+    assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+@pytest.mark.parametrize(
+    "make, message",
+    [
+        (
+            lambda: replace(SMALL, encoder="pointnet"),
+            r"model.encoder is pointnet and encoder_settings are None",
+        ),
+        (lambda: replace(SMALL, denoiser="encoder_decoder"), r"denoiser is encoder_decoder"),
+        (lambda: replace(TRAINING, smooth_noise=True), r"target is limits and smooth_noise is True"),
+        (lambda: MPDSettings(samples=0), r"mpd.samples is 0"),
+        (lambda: MPDSettings(sampling_steps=1), r"mpd.sampling_steps is 1"),
+        (lambda: MPDSettings(guided_share=2.0), r"mpd.guided_share is 2.0"),
+        (lambda: MPDSettings(margin=-0.1), r"mpd.margin is -0.1"),
+        (lambda: MPDSettings(push=0.0), r"mpd.push is 0.0"),
+        (lambda: EDMPSettings(samples=11), r"edmp.samples is 11 and guides are 12"),
+        (lambda: EDMPSettings(guides=()), r"edmp.guides is \(\)"),
+        (lambda: EDMPSettings(sampling_steps=1), r"edmp.sampling_steps is 1"),
+        (lambda: EDMPSettings(self_margin=-1.0), r"edmp.self_margin is -1.0"),
+        (lambda: EDMPSettings(push=-1.0), r"edmp.push is -1.0"),
+        (lambda: replace(ENSEMBLE[0], weight=-1.0), r"weight is -1.0"),
+        (lambda: replace(ENSEMBLE[0], guided_share=1.1), r"guided_share is 1.1"),
+    ],
+)
+def test_bad_settings(make, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        make()

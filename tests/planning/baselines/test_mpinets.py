@@ -1,0 +1,254 @@
+"""MPiNets: the grouping of points against brute force, the network's properties, roll-outs as a planner."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.checkpoint import load_network, save_network
+from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, MPiNetsNetworkSettings, RollOuts
+from robotdiffuse.learning.networks.point_groups import group_points
+from robotdiffuse.learning.networks.pointnet2 import PooledLayers
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.batches import TrajectoryData
+from robotdiffuse.planning.baselines.mpinets import MPiNets, MPiNetsSettings
+from robotdiffuse.problems.problem import PoseGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify
+
+PANDA = load_robot("panda")
+RANGES = RobotIdentity.of(PANDA)
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+WALL = [0.45, 0.0, 0.25, 0.3, 0.05, 0.5, 1.0, 0.0, 0.0, 0.0]
+SMALL = MPiNetsNetworkSettings(
+    scene_points=48, robot_points=4, target_points=2, centres=(24, 8), neighbours=(6, 4),
+    first_widths=(16, 16), second_widths=(24, 32), all_widths=(48,), cloud_widths=(32, 16),
+)  # fmt: skip
+
+
+@pytest.fixture
+def network() -> MPiNetsNetwork:
+    torch.manual_seed(0)
+    return MPiNetsNetwork(RANGES, SMALL).eval()
+
+
+class Straight(MPiNetsNetwork):
+    """Goes straight to the goal, at most 0.1 rad a joint and step."""
+
+    def forward(self, clouds: torch.Tensor, q: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
+        return q + (goal - q).clamp(-0.1, 0.1)
+
+
+def line_data(walls: bool) -> TrajectoryData:
+    """Straight motions from left to right and back, through a wall or not; not called trivial."""
+    rng = np.random.default_rng(3)
+    ends = np.stack([LEFT, RIGHT])[[[0, 1], [1, 0]] * 4] + rng.uniform(-0.05, 0.05, (8, 2, 7))
+    share = np.linspace(0, 1, 24)[:, None]
+    q = (ends[:, :1] * (1 - share) + ends[:, 1:] * share).astype(np.float32)
+    kinds = np.full((8, 1), BOX if walls else 0, np.int8)
+    params = np.tile(np.array(WALL, np.float32), (8, 1, 1)) * walls
+    return TrajectoryData(q, PackedScenes(kinds, params), np.zeros(8, bool), None, "", 0)
+
+
+def clouds_of(network: MPiNetsNetwork, count: int, seed: int = 0) -> torch.Tensor:
+    data = line_data(True)
+    return network.clouds(data.scenes[:count], np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("points", [20, 300])
+def test_grouping_is_that_of_brute_force(points: int) -> None:
+    cloud = np.random.default_rng(points).normal(size=(3, points, 3)).astype(np.float32)
+    count, most, radius = 12, 7, 0.8
+    centres, around = group_points(cloud, count, most, radius)
+    for x, chosen, near in zip(cloud.astype(np.float64), centres, around, strict=True):
+        distance = np.linalg.norm(x[:, None] - x[None], axis=2)
+        expected = [int(np.linalg.norm(x - x.mean(0), axis=1).argmax())]
+        while len(expected) < count:
+            expected.append(int(distance[expected].min(0).argmax()))
+        assert chosen.tolist() == expected
+        for centre, found in zip(chosen, near, strict=True):
+            order = np.argsort(distance[centre])
+            inside = order[distance[centre][order] < radius][:most].tolist()
+            assert found.tolist() == inside + [int(centre)] * (most - len(inside))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_pooled_layers_and_their_gradients_are_those_of_pytorch(dtype: torch.dtype) -> None:
+    torch.manual_seed(1)
+    layers = PooledLayers(5, (8, 6, 7))
+    x = torch.randn(3, 4, 9, 5, dtype=dtype, requires_grad=True)
+    found = layers(x)
+    plain = x
+    for layer in layers.layers:
+        assert isinstance(layer, nn.Linear)
+        plain = nn.functional.linear(plain, layer.weight.to(dtype), layer.bias.to(dtype)).relu()
+    plain = nn.functional.linear(plain, layers.last.weight.to(dtype), layers.last.bias.to(dtype))
+    expected = plain.relu().amax(-2)
+    direction = torch.randn_like(found)
+    wanted = [x, *layers.parameters()]
+    gradients = torch.autograd.grad(found, wanted, direction)
+    # bf16 has 8 bits, and equal greatest values, which share a gradient in PyTorch, are rare but in it
+    tolerance = 1e-5 if dtype == torch.float32 else 0.1
+    assert torch.allclose(found, expected, atol=tolerance)
+    if dtype == torch.float32:
+        for one, other in zip(gradients, torch.autograd.grad(expected, wanted, direction), strict=True):
+            assert torch.allclose(one, other, atol=tolerance)
+
+
+def test_order_of_the_scene_points_makes_no_difference(network: MPiNetsNetwork) -> None:
+    cloud = clouds_of(network, 1)
+    q, goal = torch.tensor(np.stack([LEFT, RIGHT]), dtype=torch.float32)[:, None]
+    shuffled = cloud[:, torch.randperm(cloud.shape[1])]
+    with torch.no_grad():
+        assert torch.equal(network(cloud, q, goal), network(shuffled, q, goal))
+        moved = network(cloud + torch.tensor([0.0, 0.0, 0.3]), q, goal)
+    assert not torch.equal(network(cloud, q, goal), moved)
+
+
+def test_samples_are_steps_of_the_motions(network: MPiNetsNetwork) -> None:
+    data = line_data(True)
+    steps = network.draw(data, 200, np.random.default_rng(0))
+    every = np.concatenate([data.q, data.q[:, ::-1]])
+    for q, expert, goal in zip(steps.q.numpy(), steps.expert.numpy(), steps.goal.numpy(), strict=True):
+        of = every[[bool((motion[-1] == goal).all()) and (motion == expert).all(1).any() for motion in every]]
+        at = int((of[0] == expert).all(1).argmax())
+        before = of[0][[at - 1, at]] if at == len(of[0]) - 1 else of[0][[at - 1]]
+        assert np.abs(before - q).max(1).min() < 6 * SMALL.noise
+    assert torch.unique(steps.goal, dim=0).shape[0] == 16
+
+
+def test_loss_falls_on_few_motions() -> None:
+    torch.manual_seed(0)
+    network = MPiNetsNetwork(RANGES, replace(SMALL, noise=0.0))
+    data, rng = line_data(False), np.random.default_rng(0)
+    network.fit_statistics(data)
+    optimizer = torch.optim.Adam(network.parameters(), 3e-3)
+    losses = []
+    for _ in range(25):
+        optimizer.zero_grad()
+        loss = network.loss(data, 24, 0.5, rng)
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:5])
+    assert all(parameter.grad is not None for parameter in network.parameters())
+
+
+def test_roll_outs_stay_within_limits(network: MPiNetsNetwork) -> None:
+    network.step.fill_(30.0)
+    start = np.tile(LEFT.astype(np.float32), (3, 1))
+    roll_outs = RollOuts(network, clouds_of(network, 3), start, -start)
+    for i in range(5):
+        roll_outs.advance(np.full((3, 7), 0.5, np.float32))
+        if i == 1:
+            roll_outs.stop(np.array([False, True, False]))
+    waypoints = np.stack(roll_outs.waypoints)
+    assert (waypoints >= PANDA.lower - 1e-5).all() and (waypoints <= PANDA.upper + 1e-5).all()
+    assert (waypoints[2:, 1] == waypoints[2, 1]).all()
+    assert np.abs(waypoints[-1, [0, 2]] - start[0]).max() > 0.5
+
+
+@pytest.mark.parametrize(("walls", "share"), [(False, 1.0), (True, 0.0)])
+def test_success_is_that_of_the_motions(walls: bool, share: float) -> None:
+    straight = Straight(RANGES, SMALL)
+    assert straight.success(line_data(walls), PANDA, np.random.default_rng(0)) == share
+    trivial = replace(line_data(walls), trivial=np.ones(8, bool))
+    assert straight.success(trivial, PANDA, np.random.default_rng(0)) is None
+
+
+@pytest.fixture
+def straight_weights(monkeypatch: pytest.MonkeyPatch) -> MPiNetsNetwork:
+    straight = Straight(RANGES, SMALL)
+    monkeypatch.setattr(MPiNets, "network", lambda _self, _robot: straight)
+    return straight
+
+
+POSE = PoseGoal("panda_hand", link_pose(PANDA, RIGHT, "panda_hand"))
+
+
+@pytest.mark.usefixtures("straight_weights")
+@pytest.mark.parametrize("goal", [RIGHT, np.stack([LEFT + 0.4, RIGHT]), POSE])
+def test_solved_means_verified(goal: "np.ndarray | PoseGoal") -> None:
+    problem = Problem(PANDA, Scene([Sphere([0.0, 0.0, 1.5], 0.1)]), LEFT, goal)
+    result = MPiNets().plan(problem, 10.0, 1)
+    assert result.status is Status.SOLVED and result.path is not None
+    assert verify(problem, result.path).valid
+    assert len(result.path.positions) > 3
+
+
+@pytest.mark.usefixtures("straight_weights")
+def test_a_path_in_collision_is_no_result() -> None:
+    problem = Problem(PANDA, Scene([Box(WALL[:3], WALL[3:6])]), LEFT, RIGHT)
+    MPiNets().plan(problem, 0.1, 1)  # compiles and loads
+    result = MPiNets().plan(problem, 2.0, 1)
+    assert result.status is Status.TIMEOUT and result.path is None
+    assert result.refused == "scene_collision"
+    assert "not free of collision" in result.reason
+
+
+def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(
+    tmp_path: Path, network: MPiNetsNetwork
+) -> None:
+    save_network("mpinets", network, tmp_path, {})
+    planner = MPiNets(MPiNetsSettings(weights=str(tmp_path), near=0.299))
+    q = torch.tensor(LEFT[None], dtype=torch.float32)
+    cloud = clouds_of(network, 1)
+    # weights are kept with half the bits
+    assert torch.allclose(network(cloud, q, q), planner.network(PANDA)(cloud, q, q), atol=1e-3)
+    # the policy, which knows nothing, makes some steps before it happens to be near enough
+    goal = LEFT + np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0])
+    problem = Problem(PANDA, Scene([Sphere([0.0, 0.0, 1.5], 0.1)]), LEFT, goal)
+    paths = [planner.plan(problem, 20.0, seed).path for seed in (5, 5)]
+    assert paths[0] is not None and paths[1] is not None
+    assert np.array_equal(paths[0].positions, paths[1].positions)
+    assert len(paths[0].positions) > 2
+
+
+def test_missing_weights_name_the_command(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="train baseline mpinets"):
+        MPiNets(MPiNetsSettings(weights=str(tmp_path)))
+    with pytest.raises(InputError, match="train baseline mpinets"):
+        load_network("mpinets", str(tmp_path), PANDA)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"scene_points": 0}, "scene_points is 0"),
+        ({"target_points": 13}, "target_points is 13; it must be at most robot_points, 12"),
+        ({"centres": (64, 65)}, "centres is"),
+        ({"radii": (0.2, 0.0)}, "radii is"),
+        ({"first_widths": ()}, "first_widths is"),
+        ({"cloud_widths": (30, 16)}, "cloud_widths is"),
+        ({"margin": -0.1}, "margin is -0.1"),
+        ({"trivial_share": 2.0}, "trivial_share is 2.0"),
+    ],
+)
+def test_bad_network_settings(values: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        MPiNetsNetworkSettings(**values)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"steps": 0}, "mpinets.steps is 0"),
+        ({"batch": 0}, "mpinets.batch is 0"),
+        ({"near": -1.0}, "mpinets.near is -1.0"),
+        ({"noise": float("nan")}, "mpinets.noise is nan"),
+        ({"resolution": 0.0}, "mpinets.resolution is 0.0"),
+    ],
+)
+def test_bad_planner_settings(values: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        MPiNetsSettings(**values)

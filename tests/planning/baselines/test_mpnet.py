@@ -1,0 +1,326 @@
+"""MPNet: its auto-encoder, what it learns from, bidirectional planning, contraction and replanning."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy import ndarray
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.motions import path_length
+from robotdiffuse.datasets.rows import resample
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.checkpoint import save_network
+from robotdiffuse.learning.networks.mpnet import (
+    MPNetNetwork,
+    MPNetSettings,
+    Perceptron,
+    arranged,
+    squared_slope,
+)
+from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.training.batches import TrajectoryData
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_code
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify
+
+PANDA = load_robot("panda")
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+UP = np.array([0.0, -0.9, 0.0, -1.9, 0.0, 2.2, 0.785])
+WALL = Scene([Box([0.5, 0.0, 0.2], [0.3, 0.05, 0.4], name="wall")])
+SMALL = MPNetSettings(
+    points=40, encoder_layers=(32, 16), code=8, decoder_layer=16, layers=(64, 64, 32), steady_layers=1
+)
+
+
+def network(settings: MPNetSettings = SMALL, seed: int = 0) -> MPNetNetwork:
+    torch.manual_seed(seed)
+    return MPNetNetwork(RobotIdentity.of(PANDA), settings)
+
+
+def motions(waypoints: int = 48) -> TrajectoryData:
+    """Motions from left to right over walls of several heights, and back; and a straight one."""
+    q, scenes = [], []
+    s = np.linspace(0, 1, waypoints)[:, None]
+    for i, height in enumerate((0.3, 0.4, 0.5, 0.6)):
+        way = (1 - s) * LEFT + s * RIGHT + height * np.sin(np.pi * s) * np.eye(7)[1] * -1.5
+        q.append((way if i % 2 else way[::-1]).astype(np.float32))
+        scenes.append(Scene([Box([0.5, 0.0, height / 2], [0.3, 0.05, height])]))
+    trivial = np.array([False, False, False, True])
+    even = resample(np.stack(q), waypoints)
+    return TrajectoryData(even, PackedScenes.pack(scenes, 2), trivial, None, "made", 0)
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> str:
+    """A folder with a small network that has seen some training."""
+    net, data, rng = network(), motions(), np.random.default_rng(0)
+    net.fit_statistics(data)
+    optimizer = torch.optim.Adam(net.parameters(), 3e-3)
+    for step in range(80):
+        optimizer.zero_grad()
+        net.loss(data, 256, step / 80, rng).backward()
+        optimizer.step()
+    folder = tmp_path_factory.mktemp("mpnet")
+    save_network("mpnet", net, folder, {})
+    return str(folder)
+
+
+def planning(weights: str, problem: Problem, **changes: object) -> NeuralPlanning:
+    """A round of the planner, before it begins."""
+    settings = replace(MPNetPlannerSettings(weights), **changes)
+    checker = CollisionChecker(problem.robot, problem.scene)
+    ends = Ends(checker, problem.start, np.array([RIGHT]))
+    call, rng = Call("mpnet", problem, 60.0, 0), np.random.default_rng(1)
+    return NeuralPlanning(call, ends, network(), settings, rng)
+
+
+def wall_problem(scene: Scene = WALL) -> Problem:
+    return Problem(PANDA, scene, LEFT, JointGoal(RIGHT[None]))
+
+
+@pytest.mark.parametrize("fraction", [0.0, 1.0], ids=["auto-encoder", "end to end"])
+def test_the_loss_falls(fraction: float) -> None:
+    net, data, rng = network(), motions(), np.random.default_rng(0)
+    net.fit_statistics(data)
+    optimizer = torch.optim.Adam(net.parameters(), 3e-3)
+    losses = []
+    for _ in range(120):
+        loss = net.loss(data, 256, fraction, rng)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    first, last = np.mean(losses[:5]), np.mean(losses[-20:])
+    assert last < 0.6 * first
+    if fraction:
+        assert last < 0.8, "straight steps have a loss of 1"
+
+
+def test_the_first_part_trains_enet_alone_and_the_rest_trains_it_along() -> None:
+    data = motions()
+    for fraction, trained in ((0.0, {"encoder", "decoder"}), (0.5, {"encoder", "policy"})):
+        net = network()
+        net.loss(data, 64, fraction, np.random.default_rng(0)).backward()
+        assert {name.split(".")[0] for name, p in net.named_parameters() if p.grad is not None} == trained
+
+
+def test_the_contractive_penalty_is_the_jacobian_squared() -> None:
+    torch.manual_seed(0)
+    net = Perceptron((6, 9, 7, 4)).double()
+    x = torch.randn(3, 6, dtype=torch.float64)
+    jacobians = torch.stack([torch.autograd.functional.jacobian(net, row) for row in x[:, None]])
+    expected = jacobians.square().sum((1, 2, 3, 4))
+    z, slopes = net.with_slopes(x)
+    torch.testing.assert_close(z, net(x))
+    # by each output in turn: their sum is all of J; by random signs: the mean is
+    columns = [
+        squared_slope(net, slopes, torch.eye(4, dtype=torch.float64)[i].expand(3, 4)) for i in range(4)
+    ]
+    torch.testing.assert_close(torch.stack(columns).sum(0).double(), expected, rtol=1e-5, atol=1e-6)
+    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0], dtype=torch.float64)] * 4)
+    means = torch.stack([squared_slope(net, slopes, s.expand(3, 4)) for s in signs]).mean(0)
+    torch.testing.assert_close(means.double(), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_gradients_of_the_contractive_penalty_are_those_of_finite_differences() -> None:
+    torch.manual_seed(1)
+    net, x, signs = Perceptron((5, 8, 6, 3)), torch.randn(4, 5), torch.ones(4, 3)
+    weight = net.weight(1)
+
+    def penalty() -> torch.Tensor:
+        return squared_slope(net, net.with_slopes(x)[1], signs).sum()
+
+    penalty().backward()
+    assert weight.grad is not None
+    for i, j in ((0, 0), (2, 5), (5, 7)):
+        values = []
+        for step in (1e-3, -1e-3):
+            with torch.no_grad():
+                weight[i, j] += step
+                values.append(penalty().item())
+                weight[i, j] -= step
+        assert (values[0] - values[1]) / 2e-3 == pytest.approx(float(weight.grad[i, j]), rel=2e-2, abs=2e-3)
+
+
+def test_waypoints_are_a_step_apart_or_the_goal() -> None:
+    net, data = network(replace(SMALL, step=0.5)), motions()
+    here, following, goal = net._samples(data.q, np.random.default_rng(0))
+    moved = np.linalg.norm(following - here, axis=1)
+    at_goal = (following == goal).all(1)
+    assert len(here) == len(data) * SMALL.waypoints and 0 < at_goal.mean() < 0.7
+    assert (np.abs(moved[~at_goal] - 0.5) < 0.06).all() and (moved < 0.56).all() and (moved > 0).all()
+    ends = np.concatenate([data.q[:, 0], data.q[:, -1]])
+    to_the_end = (goal[:, None] == ends).all(2).any(1).mean()
+    assert 0.4 < to_the_end < 0.8, "half have sub-goals"
+
+
+def test_the_order_of_the_points_does_not_matter_and_no_points_are_zeros() -> None:
+    net, rng = network(), np.random.default_rng(0)
+    cloud = torch.from_numpy(rng.uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.9], (2, 40, 3)).astype(np.float32))
+    shuffled = cloud[:, torch.from_numpy(rng.permutation(40))]
+    torch.testing.assert_close(net.encode(cloud), net.encode(shuffled))
+    near = arranged(cloud, net.region)
+    steps = (near[:, 1:] - near[:, :-1]).norm(dim=-1).mean()
+    assert steps < 0.7 * (cloud[:, 1:] - cloud[:, :-1]).norm(dim=-1).mean(), "neighbours are near each other"
+    assert not arranged(torch.zeros(1, 40, 3), net.region).any()
+    empty = scene_code(net, CollisionChecker(PANDA, Scene([])), rng)
+    torch.testing.assert_close(empty, net.encode(torch.zeros(1, 40, 3)))
+
+
+def test_dropout_is_on_in_planning_and_drawn_from_the_generator(weights: str) -> None:
+    net = network().eval()
+    z, q = torch.zeros(1, 8), torch.from_numpy(LEFT[None].astype(np.float32))
+    goal = torch.from_numpy(RIGHT[None].astype(np.float32))
+    generator = torch.Generator().manual_seed(0)
+    first, second = (net.next_states(z, q, goal, generator) for _ in range(2))
+    again = net.next_states(z, q, goal, torch.Generator().manual_seed(0))
+    assert not torch.equal(first, second) and torch.equal(first, again)
+    assert torch.equal(net.next_states(z, q, goal, None), net.next_states(z, q, goal, None))
+    one = planning(weights, wall_problem())
+    states = one.next_states(np.tile(LEFT, (8, 1)).astype(np.float32), one.goals[:8])
+    assert len(np.unique(states, axis=0)) == 8
+
+
+def test_states_are_within_the_limits() -> None:
+    net = network()
+    with torch.no_grad():
+        net.step_scale.fill_(100.0)
+    q = torch.from_numpy(np.tile(LEFT, (20, 1)).astype(np.float32))
+    states = net.next_states(torch.randn(20, 8), q, q.flip(0), torch.Generator().manual_seed(0))
+    states = states.detach().numpy()
+    assert (states >= PANDA.lower - 1e-5).all() and (states <= PANDA.upper + 1e-5).all()
+
+
+def test_ends_meet_where_nothing_is_in_the_way(weights: str) -> None:
+    one = planning(weights, wall_problem(Scene([])))
+    for path in one.between(one.starts, one.goals):
+        np.testing.assert_array_equal(path[[0, -1]], np.stack([LEFT, RIGHT]).astype(np.float32))
+        assert one.segments_free(path).all()
+    assert one.best().broken == 0
+    result = MPNet(MPNetPlannerSettings(weights)).plan(wall_problem(Scene([])), 10.0)
+    assert result.solved and result.path is not None and len(result.path.positions) == 2
+
+
+def test_contraction_never_lengthens_and_stays_free(weights: str) -> None:
+    one = planning(weights, wall_problem())
+    over = np.array(
+        [LEFT, [0.45, -0.3, 0, -1.9, 0, 2.2, 0.785], UP, [-0.45, -0.3, 0, -1.9, 0, 2.2, 0.785], RIGHT]
+    )
+    rng, tried = np.random.default_rng(0), 0
+    for _ in range(30):
+        path = np.repeat(over, 2, axis=0)
+        path[1:-1] += rng.normal(0, 0.08, path[1:-1].shape)
+        path = path.astype(np.float32)
+        if not one.segments_free(path).all():
+            continue
+        tried += 1
+        shorter = one.contracted(path)
+        assert one.segments_free(shorter).all() and len(shorter) < len(path)
+        assert path_length(shorter) <= path_length(path) * (1 + 1e-6)
+        np.testing.assert_array_equal(shorter[[0, -1]], path[[0, -1]])
+    assert tried > 5
+
+
+def test_replanning_keeps_what_is_free_and_leaves_out_states_in_collision(weights: str) -> None:
+    one = planning(weights, wall_problem())
+    middle = (LEFT + RIGHT) / 2
+    path = np.array([LEFT, UP, middle, RIGHT], np.float32)
+    assert not CollisionChecker(PANDA, WALL).free(middle[None])[0]
+    np.testing.assert_array_equal(one.without_collisions(path), path[[0, 1, 3]])
+    good = np.array([LEFT, UP, RIGHT], np.float32)
+    assert one.segments_free(good).all()
+    replanned = one.replan([path, good])
+    np.testing.assert_array_equal(replanned[0], good)
+    np.testing.assert_array_equal(replanned[1], good)
+    blocked = one.replan([np.array([LEFT, RIGHT], np.float32)])[0]
+    assert len(blocked) > 2
+    np.testing.assert_array_equal(blocked[[0, -1]], np.stack([LEFT, RIGHT]).astype(np.float32))
+
+
+@pytest.mark.parametrize("hybrid", [False, True])
+def test_solved_means_verified(weights: str, hybrid: bool) -> None:
+    problem = wall_problem()
+    result = MPNet(MPNetPlannerSettings(weights, hybrid=hybrid)).plan(problem, 5.0, seed=2)
+    assert result.status in (Status.SOLVED, Status.TIMEOUT)
+    assert result.solved or not hybrid
+    if result.solved:
+        assert result.path is not None and verify(problem, result.path).valid
+        np.testing.assert_array_equal(result.path.positions[[0, -1]], np.stack([LEFT, RIGHT]))
+
+
+def test_hybrid_replanning_joins_what_the_network_does_not(weights: str) -> None:
+    problem = wall_problem()
+    settings = MPNetPlannerSettings(weights, attempts=1, steps=1, replanning=0, hybrid=True)
+    result = MPNet(settings).plan(problem, 120.0)
+    assert result.solved and "RRT-Connect" in result.reason
+
+
+def test_the_same_seed_gives_the_same_path(weights: str) -> None:
+    paths: list[ndarray] = []
+    for _ in range(2):
+        settings = MPNetPlannerSettings(weights, hybrid=True, attempts=4, replanning=2)
+        result = MPNet(settings).plan(wall_problem(), 60.0, seed=3)
+        assert result.path is not None
+        paths.append(result.path.positions)
+    np.testing.assert_array_equal(paths[0], paths[1])
+
+
+def test_giving_up_says_what_was_wrong(weights: str) -> None:
+    """A wall all around: there is no way, and the last attempt says why."""
+    walls = [Box([side * 0.65, 0.0, 0.5], [1.0, 0.02, 3.0]) for side in (1, -1)]
+    problem = wall_problem(Scene([*walls, Box([0.0, 0.0, 1.35], [3.0, 0.02, 1.3])]))
+    result = MPNet(MPNetPlannerSettings(weights)).plan(problem, 0.3)
+    assert result.status is Status.TIMEOUT and result.path is None
+    assert result.refused == "scene_collision" and "hybrid" in result.reason
+
+
+def test_success_is_a_share(weights: str) -> None:
+    net, data = network(), motions()
+    share = net.success(data, PANDA, np.random.default_rng(0))
+    assert share is not None and 0 <= share <= 1
+    nothing = replace(data, trivial=np.ones(4, bool))
+    assert net.success(nothing, PANDA, np.random.default_rng(0)) is None
+    free = replace(data, scenes=PackedScenes.pack([Scene([])] * 4, 2))
+    assert net.success(free, PANDA, np.random.default_rng(0)) == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("points", 0),
+        ("dropout", 1.0),
+        ("layers", ()),
+        ("step", 0.0),
+        ("steady_layers", 12),
+        ("sub_goals", 1.5),
+        ("contraction", -1.0),
+    ],
+)
+def test_bad_settings_of_the_network_are_refused(name: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"mpnet.{name} is "):
+        replace(MPNetSettings(), **{name: value})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("attempts", 0), ("steps", 0), ("replanning", -1), ("resolution", 0.0), ("clearance", -0.1)],
+)
+def test_bad_settings_of_the_planner_are_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"mpnet.{name} is {value}"):
+        replace(MPNetPlannerSettings(), **{name: value})
+
+
+def test_missing_weights_name_the_command_that_trains_them(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="robotdiffuse train baseline mpnet"):
+        MPNet(MPNetPlannerSettings(str(tmp_path))).plan(wall_problem(Scene([Sphere([0.5, 0.0, 0.9], 0.1)])))

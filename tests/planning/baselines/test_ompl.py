@@ -1,0 +1,246 @@
+"""OMPL's planners over our kernel: verified paths, many goals, time, seeds, and no crash through C++."""
+
+import gc
+import runpy
+import sys
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+pytest.importorskip("ompl")
+
+from helpers.box_arm import box_arm
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.exact_meshes import explain_collision
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning.baselines import ompl as planners
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify
+
+PANDA = load_robot("panda")
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+READY = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+WALL = Scene([Box([0.45, 0.0, 0.25], [0.3, 0.05, 0.5], name="wall")])
+FIRST = (planners.OmplRRT, planners.OmplRRTConnect, planners.OmplPRM)
+ANYTIME = (
+    planners.OmplRRTStar,
+    planners.OmplInformedRRTStar,
+    planners.OmplBITStar,
+    planners.OmplAORRTC,
+)
+every = pytest.mark.parametrize("planner", FIRST + ANYTIME, ids=lambda planner: planner.name)
+anytime = pytest.mark.parametrize("planner", ANYTIME, ids=lambda planner: planner.name)
+
+
+def problem(*goals: np.ndarray, scene: Scene = WALL) -> Problem:
+    return Problem(PANDA, scene, LEFT, JointGoal(np.stack(goals)))
+
+
+def plan(planner: type[planners.OmplPlanner], problem: Problem, seed: int = 1) -> PlanResult:
+    """Anytime planners take all the time that they are given."""
+    return planner().plan(problem, time_limit=1.5 if planner.anytime else 120.0, seed=seed)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled() -> None:
+    """What compiling and loading the kernels takes is no planner's time."""
+    planners.OmplRRTConnect().plan(problem(RIGHT), time_limit=120.0)
+
+
+@every
+def test_around_a_wall(planner):
+    result = plan(planner, problem(RIGHT))
+    assert result.solved and result.path is not None, result.reason
+    assert verify(problem(RIGHT), result.path).valid
+    assert result.planner == result.stage == planner.name
+    assert all(later[1] < earlier[1] for earlier, later in pairwise(result.progress))
+    assert result.progress[-1][1] == pytest.approx(result.path.length)
+    # the wall is in the way
+    assert result.path.length > 1.01 * np.linalg.norm(RIGHT - LEFT)
+
+
+def test_an_anytime_planner_improves():
+    result = plan(planners.OmplInformedRRTStar, problem(RIGHT))
+    assert len(result.progress) > 2
+    assert result.progress[-1][1] < 0.9 * result.progress[0][1]
+
+
+@anytime
+def test_an_anytime_planner_ends_when_no_path_can_be_shorter(planner):
+    limit = 20.0
+    result = planner().plan(problem(RIGHT, scene=Scene([])), time_limit=limit)
+    assert result.path is not None
+    assert result.path.length <= 1.0002 * np.linalg.norm(RIGHT - LEFT)
+    assert result.planning_time < limit
+
+
+@every
+def test_a_goal_where_the_arm_stands(planner):
+    result = planner().plan(problem(LEFT), time_limit=120.0)
+    assert result.solved and result.path is not None
+    assert result.path.length < 1e-5
+
+
+@every
+def test_one_of_several_goals(planner):
+    blocked, near = np.append(0.0, LEFT[1:]), LEFT + 0.05
+    several = problem(blocked, RIGHT, near)
+    assert explain_collision(PANDA, WALL, blocked) is not None
+    result = plan(planner, several)
+    assert result.path is not None and verify(several, result.path).valid
+    if planner.anytime:
+        np.testing.assert_allclose(result.path.positions[-1], near, atol=1e-6)
+
+
+@pytest.mark.timeout(300)
+def test_prm_with_many_goals_ends():
+    """Its two threads waited for each other, for the roadmap and for Python's lock."""
+    rng = np.random.default_rng(0)
+    many = problem(*(RIGHT + 0.1 * rng.standard_normal((20, 7))))
+    for seed in range(5):
+        result = planners.OmplPRM().plan(many, time_limit=120.0, seed=seed)
+        assert result.path is not None and verify(many, result.path).valid
+
+
+@pytest.mark.parametrize("planner", [planners.OmplRRTConnect, planners.OmplAORRTC])
+def test_a_pose_is_reached(planner):
+    to_pose = Problem(PANDA, WALL, LEFT, PoseGoal("panda_hand", link_pose(PANDA, RIGHT, "panda_hand")))
+    result = plan(planner, to_pose)
+    assert result.path is not None, result.reason
+    assert verify(to_pose, result.path).valid
+
+
+def corridor() -> Problem:
+    """A planar arm whose goal lies between two walls, too long to be left or entered."""
+    walls = [Box([0.8, side * 0.12, 0.0], [1.2, 0.08, 0.2]) for side in (-1, 1)]
+    return Problem(box_arm(), Scene(walls), np.array([2.0, 0.0, 0.0]), JointGoal(np.zeros((1, 3))))
+
+
+@every
+def test_no_way_to_the_goal_times_out(planner):
+    result = planner().plan(corridor(), time_limit=0.2)
+    assert result.status is Status.TIMEOUT and result.path is None
+    assert "no path was found" in result.reason
+
+
+def test_goal_in_collision():
+    result = planners.OmplBITStar().plan(problem(np.append(0.0, LEFT[1:])))
+    assert result.status is Status.INVALID_GOAL and "wall" in result.reason
+
+
+@pytest.mark.parametrize("planner", [planners.OmplRRTConnect, planners.OmplAORRTC])
+def test_start_that_only_the_spheres_call_in_collision(planner):
+    ahead = link_pose(PANDA, READY, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
+    radii = np.arange(0.1, 0.05, -0.0002)
+    balls = (Sphere(ahead, float(radius)) for radius in radii)
+    ball = next(ball for ball in balls if explain_collision(PANDA, Scene([ball]), READY) is None)
+    scene = Scene([Sphere(ahead, ball.radius - 0.002)])
+    assert not CollisionChecker(PANDA, scene).free(READY[None])[0]
+    close = Problem(PANDA, scene, READY, JointGoal(LEFT[None]))
+    result = plan(planner, close)
+    assert result.path is not None and verify(close, result.path).valid
+    np.testing.assert_array_equal(result.path.positions[0], READY)
+
+
+@pytest.mark.parametrize("planner", [planners.OmplRRT, planners.OmplRRTConnect])
+def test_same_seed_same_path(planner):
+    once, again, other = (plan(planner, problem(RIGHT), seed).path for seed in (3, 3, 4))
+    assert once is not None and again is not None and other is not None
+    np.testing.assert_array_equal(once.positions, again.positions)
+    assert once.length != other.length
+
+
+def test_simplifying_shortens():
+    raw = planners.OmplRRT(planners.OmplSettings(simplify=False)).plan(problem(RIGHT), 120.0, seed=1)
+    short = planners.OmplRRT().plan(problem(RIGHT), 120.0, seed=1)
+    assert raw.path is not None and short.path is not None
+    assert short.path.length < raw.path.length
+
+
+def test_range_bounds_the_extensions():
+    settings = planners.OmplSettings(range=0.3, simplify=False)
+    result = planners.OmplRRT(settings).plan(problem(RIGHT), 120.0)
+    assert result.path is not None
+    assert np.linalg.norm(np.diff(result.path.positions, axis=0), axis=1).max() < 0.3 + 1e-6
+
+
+@pytest.mark.parametrize("planner", [planners.OmplRRTConnect, planners.OmplAORRTC])
+def test_a_refused_path_is_searched_again_more_closely(planner, monkeypatch):
+    resolutions = []
+
+    def first_without_the_wall(checker, resolution, *rest):
+        resolutions.append(resolution)
+        seen = checker if len(resolutions) > 1 else CollisionChecker(PANDA, Scene([]))
+        return search_space(seen, resolution, *rest)
+
+    search_space = planners.search_space
+    monkeypatch.setattr(planners, "search_space", first_without_the_wall)
+    result = plan(planner, problem(RIGHT))
+    assert resolutions[:2] == [0.05, 0.025]
+    assert result.path is not None and verify(problem(RIGHT), result.path).valid
+
+
+@every
+def test_an_error_below_ompl_comes_out(planner, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("broken kernel")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(planners, "motions_free", broken)
+        patched.setattr(planners.lanes, "free_many", broken)
+        # what surrounds the search asks the kernel as well
+        patched.setattr("robotdiffuse.planning.planner.usable_ends", FreeEnds)
+        with pytest.raises(RuntimeError, match="broken kernel"):
+            planner().plan(problem(RIGHT), time_limit=120.0)
+    assert plan(planner, problem(RIGHT)).solved
+
+
+class FreeEnds(planners.Ends):
+    """Ends that nobody checks."""
+
+    def __init__(self, *_):
+        self.checker = CollisionChecker(PANDA, WALL)
+        self.start, self.start_lead, self.goals, self.goal_leads = LEFT, LEFT, [RIGHT], [RIGHT]
+
+
+@every
+def test_nothing_stays_in_memory(planner):
+    for seed in range(3):
+        planner().plan(problem(RIGHT), time_limit=0.05, seed=seed)
+    gc.collect()
+    kept = [each for each in gc.get_objects() if type(each) in (planners._Search, planners._Motions)]
+    assert not kept
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"resolution": 0.0}, "ompl.resolution is 0.0"),
+        ({"clearance": -1.0}, "ompl.clearance is -1.0"),
+        ({"range": 0.0}, "ompl.range is 0.0"),
+    ],
+)
+def test_settings_are_checked(change, what):
+    with pytest.raises(InputError, match=what):
+        replace(planners.OmplSettings(), **change)
+
+
+@pytest.mark.parametrize("planner", [planners.OmplPRM, planners.OmplBITStar])
+def test_a_planner_without_a_range_refuses_one(planner):
+    with pytest.raises(InputError, match=f"{planner.name} has no range"):
+        planner(planners.OmplSettings(range=1.0))
+
+
+def test_without_ompl_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ompl", None)
+    with pytest.raises(InputError, match=r"pip install \"robotdiffuse\[baselines\]\""):
+        runpy.run_path(planners.__file__)

@@ -1,0 +1,120 @@
+"""The paper's method alone: the network's samples as they are, the shortest valid one, batch after batch."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.core.types import Path, Status
+from robotdiffuse.validation.validator import verify
+
+PANDA = load_robot("panda")
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
+PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
+MODEL = Diffusion().model(PANDA)
+assert MODEL is not None
+
+
+def samples_of(seed: int) -> list[Path]:
+    """The first batch for the problem, drawn as the planner draws it."""
+    planner, checker, rng = Diffusion(), CollisionChecker(PANDA, PROBLEM.scene), np.random.default_rng(seed)
+    assert MODEL is not None
+    code = encode(MODEL, checker, planner.settings.points, rng)
+    ends = LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
+    paths = [Path(PANDA.joint_names, q) for q in planner.draw(MODEL, checker, code, *ends, rng)]
+    for path in paths:
+        path.positions[0], path.positions[-1] = LEFT, RIGHT
+    return paths
+
+
+def test_the_answer_is_the_shortest_valid_sample_as_it_was_drawn() -> None:
+    result = Diffusion().plan(PROBLEM, time_limit=60.0, seed=5)
+    samples = samples_of(5)
+    valid = [path for path in samples if verify(PROBLEM, path).valid]
+    assert valid and result.path is not None and result.stage == "network"
+    shortest = min(valid, key=lambda path: path.length)
+    assert np.array_equal(result.path.positions, shortest.positions)
+    assert f"{len(valid)} of {len(samples)} samples" in result.reason
+
+
+def test_the_straight_line_is_not_tried() -> None:
+    result = Diffusion().plan(Problem(PANDA, Scene([]), LEFT, JointGoal(RIGHT[None])), time_limit=60.0)
+    assert result.stage == "network" and result.path_length is not None
+    assert result.path_length > np.linalg.norm(RIGHT - LEFT) + 1e-4
+
+
+def test_weights_are_used_with_their_own_sampler_and_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    levels: list[float] = []
+
+    def denoise(self, features, level, *rest, own=MotionModel.denoise):
+        levels.append(float(level[0]))
+        return own(self, features, level, *rest)
+
+    monkeypatch.setattr(MotionModel, "denoise", denoise)
+    model = Diffusion().model(PANDA)  # the one that planners will be given
+    assert model is not None
+    for steps, calls in ((None, model.settings.sampling_steps), (3, 3)):
+        levels.clear()
+        Diffusion(DiffusionSettings(sampling_steps=steps)).plan(PROBLEM, time_limit=60.0)
+        assert len(levels) == calls and levels[0] == 1.0
+    monkeypatch.setattr(model, "settings", replace(model.settings, sampling_steps=None))
+    levels.clear()
+    Diffusion(DiffusionSettings(samples=1, guidance_steps=0)).plan(PROBLEM, time_limit=1e-3)
+    assert len(levels) == model.settings.schedule.steps
+
+
+def test_batches_repeat_until_one_has_a_valid_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    batches = []
+
+    def draw(self, *arguments, own=Diffusion.draw, **more):
+        batches.append(own(self, *arguments, **more))
+        if len(batches) < 3:
+            batches[-1][:, 24] = LEFT + 1.5  # away and back: not valid
+        return batches[-1]
+
+    monkeypatch.setattr(Diffusion, "draw", draw)
+    result = Diffusion().plan(PROBLEM, time_limit=60.0)
+    assert result.solved and len(batches) == 3 and "of 48 samples" in result.reason
+
+
+def test_more_batches_after_the_first_path_make_it_no_longer() -> None:
+    first = Diffusion().plan(PROBLEM, time_limit=60.0)
+    more = Diffusion(DiffusionSettings(optimize_time=1.0)).plan(PROBLEM, time_limit=60.0)
+    assert first.path is not None and more.path is not None
+    assert more.path.length <= first.path.length and more.planning_time >= 1.0
+    assert [length for _, length in more.progress] == sorted({length for _, length in more.progress})[::-1]
+
+
+def test_no_valid_sample_says_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    def line(self, _model, _checker, _code, start, goals, _rng, **_how):
+        return (start + np.linspace(0, 1, 48)[:, None] * (goals[0] - start))[None]
+
+    monkeypatch.setattr(Diffusion, "draw", line)
+    result = Diffusion().plan(PROBLEM, time_limit=0.1)
+    assert result.status is Status.TIMEOUT and result.reason.startswith("0 of ")
+    assert result.refused == "scene_collision"
+
+
+def test_a_robot_without_weights_is_refused() -> None:
+    stranger = replace(PANDA, name="stranger")
+    with pytest.raises(
+        InputError, match="no weights of the network model come with the package for stranger"
+    ):
+        Diffusion().plan(Problem(stranger, Scene([BALL]), LEFT, JointGoal(RIGHT[None])))
+
+
+def test_settings_are_checked() -> None:
+    with pytest.raises(InputError, match=r"diffusion\.optimize_time is -1"):
+        DiffusionSettings(optimize_time=-1.0)
+    with pytest.raises(InputError, match=r"diffusion\.sampling_steps is 0; it must be at least 1"):
+        DiffusionSettings(sampling_steps=0)

@@ -1,0 +1,279 @@
+"""The default planner: every stage verified, point clouds, robots without weights, reproducible."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.box_arm import box_arm
+from helpers.small_model import small_model
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.learning.checkpoint import load_model
+from robotdiffuse.learning.samplers import SAMPLERS
+from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.planning.search.aorrtc import AORRTCSettings
+from robotdiffuse.planning.search.anytime import SLICE, AnytimeSearch
+from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
+from robotdiffuse.planning.diffusion.hybrid import (
+    BATCH_WORK,
+    RobotDiffuse,
+    RobotDiffuseSettings,
+    unlearned_starts,
+)
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.scenes.surface_points import sample_surface
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, PointCloud, Sphere
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify, verify_trajectory
+
+PANDA = load_robot("panda")
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+BALL = Sphere([0.5, 0.0, 0.4], 0.15, name="ball")
+PROBLEM = Problem(PANDA, Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
+
+
+@pytest.fixture(scope="module")
+def planner():
+    return RobotDiffuse()
+
+
+@pytest.fixture
+def no_search(monkeypatch):
+    """Search counts its iterations and finds nothing, so that the network's batches are the only help."""
+
+    def idle(self):
+        self.work, self._tried = self.work + SLICE, self._tried + SLICE
+
+    monkeypatch.setattr(AnytimeSearch, "_slice", idle)
+
+
+def test_the_network_solves_and_the_judge_agrees(planner, no_search):
+    result = planner.plan(PROBLEM, time_limit=10.0)
+    assert result.stage == "network" and result.path is not None and result.trajectory is not None
+    assert verify(PROBLEM, result.path).valid and verify_trajectory(PROBLEM, result.trajectory).valid
+    assert np.array_equal(result.path.positions[[0, -1]], np.stack([LEFT, RIGHT]))
+    assert result.min_clearance is not None and result.min_clearance > 0
+
+
+@pytest.mark.parametrize("index", range(8))
+def test_solved_means_verified(planner, index):
+    problem = ROP.draw(PANDA, np.random.default_rng([12, index])).problem(PANDA)
+    result = planner.plan(problem, time_limit=10.0, seed=index)
+    if result.solved:
+        assert result.path is not None and verify(problem, result.path).valid
+    else:
+        assert result.status is Status.TIMEOUT and result.reason
+
+
+def test_same_seed_same_path(planner):
+    first, second = (planner.plan(PROBLEM, time_limit=10.0, seed=3).path for _ in range(2))
+    assert first is not None and second is not None
+    assert np.array_equal(first.positions, second.positions)
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_any_sampler_plans(sampler, no_search):
+    planner = RobotDiffuse(RobotDiffuseSettings(sampler=sampler, guided_share=1.0, sampling_steps=8))
+    result = planner.plan(PROBLEM, time_limit=10.0)
+    assert result.stage == "network" and result.path is not None and verify(PROBLEM, result.path).valid
+
+
+def test_weights_that_can_do_without_the_code_are_not_told_it(planner, no_search, monkeypatch):
+    """The code of the scene made none of the hybrid's paths shorter, and took 2 ms."""
+    monkeypatch.setattr("robotdiffuse.planning.diffusion.hybrid.encode", None)
+    assert planner.plan(PROBLEM, time_limit=10.0).stage == "network"
+
+
+def test_weights_that_cannot_do_without_the_code_are_told_it(planner):
+    model = small_model().for_inference()
+    assert not model.settings.null_condition
+    checker = CollisionChecker(box_arm(), Scene([BALL]))
+    code = planner.code(model, checker, np.random.default_rng(0))
+    assert code.shape == (model.settings.code,) and np.isfinite(code).all()
+
+
+def test_a_free_straight_line_is_the_answer(planner):
+    result = planner.plan(Problem(PANDA, Scene(), LEFT, JointGoal(RIGHT[None])), time_limit=10.0)
+    assert result.stage == "straight_line" and result.path_length == pytest.approx(1.8)
+
+
+def test_a_point_cloud_in_place_of_shapes(planner, no_search):
+    """What a camera sees: the same ball as points."""
+    points = sample_surface(PROBLEM.scene, 4000, np.random.default_rng(0))
+    problem = Problem(PANDA, Scene([PointCloud(points, 0.01)]), LEFT, JointGoal(RIGHT[None]))
+    result = planner.plan(problem, time_limit=10.0)
+    assert result.path is not None and result.stage in ("network", "refinement")
+    assert verify(PROBLEM, result.path).valid, "the ball lies within its points"
+
+
+def test_several_goals_and_pose_goals(planner):
+    goals = RIGHT + np.outer([0.0, 0.3, -0.3], np.eye(7)[0])
+    result = planner.plan(Problem(PANDA, Scene([BALL]), LEFT, JointGoal(goals)), time_limit=10.0)
+    assert result.path is not None and (result.path.positions[-1] == goals).all(axis=1).any()
+    T = link_pose(PANDA, RIGHT, "panda_hand")
+    result = planner.plan(Problem(PANDA, Scene([BALL]), LEFT, PoseGoal("panda_hand", T)), time_limit=10.0)
+    assert result.path is not None
+    assert np.allclose(link_pose(PANDA, result.path.positions[-1], "panda_hand"), T, atol=1e-3)
+
+
+def test_search_answers_where_the_network_gives_nothing(planner, monkeypatch):
+    def nothing(self, *_arguments):
+        return np.zeros((1, 2, 7), np.float32)
+
+    monkeypatch.setattr(RobotDiffuse, "draw", nothing)
+    monkeypatch.setattr(RobotDiffuse, "refine", nothing)
+    result = planner.plan(PROBLEM, time_limit=10.0)
+    assert result.stage == "aorrtc" and result.path is not None
+    assert verify(PROBLEM, result.path).valid
+
+
+def test_the_first_path_comes_before_the_network_is_asked(monkeypatch):
+    """So time that runs out while it samples costs no plan; and what is returned is no longer."""
+    began = []
+
+    def late(self, *arguments, draw=RobotDiffuse.draw):
+        began.append(time.perf_counter() - start)
+        time.sleep(0.3)
+        return draw(self, *arguments)
+
+    planner = RobotDiffuse(RobotDiffuseSettings(network_share=0.9))  # which is due soon after the path
+    planner.plan(PROBLEM, time_limit=10.0)
+    monkeypatch.setattr(RobotDiffuse, "draw", late)
+    start = time.perf_counter()
+    result = planner.plan(PROBLEM, time_limit=2.0, until="limit")
+    assert result.path is not None and verify(PROBLEM, result.path).valid
+    (first, longest), *_, (_, shortest) = result.progress
+    assert first < began[0] and result.path.length == pytest.approx(shortest) and shortest <= longest
+
+
+def test_a_call_loads_the_network_in_its_own_time_or_not_at_all(monkeypatch):
+    """The second call of a process was late once by what loading took: it came before the clock."""
+    loaded, model = [], RobotDiffuse.model
+    monkeypatch.setattr(RobotDiffuse, "model", lambda self, robot: loaded.append(robot) or model(self, robot))
+    planner = RobotDiffuse(RobotDiffuseSettings(network_share=0.9))  # which is due soon after the path
+    for _ in range(2):
+        assert planner.plan(PROBLEM, time_limit=0.5, until="limit").stage == "aorrtc"
+    assert not loaded
+    planner.load_wanted(PANDA)
+    assert loaded == [PANDA]
+    planner.plan(PROBLEM, time_limit=0.5, until="limit")
+    assert len(loaded) > 1, "at hand, it is used"
+    loaded.clear()
+    fresh = RobotDiffuse()
+    fresh.load_wanted(PANDA)
+    fresh.warm_up(PROBLEM)
+    assert not loaded, "nothing wanted it"
+    fresh.warm_up(PROBLEM, "short")
+    assert loaded
+
+
+def test_batches_have_their_share_of_the_work(monkeypatch):
+    drawn = []
+    draw = RobotDiffuse.draw
+    monkeypatch.setattr(RobotDiffuse, "draw", lambda *arguments: drawn.append(1) or draw(*arguments))
+    counts = {}
+    for share in (0.0, 0.5):
+        drawn.clear()
+        settings = RobotDiffuseSettings(network_share=share, search=AORRTCSettings(patience=40_000))
+        assert RobotDiffuse(settings).plan(PROBLEM, time_limit=60.0).solved
+        counts[share] = len(drawn)
+    assert counts[0.0] == 0 and counts[0.5] >= 40_000 // BATCH_WORK - 1
+
+
+def test_a_candidate_that_the_judge_refuses_is_not_returned(planner, monkeypatch):
+    """The compiled check is not the judge: candidates through the ball are called free here, and refused."""
+
+    def through(self, _model, _checker, _code, start, goals, _rng):
+        line = start + np.linspace(0, 1, 48)[:, None] * (goals[0] - start)
+        return line[None].astype(np.float32)
+
+    monkeypatch.setattr(RobotDiffuse, "draw", through)
+    result = planner.plan(PROBLEM, time_limit=10.0)
+    assert result.path is not None and result.stage != "network" and verify(PROBLEM, result.path).valid
+
+
+def test_a_robot_without_weights_is_planned_by_search_and_noise(planner):
+    stranger = replace(PANDA, name="stranger")
+    assert planner.model(stranger) is None
+    result = planner.plan(Problem(stranger, Scene([BALL]), LEFT, JointGoal(RIGHT[None])), time_limit=10.0)
+    assert result.stage in ("aorrtc", "smooth_noise") and result.solved
+    assert any("no weights" in note for note in result.notes)
+
+
+def test_smooth_noise_solves_and_the_judge_agrees(planner, no_search):
+    problem = Problem(replace(PANDA, name="stranger"), Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
+    result = planner.plan(problem, time_limit=10.0)
+    assert result.stage == "smooth_noise" and result.path is not None and verify(problem, result.path).valid
+
+
+def test_invalid_start(planner):
+    scene = Scene([Sphere(link_pose(PANDA, LEFT, "panda_hand")[:3, 3], 0.1, name="crate")])
+    result = planner.plan(Problem(PANDA, scene, LEFT, JointGoal(RIGHT[None])))
+    assert result.status is Status.INVALID_START and "crate" in result.reason
+
+
+def test_the_code_tells_scenes_apart():
+    """z of two clouds of one scene is nearer than z of clouds of two scenes."""
+    model = load_model("panda")
+    assert model is not None
+    rng = np.random.default_rng(0)
+    near = CollisionChecker(PANDA, Scene([BALL]))
+    far = CollisionChecker(PANDA, Scene([Box([-0.4, 0.4, 0.5], [0.2, 0.2, 0.2])]))
+    a, b, c = (encode(model, checker, 320, rng) for checker in (near, near, far))
+    assert np.linalg.norm(a - b) < 0.5 * np.linalg.norm(a - c)
+
+
+def test_unlearned_starts_keep_ends_and_limits():
+    q = unlearned_starts(LEFT, RIGHT, 16, 48, PANDA, np.random.default_rng(0))
+    assert q.shape == (16, 48, 7)
+    assert (q[:, 0] == LEFT).all() and (q[:, -1] == RIGHT).all()
+    assert (q >= PANDA.lower).all() and (q <= PANDA.upper).all()
+    assert np.allclose(np.diff(q[0], axis=0), (RIGHT - LEFT) / 47)
+
+
+def test_the_guidance_scale_reaches_the_network():
+    checker, model = CollisionChecker(PANDA, PROBLEM.scene), load_model("panda")
+    assert model is not None
+    code = encode(model, checker, 320, np.random.default_rng(0))
+    plain, same, strong = (
+        RobotDiffuse(RobotDiffuseSettings(samples=2, guidance_steps=0)).draw(
+            model, checker, code, LEFT, RIGHT[None], np.random.default_rng(1), guidance_scale=scale
+        )
+        for scale in (1.0, 1.0, 3.0)
+    )
+    assert np.array_equal(plain, same) and np.abs(strong - plain).max() > 0.01
+
+
+def test_the_paper_s_planner_has_a_guidance_scale():
+    paths = [
+        Diffusion(DiffusionSettings(guidance_scale=scale)).plan(PROBLEM, time_limit=10.0).path
+        for scale in (0.0, 1.0, 3.0)
+    ]
+    assert all(path is not None and verify(PROBLEM, path).valid for path in paths)
+    assert len({path.length for path in paths if path is not None}) == 3
+
+
+def test_locked_joints_that_the_network_does_not_know_keep_the_weights():
+    """Fingers at another opening; an arm joint that is held leaves the network fewer joints."""
+    for opening in (0.0, 0.065):
+        robot = load_robot("panda", locked={"panda_finger_joint1": opening})
+        assert weights_for("model", robot) is not None and RobotDiffuse().model(robot) is not None
+    assert weights_for("model", load_robot("panda", locked={"panda_joint7": 0.3})) is None
+
+
+def test_settings_and_weights_are_checked(tmp_path):
+    with pytest.raises(InputError, match=r"robotdiffuse\.samples is 0"):
+        RobotDiffuseSettings(samples=0)
+    with pytest.raises(InputError, match=r"robotdiffuse\.guided_share is -0.1"):
+        RobotDiffuseSettings(guided_share=-0.1)
+    with pytest.raises(InputError, match=r"unknown robotdiffuse\.sampler 'heun'; known: ddim, ddpm"):
+        RobotDiffuseSettings(sampler="heun")
+    with pytest.raises(InputError, match="model"):
+        RobotDiffuse(RobotDiffuseSettings(weights=str(tmp_path)))

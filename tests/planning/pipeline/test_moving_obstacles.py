@@ -1,0 +1,184 @@
+"""Planning among obstacles that move, motions that begin moving, and the reactive loop."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.certificates.checker import check
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import PLANNERS
+from robotdiffuse.planning.pipeline.moving_obstacles_kernel import WAITED, earliest
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify_trajectory
+
+PANDA = rd.load_robot("panda")
+START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
+CROSSING = rd.MovingObstacle(rd.Sphere([0.95, 0.0, 0.45], 0.12, name="ball"), velocity=[-0.15, 0, 0])
+"""In the way when the arm would come by at full speed; it then goes on over the base."""
+PASSING = rd.MovingObstacle(rd.Box([0.55, -0.5, 0.4], [0.1, 0.1, 0.8], name="cart"), velocity=[0, 0.3, 0])
+
+
+def problem(*moving: rd.MovingObstacle, **more: object) -> rd.Problem:
+    return rd.Problem(PANDA, rd.Scene(), START, END, moving=moving, **more)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("obstacle", [CROSSING, PASSING])
+@pytest.mark.parametrize("jerk", [None, 300.0])
+def test_motion_is_certified_in_time(obstacle: rd.MovingObstacle, jerk: float | None) -> None:
+    task = problem(obstacle)
+    planner = rd.load_planner("rrt_connect")
+    still = planner.plan(replace(task, moving=()), 10.0, until="first", jerk=jerk).trajectory
+    assert still is not None
+    found = planner.plan(task, 10.0, jerk=jerk)
+    assert found.status is Status.SOLVED, found.reason
+    assert found.trajectory is not None
+    assert verify_trajectory(task, found.trajectory).valid
+    motion, least = found.trajectory, np.inf
+    for t in np.arange(0.0, motion.duration, 0.02):
+        q = np.array([np.interp(t, motion.times, column) for column in motion.positions.T])
+        exact = ExactCollision(PANDA, rd.Scene([obstacle.at(t)]))
+        least = min(least, *(d.distance for d in exact.link_distances(q)))
+    assert found.scene_clearance is not None
+    assert 0 < found.scene_clearance <= least + 1e-9
+
+
+@pytest.mark.parametrize("name", ["aorrtc", "robotdiffuse", "smooth", "lattice"])
+def test_any_planner_finds_the_path(name: str) -> None:
+    known = {"smooth": "a_star", "lattice": "d_star_lite"}
+    found = rd.load_planner(known.get(name, name)).plan(problem(PASSING), 20.0, until="first")
+    assert found.status in (Status.SOLVED, Status.TIMEOUT, Status.NO_PATH)
+    if found.trajectory is not None:
+        assert verify_trajectory(problem(PASSING), found.trajectory).valid
+    assert name in known or found.status is Status.SOLVED
+    assert known.get(name, name) in PLANNERS
+
+
+def test_start_that_is_hit_at_once() -> None:
+    at = rd.MovingObstacle(rd.Sphere([0.3, -0.45, 0.45], 0.2, name="ball"), velocity=[0, 0, 0.1])
+    found = rd.load_planner("rrt_connect").plan(problem(at))
+    assert found.status is Status.INVALID_START
+    assert "touches ball" in found.reason
+
+
+def test_no_way_by_a_wall_that_comes() -> None:
+    wall = rd.MovingObstacle(rd.Box([0, 2.0, 0.5], [4, 0.1, 4], name="wall"), velocity=[0, -2.5, 0])
+    found = rd.load_planner("rrt_connect").plan(problem(wall), 0.5)
+    assert found.status is Status.TIMEOUT
+    assert "moving obstacles" in found.reason
+
+
+def test_earliest_waits_for_what_passes() -> None:
+    """Three configurations in a row, the middle one taken at ticks 1 to 3, both ends of a step checked."""
+    clear = np.ones((3, 10), bool)
+    clear[1, 1:4] = False
+    args = np.array([0, 2]), np.array([0]), np.array([1]), np.array([0, 3]), np.array([0, 1, 2])
+    way, found = earliest(clear, *args)
+    assert found
+    assert way == [WAITED] * 4 + [0]
+    clear[0, 2] = False  # and it comes by the start before
+    assert not earliest(clear, *args)[1]
+
+
+VELOCITIES = [np.eye(7)[0] * 2.0, np.array([0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6]), -np.eye(7)[0]]
+
+
+@pytest.mark.parametrize("velocity", VELOCITIES)
+def test_motion_begins_moving(velocity: np.ndarray) -> None:
+    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
+    found = rd.load_planner("rrt_connect").plan(task, 5.0)
+    assert found.status is Status.SOLVED, found.reason
+    assert found.trajectory is not None
+    assert np.allclose(found.trajectory.velocities[0], velocity, atol=1e-9)
+    assert (np.abs(found.trajectory.velocities) <= PANDA.velocity * (1 + 1e-6)).all()
+    assert (np.abs(found.trajectory.accelerations) <= PANDA.acceleration * (1 + 1e-3)).all()
+    assert verify_trajectory(task, found.trajectory).valid
+    at_rest = verify_trajectory(replace(task, start_velocity=None), found.trajectory).violation
+    assert at_rest is not None
+    assert at_rest.kind in ("rest", "acceleration")
+
+
+@pytest.mark.parametrize(
+    ("velocity", "message"),
+    [
+        ([0.1] * 6, "start_velocity is .*; it must be 7 finite numbers"),
+        ([np.nan] * 7, "start_velocity is .*; it must be 7 finite numbers"),
+        ([9.0, 0, 0, 0, 0, 0, 0], "start_velocity: panda_joint1 is 9; its velocity limit is 2.17"),
+    ],
+)
+def test_start_velocities_that_are_none(velocity: list[float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
+
+
+def test_start_velocity_into_a_limit() -> None:
+    start = START.copy()
+    start[0] = PANDA.upper[0] - 0.01
+    task = rd.Problem(PANDA, rd.Scene(), start, END, start_velocity=np.eye(7)[0] * 2.0)
+    found = rd.load_planner("rrt_connect").plan(task)
+    assert found.status is Status.INVALID_START
+    assert "panda_joint1 cannot stop" in found.reason
+
+
+def test_start_velocity_beyond_what_scaling_leaves() -> None:
+    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=np.eye(7)[0] * 2.0)
+    with pytest.raises(InputError, match=r"velocity_scaling leaves it 1\.08"):
+        rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
+    with pytest.raises(InputError, match="jerk cannot be limited beside start_velocity"):
+        rd.load_planner("rrt_connect").plan(task, jerk=100.0)
+
+
+UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
+BESIDE: dict[str, dict[str, object]] = {
+    "waypoints": {"waypoints": [(START + END) / 2 - [0, 0.3, 0, 0, 0, 0, 0], START]},
+    "constraints": {"constraints": [UPRIGHT]},
+    "payload": {"payload": rd.Payload(2.0)},
+    "all": {"waypoints": [[-0.6, *START[1:]]], "constraints": [UPRIGHT]},
+}
+
+
+@pytest.mark.parametrize("asked", BESIDE)
+def test_what_else_is_asked_holds_among_moving_obstacles(asked: str) -> None:
+    if asked == "payload":
+        pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
+    obstacle = PASSING if asked == "waypoints" else CROSSING
+    task = problem(obstacle, **BESIDE[asked])
+    found = rd.load_planner("rrt_connect").plan(task, 20.0)
+    assert found.trajectory is not None, found.reason
+    motion = found.trajectory
+    assert verify_trajectory(task, motion).valid
+    for t in np.arange(0.0, motion.duration, 0.02):
+        q = np.array([np.interp(t, motion.times, column) for column in motion.positions.T])
+        exact = ExactCollision(PANDA, rd.Scene([obstacle.at(t)]))
+        assert min(d.distance for d in exact.link_distances(q)) > 0
+        tilt = np.arccos(min(-link_pose(PANDA, q, "panda_hand")[2, 2], 1.0))
+        assert "constraints" not in BESIDE[asked] or tilt <= UPRIGHT.angle + 1e-6
+    resting = np.abs(motion.velocities).max(axis=1) < 1e-9
+    for waypoint in task.waypoints:
+        there = np.abs(motion.positions - waypoint.positions[0]).max(axis=1) < 1e-6  # type: ignore[union-attr]
+        assert (there & resting).any()
+    if asked != "payload":  # of which certificates say nothing
+        assert check(rd.certify(task, motion), task).valid
+
+
+def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
+    """The waypoint is on the straight line, where nothing would stop the motion; a ball is there first."""
+    middle = (START + END) / 2
+    at = link_pose(PANDA, middle, "panda_hand")[:3, 3]
+    ball = rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3])
+    task = problem(ball, waypoints=[middle])
+    found = rd.load_planner("rrt_connect").plan(task, 20.0)
+    assert found.trajectory is not None, found.reason
+    assert verify_trajectory(task, found.trajectory).valid
+    alone = rd.load_planner("rrt_connect").plan(replace(task, moving=()), 20.0).trajectory
+    assert alone is not None and found.trajectory.duration > alone.duration
+
+
+def test_the_loop_says_what_it_does_not_know() -> None:
+    ball = rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1, name="ball"), max_speed=0.1)
+    for more in BESIDE.values():
+        with pytest.raises(InputError, match=r"problem\.\w+: the replanner knows of none"):
+            rd.Replanner(problem(ball, **more))

@@ -1,0 +1,202 @@
+"""Policies for unseen space: rungs only add obstacles, carved free at the ends; what results say of it."""
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from jaxtyping import Float32
+from numpy import ndarray
+
+from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.planning.context import Request
+from robotdiffuse.perception.confidence import RATES, confidence
+from robotdiffuse.perception.assumptions import (
+    CARVED,
+    FINE,
+    FINE_SHAPE,
+    PADDINGS,
+    THRESHOLDS,
+    Padded,
+    Voxels,
+    rungs,
+    voxels_in,
+)
+from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, surface, sweep
+from robotdiffuse.planning.pipeline.unknown_space import AS_SEEN, plan_beside_unseen
+from robotdiffuse.problems.problem import PoseGoal, Problem
+from robotdiffuse.core.results import load_result
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose, placed_spheres
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, observe
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box
+from robotdiffuse.core.types import FIRST, Status
+from robotdiffuse.validation.validator import verify
+
+PANDA = load_robot("panda")
+START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+GOAL = np.array([0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+DEEP = Scene([Box([0.55, 0.0, 0.3], [0.5, 0.2, 0.6])])
+"""A box that goes from far ahead to close to the arm; a camera ahead sees its front."""
+AHEAD = looking_at(np.array([1.7, 0.0, 0.3]), np.array([0.0, 0.0, 0.3]))
+REQUEST = Request()
+
+
+@pytest.fixture(scope="module")
+def planner() -> Planner:
+    return load_planner("aorrtc")
+
+
+def taken(scene: Scene, T: ndarray = AHEAD) -> DepthView:
+    return ray_cast(scene, T, (150.0, 150.0, 79.5, 59.5), (160, 120), PANDA, START)
+
+
+def partial(unseen: str, *views: DepthView) -> Problem:
+    return Problem(PANDA, Scene(), START, GOAL, views=views or (taken(DEEP),), unseen=unseen)
+
+
+def true_voxels() -> Float32[ndarray, "nx ny nz"]:
+    return voxels_within(DEEP, LOW, FINE, FINE_SHAPE).astype(np.float32)
+
+
+@pytest.mark.parametrize("unseen", ["optimistic", "padded", "occupied"])
+def test_solved_means_free_of_what_was_seen(planner: Planner, unseen: str) -> None:
+    problem = partial(unseen)
+    result = planner.plan(problem, time_limit=2.0)
+    assert (result.rung != "") == (result.confidence is not None) == result.solved
+    if result.solved:
+        assert result.path is not None and verify(problem, result.path).valid
+    if unseen == "optimistic":
+        assert result.rung == AS_SEEN and result.unseen_region is not None
+    if unseen == "occupied" and not result.solved:
+        assert "space that no view saw" in result.reason
+
+
+def test_imagined_obstacles_are_kept_clear_of(planner: Planner) -> None:
+    """As seen, the way leads through the back of the box; with its voxels imagined, past it."""
+    truth = Problem(PANDA, DEEP, START, GOAL)
+    through = planner.plan(partial("optimistic"), time_limit=2.0)
+    assert through.path is not None and not verify(truth, through.path).valid
+    past = plan_beside_unseen(planner, partial("imagined"), 4.0, 0, REQUEST, true_voxels())
+    assert past.rung == "imagined, p > 0.1" and past.swept_probability == 0
+    assert past.path is not None and verify(truth, past.path).valid
+    assert past.confidence is not None and through.confidence is not None
+    assert past.confidence > through.confidence
+
+
+def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Planner) -> None:
+    everywhere = np.full(FINE_SHAPE, np.float32(0.01))
+    problem = partial("imagined")
+    chosen = plan_beside_unseen(planner, problem, 4.0, 0, REQUEST, everywhere)
+    first = planner.attempt(replace(problem, views=()), 1.0, 0, REQUEST)
+    unknown = observe(problem.views, PANDA, START).unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
+    swept = np.zeros(FINE_SHAPE, np.bool_)
+    assert first.path is not None and chosen.swept_probability is not None
+    path = first.path.positions.astype(np.float32)
+    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(FINE), swept)
+    assert chosen.swept_probability <= 0.01 * (swept & unknown & ~voxels_in(ends)).sum() * (1 + 1e-3)
+
+
+def test_occupied_crosses_nothing_unseen_but_at_the_ends(planner: Planner) -> None:
+    around = [(2.4, 0.0, 0.6), (-2.4, 0.0, 0.6), (0.0, 2.4, 0.6), (0.0, -2.4, 0.6), (0.1, 0.0, 3.2)]
+    behind = Scene([Box([-0.6, 0.0, 0.3], [0.3, 0.3, 0.3])])
+    views = [taken(behind, looking_at(np.array(at), np.array([0.0, 0.0, 0.4]))) for at in around]
+    near = START + 0.15 * (GOAL - START)
+    problem = replace(partial("occupied", *views), goal=near)
+    result = planner.plan(problem, time_limit=20.0, until=FIRST)
+    assert result.rung == "unseen is occupied" and result.confidence == RATES["unseen is occupied"]
+    assert result.path is not None
+    ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, near)]).astype(np.float32)
+    swept, path = np.zeros(SHAPE, np.bool_), result.path.positions.astype(np.float32)
+    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(VOXEL), swept)
+    unknown = observe(problem.views, PANDA, START).unknown & ~voxels_in(ends, CARVED + VOXEL / 2, VOXEL)
+    assert unknown.any() and not (swept & unknown).any()
+
+
+def test_goals_given_as_a_pose(planner: Planner) -> None:
+    goal = PoseGoal(PANDA.tip, link_pose(PANDA, GOAL, PANDA.tip))
+    problem = replace(partial("padded"), goal=goal)
+    result = planner.plan(problem, time_limit=3.0)
+    assert result.path is not None and verify(problem, result.path).valid
+
+
+def test_an_end_in_what_was_seen_is_named(planner: Planner) -> None:
+    blocked = Scene([Box(link_pose(PANDA, GOAL, PANDA.tip)[:3, 3], [0.3, 0.3, 0.3])])
+    result = planner.plan(partial("padded", taken(blocked)), time_limit=4.0)
+    assert result.status is Status.INVALID_GOAL and result.rung == "" and result.confidence is None
+
+
+def test_rungs_are_carved_free_at_the_ends() -> None:
+    ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
+    solid = np.ones(FINE_SHAPE, np.bool_)
+    volume = observe([taken(DEEP)], PANDA, START)
+    chain = [*rungs(partial("padded"), volume, None), *rungs(partial("occupied"), volume, None)]
+    assert [rung.padding for rung in chain if isinstance(rung, Padded)] == list(PADDINGS)
+    for rung in (*chain, Voxels("all", solid, partial("imagined"))):
+        cloud = rung.obstacles(ends)
+        away = np.linalg.norm(cloud.points[:, None] - ends[None, :, :3], axis=2) - ends[:, 3]
+        assert len(cloud.points) and away.min() > cloud.point_radius
+        assert rung.touched(ends) > 0 or isinstance(rung, Padded)
+    assert len(Voxels("all", solid, partial("imagined")).obstacles(ends[:1]).points) < 0.15 * solid.size
+
+
+def test_thresholds_fall_from_rung_to_rung() -> None:
+    volume = observe([taken(DEEP)], PANDA, START)
+    p = np.random.default_rng(0).random(FINE_SHAPE).astype(np.float32) ** 3
+    occupied = [rung.occupied for rung in rungs(partial("imagined"), volume, p) if isinstance(rung, Voxels)]
+    assert len(occupied) == len(THRESHOLDS)
+    assert all((b <= a).all() and b.sum() < a.sum() for a, b in pairwise(occupied))
+
+
+def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:
+    path = np.stack([START, GOAL]).astype(np.float32)
+    swept = np.zeros(SHAPE, np.bool_)
+    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(VOXEL), swept)
+    centres = (np.argwhere(np.ones(SHAPE)) + 0.5) * VOXEL + LOW
+    moving = {link for link in PANDA.spheres if PANDA.link_frame(link) > 0}
+    fixed = sum(len(spheres) for link, spheres in PANDA.spheres.items() if link not in moving)
+    for t in (0.0, 0.5, 1.0):
+        spheres = placed_spheres(PANDA, START + t * (GOAL - START))[fixed:]
+        distances = np.linalg.norm(centres[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
+        within = (distances < -0.002).any(axis=1).reshape(SHAPE)
+        assert within.any() and swept[within].all()
+
+
+def test_confidence_falls_with_the_probability_that_is_swept() -> None:
+    for rung in ("imagined, p > 0.1", AS_SEEN):
+        stated = [confidence(rung, risk) for risk in (0.0, 0.1, 1.0, 10.0, 1000.0)]
+        assert all(0 <= b <= a <= 1 for a, b in pairwise(stated))
+    assert all(0 < confidence(rung) < 1 for rung in RATES)
+
+
+def test_files_of_results_keep_it(planner: Planner, tmp_path: Path) -> None:
+    result = plan_beside_unseen(planner, partial("imagined"), 4.0, 0, REQUEST, true_voxels())
+    result.save(tmp_path / "result.json")
+    again = load_result(tmp_path / "result.json").result
+    for name in ("rung", "confidence", "swept_probability", "unseen_region"):
+        assert getattr(again, name) == getattr(result, name)
+    assert again.unseen_region is not None and len(again.unseen_region[0]) == 3
+
+
+def test_the_part_that_weighs_most_is_boxed() -> None:
+    marked, weights = np.zeros((6, 7, 8), np.bool_), np.ones((6, 7, 8), np.float32)
+    marked[0, 0, :3], marked[5, 6, 7], marked[3:5, 3, 3] = True, True, True
+    assert heaviest_part(marked, weights).tolist() == [[0, 0, 0], [1, 1, 3]]
+    weights[5, 6, 7] = 4.0
+    assert heaviest_part(marked, weights).tolist() == [[5, 6, 7], [6, 7, 8]]
+    assert summed(weights, marked) == 9.0
+    assert not heaviest_part(np.zeros_like(marked), weights).any()
+
+
+def test_the_surface_is_what_has_a_face_outside() -> None:
+    marked = np.zeros((5, 5, 5), np.bool_)
+    marked[1:4, 1:4, 1:4] = True
+    assert len(surface(marked)) == 26 and [2, 2, 2] not in surface(marked).tolist()
+    assert len(surface(np.ones((3, 3, 3), np.bool_))) == 0

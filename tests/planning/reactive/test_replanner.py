@@ -1,0 +1,147 @@
+"""The reactive loop: what it hands out always ends at rest before anything can get there."""
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.collision.moving_obstacles import MovingCollision
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.validation.validator import verify_trajectory
+
+PANDA = rd.load_robot("panda")
+START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
+SPEED, PERIOD = 0.4, 0.02
+FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
+
+
+def balls(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where balls are at first, and their velocities: through the arm's workspace after 1 to 2 s."""
+    rng = np.random.default_rng(seed)
+    through = np.column_stack([rng.uniform(0.4, 0.7, count), rng.uniform(-0.3, 0.3, count), [0.5] * count])
+    ways = np.column_stack([rng.choice([-1.0, 1.0], count), rng.normal(size=(count, 2)) * [0.3, 0.2]])
+    ways = ways[:, [1, 0, 2]]
+    velocities = SPEED * rng.uniform(0.5, 0.95, (count, 1)) * ways / np.linalg.norm(ways, axis=1)[:, None]
+    return through - rng.uniform(1.5, 2.5, (count, 1)) * velocities, velocities
+
+
+def loop(places: np.ndarray) -> rd.Replanner:
+    moving = [rd.MovingObstacle(rd.Sphere(place, 0.1), max_speed=SPEED) for place in places]
+    return rd.Replanner(rd.Problem(PANDA, rd.Scene([FLOOR]), START, END, moving=moving))
+
+
+@pytest.mark.parametrize(("count", "seed"), [(1, 0), (2, 1), (3, 2)])
+def test_every_command_is_a_certified_stop(count: int, seed: int) -> None:
+    places, velocities = balls(count, seed)
+    replanner = loop(places)
+    names = [one.name for one in replanner.problem.moving]
+    before, renewed, arrived = None, 0, False
+    for k in range(600):
+        now = k * PERIOD
+        seen = places + now * velocities
+        command = replanner.step(dict(zip(names, seen, strict=True)), now)
+        motion = command.motion
+        assert command.begins == pytest.approx(now + PERIOD)
+        assert np.abs(motion.velocities[-1]).max() == 0
+        assert (np.abs(motion.velocities) <= PANDA.velocity).all()
+        assert (np.abs(motion.accelerations) <= PANDA.acceleration).all()
+        if before is not None:  # it goes on where the last one is then
+            at = command.begins - before.begins
+            rows = before.motion
+            for what in ("positions", "velocities"):
+                then = [np.interp(at, rows.times, column) for column in getattr(rows, what).T]
+                assert np.allclose(getattr(motion, what)[0], then, atol=2e-3 if what == "positions" else 0.05)
+        if command.renewed:
+            renewed += 1
+            anywhere = [rd.MovingObstacle(rd.Sphere(place, 0.1), max_speed=SPEED) for place in seen]
+            judge = MovingCollision(PANDA, anywhere, 1e-4, 0.5)
+            assert judge.sweep(motion.times + PERIOD, motion.positions).contact is None
+            still = rd.Problem(
+                PANDA,
+                rd.Scene([FLOOR]),
+                motion.positions[0],
+                motion.positions[-1],
+                start_velocity=motion.velocities[0],
+            )
+            violation = verify_trajectory(still, motion).violation
+            assert violation is None, violation
+        before, arrived = command, command.arrived
+        if arrived:
+            break
+    assert arrived
+    assert renewed > 10
+    assert np.allclose(motion.positions[-1], END, atol=1e-9)
+
+
+def test_same_observations_give_the_same_motions() -> None:
+    places, velocities = balls(3, 1)
+    loops = loop(places), loop(places)
+    names = [one.name for one in loops[0].problem.moving]
+    for k in range(60):
+        seen = dict(zip(names, places + k * PERIOD * velocities, strict=True))
+        one, other = (each.step(seen, k * PERIOD) for each in loops)
+        assert np.array_equal(one.motion.positions, other.motion.positions)
+
+
+def test_a_late_step_finds_the_arm_where_the_last_command_left_it() -> None:
+    replanner = loop(np.array([[0.5, 3.0, 0.5]]))
+    command = replanner.step({}, 0.0)
+    for k in range(1, 15):
+        command = replanner.step({}, k * PERIOD)
+    assert np.abs(command.motion.velocities[0]).max() > 0.5
+    late = replanner.step({}, 15 * PERIOD + 3.0)
+    assert np.allclose(late.motion.positions[0], command.motion.positions[-1], atol=1e-9)
+
+
+def test_what_is_not_seen_can_be_further_each_time() -> None:
+    """A ball that is not seen again keeps the arm at rest after a while, wherever it is."""
+    replanner = loop(np.array([[0.5, 1.6, 0.5]]))
+    replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
+    late = replanner.step({}, 10.0)
+    assert not late.renewed
+
+
+def test_obstacle_that_stands_in_the_goal_is_waited_for() -> None:
+    from robotdiffuse.robots.kinematics import link_pose
+
+    place = link_pose(PANDA, END, "panda_hand")[:3, 3]
+    replanner = loop(place[None])
+    for k in range(100):
+        command = replanner.step({"sphere": place}, k * PERIOD)
+    assert not command.arrived
+    for k in range(100, 700):
+        command = replanner.step({"sphere": place + 0.3 * PERIOD * (k - 99) * np.eye(3)[1]}, k * PERIOD)
+        if command.arrived:
+            break
+    assert command.arrived
+
+
+@pytest.mark.parametrize(
+    ("observation", "now", "message"),
+    [
+        ({"sphere": [0.5, 1.6, 0.5]}, 0.0, "now is 0 s after 0 s; time must go on"),
+        ({"sphere": [0.5, 1.6, 0.5]}, -1.0, "now is -1 s after 0 s; time must go on"),
+        ({"sphere": [0.5, 1.6, 0.5]}, np.nan, "now is nan; it must be a finite number of seconds"),
+        ({"ball": [0.5, 1.6, 0.5]}, 0.1, "unknown obstacle in observation: 'ball'"),
+        ({"sphere": [0.5, np.nan, 0.5]}, 0.1, r"observation\['sphere'\] is"),
+        ({"sphere": [0.5, 1.0, 0.5]}, 0.1, r"observation\['sphere'\] is 0.6 m from where it was 0.1 s ago"),
+    ],
+)
+def test_steps_that_make_no_sense(observation: object, now: float, message: str) -> None:
+    replanner = loop(np.array([[0.5, 1.6, 0.5]]))
+    replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
+    with pytest.raises(InputError, match=message):
+        replanner.step(observation, now)  # type: ignore[arg-type]
+
+
+def test_loops_that_cannot_begin() -> None:
+    with pytest.raises(InputError, match=r"problem\.moving is empty"):
+        rd.Replanner(rd.Problem(PANDA, rd.Scene(), START, END))
+    inside = rd.Problem(
+        PANDA,
+        rd.Scene([rd.Sphere([0.35, -0.5, 0.4], 0.3)]),
+        START,
+        END,
+        moving=[rd.MovingObstacle(rd.Sphere([3, 3, 3], 0.1), max_speed=1.0)],
+    )
+    with pytest.raises(InputError, match="the replanner cannot begin: the start is in collision"):
+        rd.Replanner(inside)

@@ -1,0 +1,224 @@
+"""AORRTC: paths below the bound, shorter with time; `until`, the clearance and the scaling of a call."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.trajectories.simplification import simplify, tighten
+from robotdiffuse.planning import context
+from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
+from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.problems.held_out import held_out_problem
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify
+
+PANDA = load_robot("panda")
+WALL = Scene([Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.8], name="wall")])
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+AROUND = Problem(PANDA, WALL, LEFT, RIGHT)
+
+
+def ends() -> tuple[np.ndarray, np.ndarray]:
+    return LEFT.astype(np.float32), RIGHT[None].astype(np.float32)
+
+
+def test_paths_are_below_the_bound_and_join_the_ends() -> None:
+    space = search_space(CollisionChecker(PANDA, WALL), 0.04)
+    start, goals = ends()
+    longest, bound, found = np.float32(1.0), np.float32(np.inf), 0
+    state = random_state(0)
+    for _ in range(20):
+        trees = rrt_kernel.make_trees(start, goals, 20_000)
+        path = rrt_kernel.search(space, trees, goals, bound, longest, 5_000, state)
+        if not len(path):
+            break
+        assert path_length(path) <= bound + 1e-4
+        assert np.array_equal(path[0], start) and np.array_equal(path[-1], goals[0])
+        assert motions_free(space, path).all()
+        for tree in (0, 1):  # costs are the lengths of the ways from the roots
+            size = trees.sizes[tree]
+            nodes, parents, costs = (
+                trees.nodes[tree, :size],
+                trees.parents[tree, :size],
+                trees.costs[tree, :size],
+            )
+            for n in np.flatnonzero(parents >= 0):
+                step = np.linalg.norm(nodes[n] - nodes[parents[n]])
+                assert costs[n] == pytest.approx(costs[parents[n]] + step, abs=1e-3)
+        bound, found = np.float32(path_length(path)), found + 1
+    assert found >= 3
+
+
+@pytest.mark.parametrize("limit", [2.0, 0.05])
+def test_trees_that_are_kept_hold_free_edges_and_change_no_path(limit: float) -> None:
+    """Of a search that found a path, and of one that hardly can in its time: walls on both sides, one
+    above."""
+    walls = [Box([x, 0.0, 0.6], [1.4, 0.05, 2.4], name=f"wall{x}") for x in (-0.95, 0.95)]
+    scene = WALL if limit > 1 else Scene([*walls, Box([0.0, 0.0, 1.2], [0.6, 0.05, 0.6], name="above")])
+    problem = replace(AROUND, scene=scene)
+    kept = AORRTC(AORRTCSettings(keep_trees=True)).plan(problem, limit, until="first")
+    plain = AORRTC().plan(problem, limit, until="first")
+    assert plain.trees == () and len(kept.trees) == 2
+    assert limit < 1 or (kept.solved and plain.solved)
+    if kept.path is not None and plain.path is not None:
+        assert np.array_equal(kept.path.positions, plain.path.positions)
+    space = search_space(CollisionChecker(PANDA, problem.scene), 0.04)
+    for tree, root in zip(kept.trees, (LEFT, RIGHT), strict=True):
+        children = np.flatnonzero(tree.parents >= 0)
+        assert np.array_equal(tree.nodes[0], root.astype(np.float32)) and len(children)
+        for child in children:
+            parent = tree.parents[child]
+            assert parent < child
+            assert motions_free(space, tree.nodes[[parent, child]]).all()
+    assert "trees" not in kept.record()
+
+
+def test_samples_are_in_the_spheroid_of_a_goal() -> None:
+    start, goals = ends()
+    goals = np.concatenate([goals, goals + np.float32(0.5)])
+    bound = np.float32(1.3 * np.linalg.norm(goals[0] - start))
+    far = np.full(7, 10.0, np.float32)
+    space = search_space(CollisionChecker(PANDA, WALL), 0.04)._replace(lower=-far, upper=far)
+    shares, state, q = rrt_kernel._shares(start, goals, bound), random_state(3), np.empty(7, np.float32)
+    near = np.zeros(2)
+    for _ in range(2_000):
+        rrt_kernel._sample_within(space, start, goals, shares, bound, q, state)
+        through = np.linalg.norm(q - start) + np.linalg.norm(q - goals, axis=1)
+        assert through.min() <= bound + 1e-4
+        near += through <= bound
+    assert (near > 100).all()
+
+
+@pytest.mark.parametrize("planner", [AORRTC(), RRTConnect()], ids=["aorrtc", "rrt_connect"])
+def test_longer_is_no_longer(planner: AORRTC | RRTConnect) -> None:
+    planner.plan(AROUND, 1e-3)  # compiles
+    first, short, limit = (
+        planner.plan(AROUND, 1.0, seed=3, until=until) for until in ("first", "short", "limit")
+    )
+    assert first.path_length is not None and short.path_length is not None and limit.path_length is not None
+    assert limit.path_length <= short.path_length <= first.path_length
+    for result in (first, short, limit):
+        assert result.path is not None and verify(AROUND, result.path).valid
+        lengths = [length for _, length in result.progress]
+        assert lengths == sorted(lengths, reverse=True) and lengths[-1] == result.path_length
+
+
+def test_the_same_seed_gives_the_same_path() -> None:
+    one, two, other = (AORRTC().plan(AROUND, 20.0, seed=seed) for seed in (4, 4, 5))
+    assert one.path is not None and two.path is not None and other.path is not None
+    assert np.array_equal(one.path.positions, two.path.positions)
+    assert not np.array_equal(one.path.positions, other.path.positions)
+
+
+def test_a_free_straight_line_is_the_answer() -> None:
+    result = AORRTC().plan(
+        Problem(PANDA, Scene(), LEFT, JointGoal(np.stack([-LEFT * [1, 0, 0, -1, 0, -1, 1], RIGHT])))
+    )
+    assert result.path is not None and result.stage == "straight_line"
+    assert len(result.path.positions) == 2
+
+
+def test_the_clearance_is_kept_or_it_is_said_that_it_is_not() -> None:
+    for asked in (0.0, 0.02, 0.05):
+        result = AORRTC().plan(AROUND, 5.0, clearance=asked)
+        assert result.scene_clearance is not None
+        least = CollisionChecker(PANDA, WALL)
+        assert result.trajectory is not None
+        legs = pairwise(result.trajectory.positions)  # rounded corners keep it too
+        dense = np.concatenate([np.linspace(a, b, 5) for a, b in legs])
+        assert least.link_clearances(dense).min() >= asked - 0.002 and not result.notes
+    # between the plates the arm does not keep 20 cm
+    narrow = AORRTC().plan(AROUND, 5.0, clearance=0.3)
+    assert narrow.solved and any("not 30 cm" in note for note in narrow.notes)
+
+
+def test_the_problem_says_the_clearance_unless_the_call_does() -> None:
+    wide = Problem(PANDA, WALL, LEFT, RIGHT, clearance=0.05)
+    kept, less = AORRTC().plan(wide, 5.0), AORRTC().plan(wide, 5.0, clearance=0.0)
+    assert kept.path_length is not None and less.path_length is not None
+    assert kept.path_length > less.path_length
+    with pytest.raises(InputError, match=r"clearance is -0\.1; it must be a distance from 0 to 10000 m"):
+        Problem(PANDA, WALL, LEFT, RIGHT, clearance=-0.1)
+
+
+def test_scaled_motions_are_slower() -> None:
+    full, half = (
+        AORRTC().plan(AROUND, 20.0, velocity_scaling=v, acceleration_scaling=v * v) for v in (1.0, 0.5)
+    )
+    assert full.trajectory is not None and half.trajectory is not None
+    assert half.trajectory.duration == pytest.approx(2 * full.trajectory.duration, rel=0.01)
+
+
+def test_a_limit_of_jerk_is_kept_by_a_certified_motion() -> None:
+    free, gentle = (
+        AORRTC().plan(AROUND, 20.0, until="first", jerk=jerk).trajectory for jerk in (None, 100.0)
+    )
+    assert free is not None and gentle is not None
+    rates = np.diff(gentle.accelerations, axis=0) / np.diff(gentle.times)[:, None]
+    assert np.abs(rates).max() <= 100.0 * (1 + 1e-6)
+    assert free.duration < gentle.duration < 2 * free.duration
+
+
+def test_no_gain_asked_for_is_no_end() -> None:
+    """With `gain` 0 the search stopped at once where there was no path at half the work."""
+    result = AORRTC(AORRTCSettings(gain=0.0, patience=0)).plan(AROUND, 0.5)
+    assert result.solved and len(result.progress) > 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"until": "soon"}, r"until"),
+        ({"clearance": float("nan")}, "clearance is nan"),
+        ({"velocity_scaling": 0.0}, r"velocity_scaling is 0\.0; it must be above 0 and at most 1"),
+        ({"acceleration_scaling": 1.5}, r"acceleration_scaling is 1\.5"),
+        ({"jerk": 0.0}, r"jerk is 0\.0; it must be"),
+    ],
+)
+def test_arguments_are_checked(arguments: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        AORRTC().plan(AROUND, **arguments)
+
+
+def test_a_short_limit_is_a_time_out() -> None:
+    result = AORRTC().plan(AROUND, 1e-6)
+    assert result.status is Status.TIMEOUT and result.path is None
+
+
+def test_one_slow_judging_does_not_take_later_calls_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A first call that loads code judged for a second; calls of a tenth of that then ended at once."""
+    monkeypatch.setitem(context._finishing, "panda", 1.0)
+    assert AORRTC().plan(AROUND, 0.3, until="limit").solved
+    assert context._finishing["panda"] < 1.0
+
+
+def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
+    space = search_space(CollisionChecker(PANDA, WALL), 0.04)
+    for seed in range(5):
+        state, trees = random_state(seed), rrt_kernel.make_trees(*ends(), 5_000)
+        path = rrt_kernel.connect(space, trees, np.float32(1.0), 100_000, state)
+        for rounds, tries in ((0, 0), (1, 0), (4, 10), (1, 300)):
+            short = tighten(space, simplify(space, path, rounds), tries, state)
+            assert np.array_equal(short[[0, -1]], path[[0, -1]])
+            assert path_length(short) <= path_length(path) + 1e-4
+            assert motions_free(space, short).all()
+
+
+def test_a_long_way_round_is_left_again() -> None:
+    """Bounded rounds found nothing below a first path that went round a shelf, where restarts did."""
+    problem = replace(held_out_problem("shelf", 3), clearance=0.0)
+    result = AORRTC(AORRTCSettings(patience=40_000)).plan(problem, time_limit=60.0)
+    assert result.path is not None and result.path.length < 8.0

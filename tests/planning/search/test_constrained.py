@@ -1,0 +1,135 @@
+"""Planning under path constraints: what is found keeps them at every millimetre, by kinematics that share no
+code with search and judge; what cannot be is told."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.planning import load_planner
+from robotdiffuse.problems.constraints import Constraint
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.kinematics import link_pose, link_poses
+from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
+from robotdiffuse.core.types import Path, Status
+from robotdiffuse.validation.validator import verify, verify_trajectory
+
+PANDA = rd.load_robot("panda")
+START = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
+GOAL = np.array([0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
+HAND = "panda_hand"
+AT = link_pose(PANDA, START, HAND)[:3, 3]
+WALL = rd.Box([0.5, 0.0, 0.2], [0.3, 0.06, 0.4], name="wall")
+UPRIGHT = rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], np.radians(10))
+LINE = rd.CartesianLine(HAND, 1e-3, 0.02, 0.25)
+PLANE = rd.OnPlane(HAND, AT, [0, 0, 1], 2e-3)
+CASES: list[tuple[list[Constraint], rd.Scene]] = [
+    ([UPRIGHT], rd.Scene([WALL])),
+    ([LINE], rd.Scene()),
+    ([PLANE], rd.Scene([rd.Box([0.6, 0.0, 0.25], [0.05, 0.06, 0.3], name="post")])),
+    ([rd.OnLine(HAND, AT, [0, 1, 0], 2e-3)], rd.Scene()),
+    ([rd.PositionBox(HAND, [0.2, -0.6, 0.1], [0.8, 0.6, 0.7]), UPRIGHT], rd.Scene([WALL])),
+]
+
+
+def problem(constraints: list[Constraint], scene: rd.Scene | None = None) -> Problem:
+    return Problem(PANDA, scene or rd.Scene(), START, GOAL, constraints=constraints)
+
+
+def excess(constraint: Constraint, q: np.ndarray) -> float:
+    """How far the worst of configurations [n, dof] is beyond a constraint [m] or [rad], by hand."""
+    T = link_poses(PANDA, q, constraint.frame)
+    p = T[:, :3, 3]
+    if isinstance(constraint, rd.AxisCone):
+        cosines = T[:, :3, :3] @ constraint.axis @ constraint.direction
+        return float(np.arccos(min(cosines.min(), 1.0))) - constraint.angle
+    if isinstance(constraint, rd.PositionBox):
+        return float(np.maximum(constraint.low - p, p - constraint.high).max())
+    if isinstance(constraint, rd.OnPlane):
+        return float(np.abs((p - constraint.point) @ constraint.normal).max()) - constraint.tolerance
+    if isinstance(constraint, rd.OnLine):
+        off = np.linalg.norm(np.cross(p - constraint.point, constraint.direction), axis=1)
+        return float(off.max()) - constraint.tolerance
+    first, last = link_pose(PANDA, START, HAND), link_pose(PANDA, GOAL, HAND)
+    way = last[:3, 3] - first[:3, 3]
+    share = np.clip((p - first[:3, 3]) @ way / (way @ way), 0, 1)
+    off = np.linalg.norm(p - first[:3, 3] - share[:, None] * way, axis=1) - constraint.tolerance
+    # start and goal have the same orientation here but for a turn of the base joint, about the vertical
+    ups = (rotation_from_rpy(0.0, 0.0, 1.2 * one) @ first[:3, :3] for one in share.tolist())
+    assert constraint.angle is not None
+    turned = max(rotation_angle(up.T @ R) for up, R in zip(ups, T[:, :3, :3], strict=True))
+    return max(float(off.max()), turned - constraint.angle)
+
+
+@pytest.mark.parametrize(
+    ("name", "stage"), [("rrt_connect", "constrained_rrt_connect"), ("diffusion", "network")]
+)
+@pytest.mark.parametrize(("constraints", "scene"), CASES, ids=[case[0][0].kind for case in CASES])
+def test_motions_keep_constraints_at_every_millimetre(
+    constraints: list[Constraint], scene: rd.Scene, name: str, stage: str
+) -> None:
+    made = problem(constraints, scene)
+    result = load_planner(name).plan(made, time_limit=20.0)
+    assert result.path is not None and result.trajectory is not None, result.reason
+    assert result.stage == stage
+    assert verify(made, result.path).valid and verify_trajectory(made, result.trajectory).valid
+    for rows in (result.path.positions, result.trajectory.positions):
+        for a, b in pairwise(rows):
+            steps = int(np.abs(b - a).sum() / 1e-3) + 2  # lever arms are below 1 m
+            between = a + np.linspace(0, 1, steps)[:, None] * (b - a)
+            assert max(excess(one, between) for one in constraints) <= 1e-9
+
+
+def test_speed_of_a_line_is_kept_and_used() -> None:
+    result = load_planner("aorrtc").plan(problem([LINE]), time_limit=20.0)
+    assert result.trajectory is not None, result.reason
+    t = result.trajectory
+    at = link_poses(PANDA, t.positions, HAND)[:, :3, 3]
+    speeds = np.linalg.norm(np.diff(at, axis=0), axis=1) / np.diff(t.times)
+    assert speeds.max() <= 0.25 * 1.001 and np.median(speeds) >= 0.24
+    slower = problem([replace(LINE, speed=0.2)])
+    found = verify_trajectory(slower, t).violation
+    assert found is not None and found.kind == "speed" and "allows 0.2 m/s" in found.message
+
+
+def test_judge_names_constraint_amount_and_place() -> None:
+    """The straight line in joint space turns the base joint: the hand is 103 mm off in its middle."""
+    straight = Path(PANDA.joint_names, np.stack([START, GOAL]))
+    found = verify(problem([LINE]), straight).violation
+    assert found is not None and (found.kind, found.subject, found.other) == ("constraint", HAND, LINE.kind)
+    assert found.excess == pytest.approx(0.1022, abs=1e-3) and 0 < found.time < 0.01
+    assert found.message == "cartesian_line of panda_hand is exceeded: 103.2 mm, of 1 allowed"
+    assert verify(problem([UPRIGHT]), straight).valid, "turning the base joint keeps the hand upright"
+
+
+def test_start_and_goal_that_do_not_keep_constraints_are_told_by_how_much() -> None:
+    tilted = START + np.array([0, 0, 0, 0, 0, 0.5, 0])
+    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), start=tilted))
+    assert told.status is Status.INVALID_START
+    assert "axis_cone of panda_hand is exceeded: 28.65 degrees, of 10 allowed" in told.reason
+    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=tilted))  # type: ignore[arg-type]
+    assert told.status is Status.INVALID_GOAL and "28.65 degrees" in told.reason
+    pose = rd.PoseGoal(HAND, link_pose(PANDA, tilted, HAND))
+    told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), goal=pose))
+    assert told.status is Status.INVALID_GOAL and "28.65 degrees" in told.reason
+
+
+def test_goal_pose_with_room_is_turned_until_it_keeps_the_constraint() -> None:
+    """A pose tilted by half a radian with any tilt allowed: few draws are upright, projection makes some."""
+    T = transform(AT + np.array([0.0, 0.4, 0.1])) @ transform(
+        np.zeros(3), rotation_from_rpy(np.pi - 0.5, 0.0, 0.0)
+    )
+    goal = rd.PoseGoal(HAND, T, [0.02] * 3, [0.7, 0.7, np.pi])
+    made = replace(problem([UPRIGHT]), goal=goal)
+    result = load_planner("aorrtc").plan(made, time_limit=20.0)
+    assert result.path is not None, result.reason
+    assert verify(made, result.path).valid
+
+
+def test_same_seed_same_path() -> None:
+    made = problem([UPRIGHT], rd.Scene([WALL]))
+    a, b = (load_planner("aorrtc").plan(made, time_limit=20.0, seed=3) for _ in range(2))
+    assert a.path is not None and b.path is not None
+    np.testing.assert_array_equal(a.path.positions, b.path.positions)

@@ -1,0 +1,270 @@
+"""Shared-Tree Informed RRT*: optimal in the limit, many goals at once, a safety distance, always verified."""
+
+from dataclasses import replace
+from itertools import pairwise, product
+from math import gcd
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from helpers.box_arm import box_arm
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.kernels.compiled import random_state
+from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.search.shared_tree import kernel
+from robotdiffuse.planning.search.shared_tree.planner import SharedTreeRRTStar, SharedTreeSearch, SharedTreeSettings
+from robotdiffuse.planning.search.shared_tree.tree import best_cost, make_tree
+from robotdiffuse.problems.families.rop import ROP
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify
+
+PANDA = load_robot("panda")
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+WALL = Scene([Box([0.45, 0.0, 0.25], [0.3, 0.05, 0.5], name="wall")])
+ENDLESS = SharedTreeSettings(improvement=0.0)
+TOUCHING = replace(ENDLESS, safety_distance=0.0)
+
+
+def two_joints():
+    """The planar arm with its last joint locked: configurations are a plane, and a grid knows the optimum."""
+    pairs = (("l1", "l2"), ("l1", "l3"), ("l2", "l3"))
+    arm = box_arm().with_locked({box_arm().joint_names[2]: 0.0})
+    return replace(arm, allowed_collisions=frozenset(map(frozenset, pairs)))
+
+
+def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray, cells: int) -> float:
+    """Shortest way over a grid whose steps go in 64 directions, so that it is at most 0.4 % too long."""
+    axis = np.linspace(-2.8, 2.8, cells)
+    h = axis[1] - axis[0]
+    free = checker.free(np.array(list(product(axis, axis)))).reshape(cells, cells)
+    steps = [(i, j) for i, j in product(range(-5, 6), repeat=2) if gcd(i, j) == 1]
+    rows, columns, lengths = [], [], []
+    number = np.arange(cells * cells).reshape(cells, cells)
+    for i, j in steps:
+        here = np.s_[max(0, -i) : cells - max(0, i), max(0, -j) : cells - max(0, j)]
+        there = np.s_[max(0, i) : cells - max(0, -i), max(0, j) : cells - max(0, -j)]
+        open_ = free[here] & free[there]
+        # what a long step passes over must be free as well
+        for t in np.arange(1, max(abs(i), abs(j))) / max(abs(i), abs(j)):
+            a, b = round(t * i), round(t * j)
+            middle = np.s_[max(0, -i) + a : cells - max(0, i) + a, max(0, -j) + b : cells - max(0, j) + b]
+            open_ = open_ & free[middle]
+        rows.append(number[here][open_])
+        columns.append(number[there][open_])
+        lengths.append(np.full(int(open_.sum()), h * np.hypot(i, j)))
+    graph = coo_array(
+        (np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))), (cells**2, cells**2)
+    )
+    a, b = (number[tuple(np.abs(axis - x).argmin() for x in q)] for q in (start, goal))
+    return float(dijkstra(graph.tocsr(), indices=a)[b])
+
+
+@pytest.fixture(scope="module")
+def planar():
+    """A planar problem with a detour, its checker, ends and optimum."""
+    robot = two_joints()
+    scene = Scene([Sphere([0.75, 0.0, 0.0], 0.2), Sphere([-0.3, 0.7, 0.0], 0.15)])
+    checker = CollisionChecker(robot, scene)
+    axis = np.linspace(-2.8, 2.8, 281)
+    start, goal = (np.array([axis[np.abs(axis - x).argmin()] for x in q]) for q in ((-0.9, 0.3), (0.9, -0.5)))
+    assert checker.free(np.stack([start, goal])).all()
+    return checker, start, goal, grid_optimum(checker, start, goal, 281)
+
+
+def test_rrt_star_alone_converges_to_the_optimum(planar) -> None:
+    """Choose-parent and rewiring without RRT-Connect and shortcuts: what asymptotic optimality promises."""
+    checker, start, goal, optimum = planar
+    assert optimum > 1.1 * np.linalg.norm(goal - start), "the straight line must not do"
+    space = search_space(checker, 0.01)
+    goals = goal[None].astype(np.float32)
+    tree = make_tree(start.astype(np.float32), goals, 60_000)
+    state, costs = random_state(0), []
+    for iterations in (500, 3_000, 30_000):
+        kernel.grow(space, tree, np.float32(0.5), np.float32(0.1), iterations, state)
+        costs.append(float(best_cost(tree)) / optimum)
+    assert costs[0] > costs[1] > costs[2]
+    # the grid's own error: 0.4 % of direction, and cells of 0.02 rad at the obstacle's edge
+    assert 0.985 < costs[2] < 1.01
+
+
+def test_rounds_reach_the_optimum_quickly(planar) -> None:
+    checker, start, goal, optimum = planar
+    settings = replace(TOUCHING, resolution=0.01)
+    search = SharedTreeSearch(checker, start, goal[None], settings, random_state(1))
+    for _ in range(20):
+        search.round()
+    assert 0.985 < search.cost / optimum < 1.01
+    assert all(a >= b for a, b in pairwise(search.costs))
+
+
+def consistent(tree) -> None:
+    """Parents, children and costs agree."""
+    n = int(tree.size[0])
+    for node in range(1, n):
+        parent = int(tree.parent[node])
+        gap = np.linalg.norm(tree.nodes[node].astype(float) - tree.nodes[parent])
+        assert abs(tree.cost[node] - tree.cost[parent] - gap) < 1e-3
+        siblings, child = [], int(tree.child[parent])
+        while child >= 0:
+            siblings.append(child)
+            child = int(tree.sibling[child])
+        assert siblings.count(node) == 1
+
+
+def test_the_tree_stays_a_tree() -> None:
+    """With goals reached, rewired, grafted, and room made anew."""
+    checker = CollisionChecker(PANDA, WALL)
+    goals = RIGHT + np.pad([[0.0, 0.0, 0.0], [0.2, 0.2, 0.0], [0.1, -0.3, 0.3]], ((0, 0), (0, 4)))
+    settings = replace(TOUCHING, capacity=64, growth=400)
+    search = SharedTreeSearch(checker, LEFT, goals, settings, random_state(2))
+    for _ in range(5):
+        search.round()
+    assert search.nodes > 64
+    consistent(search._tree)
+    for g, cost in enumerate(search.goal_costs):
+        path = search.path(g)
+        if path is not None:
+            np.testing.assert_allclose(np.linalg.norm(np.diff(path, axis=0), axis=1).sum(), cost, rtol=1e-4)
+            np.testing.assert_array_equal(path[[0, -1]], np.stack([LEFT, goals[g]]).astype(np.float32))
+
+
+def test_samples_fill_the_hyperspheroid_evenly() -> None:
+    """Every sample could lie on a shorter path; and the share in a smaller spheroid is that of its volume."""
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 4)).astype(np.float32)
+    wide = np.full(4, 100, np.float32)
+    gap, state = np.float32(np.linalg.norm(b - a)), random_state(0)
+    length, inner = 1.5 * gap, 1.2 * gap
+    out, sums = np.empty(4, np.float32), []
+    for _ in range(20_000):
+        kernel.sample_hyperspheroid(a, b, length, -wide, wide, state, out)
+        sums.append(np.linalg.norm(out - a) + np.linalg.norm(out - b))
+    assert max(sums) <= length * 1.0001
+    volume = [c * (c**2 - gap**2) ** 1.5 for c in (inner, length)]
+    share, expected = np.mean(np.array(sums) < inner), volume[0] / volume[1]
+    assert abs(share - expected) < 4 * np.sqrt(expected / 20_000)
+
+
+def test_the_cheapest_goal_wins_and_every_goal_has_its_cost() -> None:
+    goals = np.stack([RIGHT, RIGHT, LEFT])
+    goals[1:, :2] += [[0.2, 0.2], [0.1, 0.4]]
+    checker = CollisionChecker(PANDA, WALL)
+    assert checker.free(goals).all()
+    search = SharedTreeSearch(checker, LEFT, goals, TOUCHING, random_state(0))
+    assert search.best_goal == 2 and search.finished, "its straight line is free: nothing can be shorter"
+    search = SharedTreeSearch(checker, LEFT, goals[:2], TOUCHING, random_state(0))
+    for _ in range(30):
+        search.round()
+    costs = search.goal_costs
+    assert np.isfinite(costs[search.best_goal]) and search.cost == costs.min()
+    single = [SharedTreeSearch(checker, LEFT, g[None], TOUCHING, random_state(1)) for g in goals[:2]]
+    for other in single:
+        for _ in range(30):
+            other.round()
+    assert search.cost < 1.02 * min(other.cost for other in single)
+
+
+def test_the_safety_distance_is_kept() -> None:
+    checker = CollisionChecker(PANDA, WALL)
+    ends = checker.link_clearances(np.stack([LEFT, RIGHT])).min(axis=1)
+    assert (ends > 0.06).all()
+    for distance in (0.0, 0.05):
+        settings = replace(ENDLESS, safety_distance=distance, resolution=0.01)
+        search = SharedTreeSearch(checker, LEFT, RIGHT[None], settings, random_state(0))
+        for _ in range(10):
+            search.round()
+        path = search.path()
+        assert path is not None and search.safety_distance == distance
+        fine = np.concatenate([a + np.linspace(0, 1, 60)[:, None] * (b - a) for a, b in pairwise(path)])
+        least = checker.link_clearances(fine).min()
+        assert distance - 0.002 < least < distance + 0.02, "the shortest way passes at this distance"
+
+
+def test_near_a_close_end_the_distance_is_relaxed() -> None:
+    """Away from an end that is closer than the safety distance the rest of the way still keeps it."""
+    checker = CollisionChecker(PANDA, WALL)
+    close = LEFT.copy()
+    while checker.link_clearances(close[None]).min() > 0.01:
+        close[0] -= 0.002
+    settings = replace(ENDLESS, resolution=0.01)
+    search = SharedTreeSearch(checker, close, RIGHT[None], settings, random_state(0))
+    for _ in range(10):
+        search.round()
+    path = search.path()
+    assert path is not None and search.safety_distance == 0.05
+    fine = np.concatenate([a + np.linspace(0, 1, 60)[:, None] * (b - a) for a, b in pairwise(path)])
+    clearance = checker.link_clearances(fine).min(axis=1)
+    away = np.linalg.norm(fine - close, axis=1)
+    allowed = np.minimum(0.05, clearance[0] + 0.1 * (away + 0.1))
+    assert clearance[0] < 0.01 < 0.04 < clearance[away > 0.6].min()
+    # half a step of the relaxation, and what hides between two checks
+    assert (clearance > np.minimum(0.05, clearance[0] + 0.1 * away) - 0.01).all(), allowed
+
+
+def test_a_gap_too_narrow_for_the_distance_lowers_it() -> None:
+    """One joint, one way: between two balls, 1.1 cm from either."""
+    arm = two_joints()
+    arm = arm.with_locked({arm.joint_names[1]: 0.0})
+    checker = CollisionChecker(arm, Scene([Sphere([0.87, 0.0, side * 0.16], 0.1) for side in (1, -1)]))
+    start, goal = np.array([-0.9]), np.array([0.9])
+    least = checker.link_clearances(np.linspace(start, goal, 200)).min()
+    assert 0.01 < least < 0.02
+    search = SharedTreeSearch(checker, start, goal[None], ENDLESS, random_state(0))
+    search.run(lambda: search.cost < np.inf)
+    assert search.safety_distance == pytest.approx(0.01) and search.cost == pytest.approx(1.8)
+
+
+@pytest.mark.parametrize("family", [ROP, ROP_DENSE], ids=["rop", "rop_dense"])
+@pytest.mark.parametrize("index", range(4))
+def test_solved_means_verified(family, index) -> None:
+    problem = family.draw(PANDA, np.random.default_rng([21, index])).problem(PANDA)
+    result = SharedTreeRRTStar().plan(problem, time_limit=5.0)
+    assert result.status in (Status.SOLVED, Status.NO_PATH)
+    if result.solved:
+        assert result.path is not None and verify(problem, result.path).valid
+        assert np.array_equal(result.path.positions[0], problem.start)
+
+
+def test_the_same_seed_gives_the_same_path() -> None:
+    problem = Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None]))
+    first, second = (load_planner("shared_tree_rrt_star").plan(problem, 120.0, seed=4) for _ in range(2))
+    assert first.path is not None and second.path is not None
+    assert np.array_equal(first.path.positions, second.path.positions)
+
+
+def test_a_pose_is_planned_to_with_many_goals() -> None:
+    T = link_pose(PANDA, RIGHT, "panda_hand")
+    result = SharedTreeRRTStar().plan(Problem(PANDA, WALL, LEFT, PoseGoal("panda_hand", T)), 5.0)
+    assert result.solved and " goals reached" in result.reason
+    assert result.path is not None
+    np.testing.assert_allclose(link_pose(PANDA, result.path.positions[-1], "panda_hand"), T, atol=1e-5)
+
+
+def test_no_way_ends_at_the_time_limit_or_when_it_was_searched_for_at_every_distance() -> None:
+    walls = [Box([side * 0.65, 0.0, 0.5], [1.0, 0.02, 3.0]) for side in (1, -1)]
+    sealed = Scene([*walls, Box([0.0, 0.0, 1.35], [3.0, 0.02, 1.3])])
+    problem = Problem(PANDA, sealed, LEFT, JointGoal(RIGHT[None]))
+    for step_rounds, limit, status in ((10**9, 0.3, Status.TIMEOUT), (1, 60.0, Status.NO_PATH)):
+        settings = SharedTreeSettings(step_rounds=step_rounds, growth=10, connect_iterations=10)
+        result = SharedTreeRRTStar(settings).plan(problem, time_limit=limit)
+        assert result.status is status and result.path is None and result.reason
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("range", 0.0), ("safety_distance", -0.1), ("goal_bias", 1.0), ("patience", 0), ("growth", 0)],
+)
+def test_bad_settings_are_refused(name: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"shared_tree_rrt_star.{name} is {value}"):
+        replace(SharedTreeSettings(), **{name: value})

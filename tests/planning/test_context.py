@@ -1,0 +1,102 @@
+"""What a call of a planner notes on the way: shorter and shorter paths, and what the judge refused."""
+
+import subprocess
+import sys
+import time
+
+import numpy as np
+from numba import njit
+
+from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.search.shared_tree.planner import SharedTreeRRTStar, SharedTreeSettings
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.core.types import Status
+
+START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+
+
+def turned(angle: float) -> np.ndarray:
+    return START + np.array([angle, 0, 0, 0, 0, 0, 0])
+
+
+def problem(scene: Scene) -> Problem:
+    return Problem(load_robot("panda"), scene, START, turned(1.2))
+
+
+def blocked() -> Problem:
+    return problem(Scene([Sphere((0.4, 0.3, 0.6), 0.15)]))
+
+
+def call_on(scene: Scene) -> Call:
+    return Call("test", problem(scene), time_limit=10.0, seed=0)
+
+
+def test_progress_falls_and_ends_with_the_returned_path() -> None:
+    call = call_on(Scene([]))
+    for length in (5.0, 3.0, 4.0, 0.9):  # 4 is no improvement; 0.9 is shorter than what is returned
+        call.improved(length)
+    result = call.finish(np.stack([START, turned(1.2)]), "test")
+    assert result is not None and result.path is not None
+    lengths = [length for _, length in result.progress]
+    np.testing.assert_allclose(lengths, [5.0, 3.0, 1.2])
+    assert result.progress[-1] == (result.planning_time, result.path.length)
+
+
+def test_returned_path_keeps_the_time_at_which_it_was_found() -> None:
+    call = call_on(Scene([]))
+    call.improved(1.2)
+    result = call.finish(np.stack([START, turned(1.2)]), "test")
+    assert result is not None
+    assert len(result.progress) == 1 and result.progress[0][0] < result.planning_time
+
+
+def test_failure_tells_what_the_judge_refused() -> None:
+    call = Call("test", blocked(), time_limit=10.0, seed=0)
+    assert call.unsolved().refused == ""
+    assert call.finish(np.stack([START, turned(1.2)]), "test") is None
+    assert call.unsolved().refused == "scene_collision"
+    assert call.finish(np.stack([START, turned(0.1)]), "test") is None
+    assert call.unsolved().refused == "goal"
+
+
+def test_a_search_that_ended_is_told_from_one_that_ran_out_of_time() -> None:
+    ended = Call("test", blocked(), time_limit=10.0, seed=0).unsolved()
+    assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
+    late = Call("test", blocked(), time_limit=1e-9, seed=0).unsolved()
+    assert late.status is Status.TIMEOUT and "longer time limit" in late.reason
+
+
+def test_anytime_planner_reports_its_progress() -> None:
+    planner = SharedTreeRRTStar(SharedTreeSettings(safety_distance=0.0, rounds=40, improvement=0.0))
+    result = planner.plan(blocked(), time_limit=20.0)
+    assert result.path is not None, result.reason
+    times, lengths = np.array(result.progress).T
+    assert (np.diff(times) > 0).all() and (np.diff(lengths) < 0).all()
+    assert lengths[-1] == result.path.length
+
+
+def test_compiling_takes_no_time_of_the_call_and_is_noted() -> None:
+    began = time.perf_counter()
+    call = call_on(Scene([]))
+    before = call.elapsed
+    njit(lambda x: x + 1)(1)
+    waited, counted = time.perf_counter() - began, call.elapsed - before
+    assert counted < 0.5 * waited
+    [note] = call.fail(Status.TIMEOUT, "").notes
+    assert "compiled for" in note and "does not count" in note
+
+
+def test_a_solved_call_imports_no_toppra_and_no_matplotlib() -> None:
+    """toppra, which imports matplotlib, once cost the first call over a second; it is for who selects it."""
+    code = (
+        "import sys, numpy as np, robotdiffuse as rd\n"
+        f"start = np.array({START.tolist()})\n"
+        "problem = rd.Problem(rd.load_robot('panda'), rd.Scene([]), start, start + 0.2)\n"
+        "assert rd.plan(problem, time_limit=10.0).solved\n"
+        "print([name for name in ('toppra', 'matplotlib') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.strip() == "[]", done.stdout + done.stderr

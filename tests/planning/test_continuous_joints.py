@@ -1,0 +1,101 @@
+"""Joints that turn without end: values a turn apart are the same, and motions take the short way."""
+
+from dataclasses import replace
+from pathlib import Path as FilePath
+
+import numpy as np
+import pytest
+
+from helpers.box_arm import box_arm
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.start_goal import images
+from robotdiffuse.problems.problem import PoseGoal, Problem
+from robotdiffuse.robots import Robot
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.parsing.joint_limits import with_limits
+from robotdiffuse.robots.robot import TURNS
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box
+from robotdiffuse.core.types import Path
+from robotdiffuse.validation.validator import verify, verify_trajectory
+
+
+def turning_arm() -> Robot:
+    """The arm of boxes, whose first and last joints turn without end."""
+    arm = box_arm()
+    joints = tuple(
+        replace(joint, kind="continuous", lower=-TURNS, upper=TURNS) if joint.name in ("j0", "j2") else joint
+        for joint in arm.joints
+    )
+    return replace(arm, joints=joints)
+
+
+ARM = turning_arm()
+POST = Scene([Box([-0.7, 0.0, 0.0], [0.4, 0.05, 0.2], name="post")])
+"""Where the stretched arm points at half a turn."""
+
+
+def planned(
+    planner: str, start: list[float], goal: object, scene: Scene | None = None, **more: object
+) -> Path:
+    problem = Problem(ARM, scene or Scene(), start, goal)  # type: ignore[arg-type]
+    result = load_planner(planner).plan(problem, time_limit=5.0, **more)  # type: ignore[arg-type]
+    assert result.solved and result.path is not None and result.trajectory is not None, result.reason
+    assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    assert np.array_equal(result.path.positions[0], problem.start)
+    steps = np.abs(np.diff(result.trajectory.positions, axis=0)).max()
+    assert steps < 0.05  # no jump: 2 rad/s at rows of 10 ms
+    return result.path
+
+
+@pytest.mark.parametrize("planner", ["rrt_connect", "aorrtc", "robotdiffuse", "shared_tree_rrt_star"])
+@pytest.mark.parametrize("turns", [0, 1, -5])
+def test_from_3_to_minus_3_is_a_short_way(planner: str, turns: int) -> None:
+    """0.28 rad across half a turn, from wherever the joint really is; it was 6 rad."""
+    start = 3.0 + 2 * np.pi * turns
+    path = planned(planner, [start, 0.0, 0.0], [-3.0, 0.0, 0.0])
+    assert path.length == pytest.approx(2 * np.pi - 6, abs=1e-6)
+    assert path.positions[-1, 0] == pytest.approx(start + 2 * np.pi - 6)
+
+
+def test_the_long_way_where_something_blocks_the_short_one() -> None:
+    path = planned("aorrtc", [2.8, 0.0, 0.0], [-2.8, 0.0, 0.0], POST)
+    assert path.positions[-1, 0] == pytest.approx(-2.8)
+    assert path.length > 5.5
+
+
+def test_a_pose_is_reached_across_half_a_turn() -> None:
+    goal = PoseGoal("tip", link_pose(ARM, np.array([-2.9, 0.5, 0.2]), "tip"))
+    path = planned("aorrtc", [2.9, 0.5, 0.2], goal, until="limit")
+    assert path.length < 0.6
+
+
+def test_images_of_a_goal() -> None:
+    start = np.array([3.0, 1.0, -0.2])
+    nearest, first, last = images(ARM, start, np.array([-3.0 - 4 * np.pi, -1.0, 0.2]))
+    np.testing.assert_allclose(nearest, [2 * np.pi - 3, -1.0, 0.2])
+    np.testing.assert_allclose(first, [-3.0, -1.0, 0.2])
+    np.testing.assert_allclose(last, [2 * np.pi - 3, -1.0, 0.2 - 2 * np.pi])
+    assert len(images(box_arm(), start, start)) == 1
+    assert (np.abs([nearest, first, last]) <= TURNS).all()
+
+
+def test_limits_of_a_continuous_joint() -> None:
+    """The judge knows none; a file that gives some makes it revolute, and robots keep which it is."""
+    assert Problem(ARM, Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0]).start[0] == 50.0
+    narrow = with_limits(ARM, {"j0": {"lower": -1.0}})
+    assert (narrow.planned_joints[0].kind, narrow.lower[0], narrow.upper[0]) == ("revolute", -1.0, np.pi)
+    with pytest.raises(InputError, match="j0 is 50 rad; its limits are -1"):
+        Problem(narrow, Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("half, kind", [(np.pi, "continuous"), (1.0, "revolute"), (TURNS, "continuous")])
+def test_continuous_joints_of_robot_folders(half: float, kind: str, tmp_path: FilePath) -> None:
+    """Older ones hold half a turn either way, or what a limits file said."""
+    joints = tuple(replace(j, lower=-half, upper=half) if j.name == "j0" else j for j in ARM.joints)
+    write_bundle(replace(ARM, joints=joints), tmp_path, {})
+    robot = read_bundle(tmp_path)
+    assert robot.planned_joints[0].kind == kind
+    assert robot.upper[0] == (TURNS if kind == "continuous" else half)

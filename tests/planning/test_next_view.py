@@ -1,0 +1,81 @@
+"""Where to look next: from where what the motion crosses is in plain sight."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from robotdiffuse.cli import main
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.next_view import next_view, poses_around
+from robotdiffuse.perception.visibility_kernel import seen_weights
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.robots import load_robot
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box
+
+PANDA = load_robot("panda")
+START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+GOAL = np.array([0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
+WALL = Scene([Box([0.75, 0.0, 0.35], [0.05, 1.2, 0.7])])
+"""Ahead of the arm: a camera beyond sees nothing of what the arm crosses."""
+INTRINSICS = (150.0, 150.0, 79.5, 59.5)
+BEYOND, ABOVE = (
+    looking_at(np.array(at), np.array([0.3, 0.0, 0.3])) for at in ([1.9, 0.0, 0.35], [0.3, 0.0, 1.9])
+)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    view = ray_cast(WALL, BEYOND, INTRINSICS, (160, 120), PANDA, START)
+    return Problem(PANDA, Scene(), START, GOAL, views=(view,))
+
+
+@pytest.fixture(scope="module")
+def result(problem: Problem) -> PlanResult:
+    return load_planner("aorrtc").plan(problem, time_limit=2.0)
+
+
+def test_what_hides_counts_as_often_as_it_is_there() -> None:
+    """One voxel, cameras to both sides of it along x; before one of them something that is there by half."""
+    filled = np.zeros((20, 9, 9), np.float32)
+    filled[14, 4, 4] = 0.5
+    voxel, low = np.array([[8, 4, 4]]), np.zeros(3, np.float32)
+    middle = np.array([0.85, 0.45, 0.45])
+    poses = [looking_at(middle + np.array([x, 0, 0]), middle) for x in (3.0, -3.0)]
+    away = looking_at(middle + np.array([3, 0, 0]), middle + np.array([6, 0, 0]))
+    intrinsics = np.array([100, 100, 50, 40], np.float32)
+    stacked = np.stack([*poses, away]).astype(np.float32)
+    weights = np.array([2.0], np.float32)
+    seen = seen_weights(stacked, intrinsics, (81, 101), voxel, weights, filled, low, np.float32(0.1))
+    np.testing.assert_allclose(seen, [1.0, 2.0, 0.0], rtol=1e-6)
+
+
+def test_it_looks_from_where_nothing_is_in_the_way(problem: Problem, result: PlanResult) -> None:
+    found = next_view(problem, result, [BEYOND, ABOVE])
+    assert np.array_equal(found.T_base_camera, ABOVE) and 0.2 < found.seen <= 1
+    assert next_view(problem, result, [BEYOND]).seen < 0.1
+    anywhere = next_view(problem, result)
+    assert anywhere.seen >= max(next_view(problem, result, [T]).seen for T in poses_around()[::7])
+
+
+def test_what_was_looked_at_is_not_proposed_again(problem: Problem, result: PlanResult) -> None:
+    above = ray_cast(WALL, ABOVE, INTRINSICS, (160, 120), PANDA, START)
+    seen_twice = replace(problem, scene=Scene(), views=(*problem.views, above))
+    assert next_view(seen_twice, result, [ABOVE]).seen < next_view(problem, result, [ABOVE]).seen
+
+
+def test_misuse_is_refused(problem: Problem, result: PlanResult, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(InputError, match="has no views"):
+        next_view(Problem(PANDA, Scene(), START, GOAL), result)
+    with pytest.raises(InputError, match="poses is empty"):
+        next_view(problem, result, [])
+    with pytest.raises(InputError, match="no motion"):
+        next_view(problem, replace(result, path=None, trajectory=None))
+    with pytest.raises(InputError, match="T_base_camera"):
+        next_view(problem, result, [2 * np.eye(4)])
+    assert main(["plan", "examples/two_spheres.yaml", "--next-view"]) == 2
+    assert "--next-view is for problems that cameras saw" in capsys.readouterr().err

@@ -1,0 +1,71 @@
+"""Many problems: results in order, as alone; a process that dies costs one problem."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.planning import PLANNERS, SEARCH
+from robotdiffuse.planning.search.rrt_connect import RRTConnect
+from robotdiffuse.core.registry import Entry
+from robotdiffuse.core.types import Status
+
+PANDA = rd.load_robot("panda")
+LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
+BURIED = rd.Scene([rd.Sphere([0.0, 0.0, 0.3], 0.5, name="everything")])
+
+
+def problems() -> list[rd.Problem]:
+    heights = (0.2, 0.3, 0.4, 0.5, 0.6)
+    scenes = [rd.Scene([rd.Box([0.45, 0.0, h], [0.3, 0.05, 0.4], name="wall")]) for h in heights]
+    return [rd.Problem(PANDA, scene, LEFT, RIGHT) for scene in [*scenes, BURIED]]
+
+
+def test_results_are_in_order_and_as_alone() -> None:
+    results = list(rd.plan_many(problems(), "rrt_connect", workers=2, time_limit=20.0, seed=3))
+    alone = [RRTConnect().plan(problem, 20.0, seed=3) for problem in problems()]
+    assert [result.status for result in results] == [Status.SOLVED] * 5 + [Status.INVALID_START]
+    for together, one in zip(results[:5], alone, strict=False):
+        assert together.path is not None and one.path is not None
+        assert np.array_equal(together.path.positions, one.path.positions)
+
+
+def test_a_process_that_dies_costs_one_problem(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = problems()[:3]
+    deadly = rd.Scene([rd.Box([0.45, 0.0, 0.4], [0.3, 0.05, 0.4], name="deadly")])
+    asked.insert(1, rd.Problem(PANDA, deadly, LEFT, RIGHT))
+    asked.insert(3, replace(asked[0], robot=replace(PANDA, name="unknown")))
+    entry = Entry("helpers.deadly_planner:Deadly", "dies of it", "RRTConnectSettings", SEARCH)
+    monkeypatch.setitem(PLANNERS, "deadly", entry)
+    results = list(rd.plan_many(asked, "deadly", workers=1, time_limit=20.0))
+    ends = [result.status for result in results]
+    assert ends == [Status.SOLVED, Status.ERROR, Status.SOLVED, Status.ERROR, Status.SOLVED]
+    assert "died" in results[1].reason and "no such robot" in results[3].reason
+
+
+def test_no_problems_are_no_results() -> None:
+    assert list(rd.plan_many([])) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"workers": 0}, "workers is 0"),
+        ({"planner": "rrt"}, "unknown planner 'rrt'"),
+        ({"time": 1.0}, "unknown argument 'time'; known: .*time_limit"),
+        ({"until": "soon"}, "unknown until .soon."),
+    ],
+)
+def test_arguments_are_checked_at_once(arguments: dict, message: str) -> None:
+    with pytest.raises(rd.InputError, match=message):
+        rd.plan_many(problems()[:1], **arguments)
+
+
+def test_robots_that_hold_something_go_to_processes_too() -> None:
+    cup = rd.Cylinder([0, 0, 0.16], 0.03, 0.12, name="cup")
+    held = [replace(problem, robot=PANDA.attach(cup, "panda_hand")) for problem in problems()[:2]]
+    results = list(rd.plan_many(held, "rrt_connect", workers=1, time_limit=20.0))
+    for problem, result in zip(held, results, strict=True):
+        assert result.path is not None and rd.verify(problem, result.path).valid

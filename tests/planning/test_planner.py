@@ -1,0 +1,74 @@
+"""What holds of every planner in the table: solved means verified, anything else comes with a reason."""
+
+import numpy as np
+import pytest
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import PLANNERS, SEARCH, load_planner
+from robotdiffuse.problems.held_out import held_out_problem
+from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Sphere
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify, verify_trajectory
+
+START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+GOAL = START + np.array([1.2, 0.3, 0.0, 0.4, 0.0, 0.0, 0.0])
+
+
+@pytest.fixture(params=PLANNERS)
+def name(request: pytest.FixtureRequest) -> str:
+    if request.param.startswith("ompl_"):
+        pytest.importorskip("ompl", reason="the extra `baselines` (ompl) is not installed")
+    return request.param
+
+
+@pytest.mark.parametrize("number", [0, 4])
+def test_solved_means_verified(name: str, number: int) -> None:
+    problem = held_out_problem("rop", number)
+    result = load_planner(name).plan(problem, time_limit=1.0, seed=number)
+    assert result.planner == name and result.reason
+    assert (result.path is not None) == (result.trajectory is not None) == result.solved
+    if result.path is None or result.trajectory is None:
+        assert result.progress == ()
+        return
+    assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+    times, lengths = np.array(result.progress).T
+    assert (np.diff(times) >= 0).all() and (np.diff(lengths) < 0).all()
+    assert lengths[-1] == pytest.approx(result.path.length)
+
+
+def test_nothing_in_the_way_is_solved_by_all(name: str) -> None:
+    problem = Problem(load_robot("panda"), Scene([]), START, GOAL)
+    result = load_planner(name).plan(problem, time_limit=30.0)
+    assert result.solved, result.reason
+    assert result.path_length is not None and result.path_length >= np.linalg.norm(GOAL - START) - 1e-6
+
+
+def test_buried_goal_is_told(name: str) -> None:
+    problem = Problem(load_robot("panda"), Scene([Sphere((0.2, 0.5, 0.5), 0.3)]), START, GOAL)
+    result = load_planner(name).plan(problem, time_limit=1.0)
+    assert result.status is Status.INVALID_GOAL and "in collision" in result.reason
+
+
+def test_any_of_several_goals_will_do(name: str) -> None:
+    goals = np.stack([GOAL, START + np.array([-1.0, 0.2, 0.0, 0.3, 0.0, 0.2, 0.0])])
+    problem = Problem(load_robot("panda"), Scene([]), START, JointGoal(goals))
+    result = load_planner(name).plan(problem, time_limit=30.0)
+    assert result.path is not None, result.reason
+    assert np.abs(result.path.positions[-1] - goals).max(axis=1).min() < 1e-4
+
+
+def test_time_limit_and_seed_are_checked(name: str) -> None:
+    problem, planner = Problem(load_robot("panda"), Scene([]), START, GOAL), load_planner(name)
+    with pytest.raises(InputError, match="time_limit is 0"):
+        planner.plan(problem, time_limit=0.0)
+    with pytest.raises(InputError, match="seed is -1"):
+        planner.plan(problem, seed=-1)
+
+
+def test_weights_are_for_learned_planners_alone(name: str) -> None:
+    learned = PLANNERS[name].kind != SEARCH
+    with pytest.raises(InputError, match="nowhere" if learned else "has no weights"):
+        load_planner(name, weights="nowhere").plan(Problem(load_robot("panda"), Scene([]), START, GOAL))

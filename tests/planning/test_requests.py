@@ -1,0 +1,171 @@
+"""The whole table: whatever a problem or a call may ask for, every planner does it or refuses it by one line
+that names the planner and what it cannot do."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.planning import PLANNERS, load_planner
+from robotdiffuse.planning.planner import ABLE, CLEARANCE, CONSTRAINTS, Planner
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.validation.validator import verify, verify_trajectory
+
+PANDA = rd.load_robot("panda")
+START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
+GOAL = START + np.array([0.4, 0.1, 0.0, 0.1, 0.0, 0.0, 0.1])
+HAND, ELBOW = "panda_hand", "panda_link4"
+FAR = rd.Box([0.0, -0.8, 0.3], [0.2, 0.2, 0.6], name="crate")
+SCENE = rd.Scene([FAR])
+T_GOAL = link_pose(PANDA, GOAL, HAND)
+T_WORLD_BASE = transform(np.array([1.0, -2.0, 0.5]), rotation_about(np.array([0.0, 0.0, 1.0]), 2.0))
+PLAIN = Problem(PANDA, SCENE, START, GOAL)
+
+
+class Asked(NamedTuple):
+    problem: Callable[[], Problem]
+    request: Mapping[str, Any] = MappingProxyType({})
+    needs: tuple[str, ...] = ()
+    """What a planner must be able to keep."""
+
+
+def _goal(goal: object) -> Callable[[], Problem]:
+    return lambda: replace(PLAIN, goal=goal)  # type: ignore[arg-type]
+
+
+def _constrained(*constraints: Any) -> Callable[[], Problem]:
+    return lambda: replace(PLAIN, constraints=constraints)
+
+
+def _held() -> Problem:
+    robot = PANDA.with_tool(
+        HAND, transform(np.array([0.0, 0.0, 0.12])), [rd.Cylinder([0, 0, 0.09], 0.01, 0.06)]
+    )
+    return replace(PLAIN, robot=robot.attach(rd.Box([0, 0, 0.04], [0.06] * 3, name="parcel"), "tool"))
+
+
+def _seen() -> Problem:
+    view = ray_cast(
+        SCENE,
+        looking_at(np.array([1.7, 0.0, 0.3]), np.array([0.0, 0.0, 0.3])),
+        (75.0, 75.0, 39.5, 29.5),
+        (80, 60),
+        PANDA,
+        START,
+    )
+    return Problem(PANDA, rd.Scene(), START, GOAL, views=[view], unseen="padded")
+
+
+ASKED: dict[str, Asked] = {
+    "pose": Asked(_goal(rd.PoseGoal(HAND, T_GOAL))),
+    "pose with room": Asked(_goal(rd.PoseGoal(HAND, T_GOAL, [0.02] * 3, [0.1, 0.1, np.pi]))),
+    "poses of two links": Asked(
+        _goal(rd.PosesGoal([rd.PoseGoal(ELBOW, link_pose(PANDA, GOAL, ELBOW)), rd.PoseGoal(HAND, T_GOAL)]))
+    ),
+    "any goal": Asked(_goal([rd.PoseGoal(HAND, T_GOAL), rd.JointGoal(GOAL)])),
+    "waypoints": Asked(lambda: replace(PLAIN, waypoints=(rd.JointGoal((START + GOAL) / 2),))),
+    "blended": Asked(
+        lambda: replace(
+            PLAIN,
+            waypoints=(rd.JointGoal((START + GOAL) / 2 + 0.1), rd.PoseGoal(HAND, T_GOAL)),
+            goal=START,
+            blend=0.05,
+        )
+    ),
+    "base": Asked(lambda: Problem.in_world(T_WORLD_BASE, PANDA, SCENE.moved(T_WORLD_BASE), START, GOAL)),
+    "tool and attached": Asked(_held),
+    "views": Asked(_seen),
+    "first": Asked(lambda: PLAIN, {"until": "first"}),
+    "scaling": Asked(lambda: PLAIN, {"velocity_scaling": 0.5, "acceleration_scaling": 0.3}),
+    "payload": Asked(lambda: replace(PLAIN, payload=rd.Payload(2.0, [0.0, 0.0, 0.1], HAND))),
+    "jerk": Asked(lambda: PLAIN, {"jerk": 100.0}),
+    "no clearance": Asked(lambda: PLAIN, {"clearance": 0.0}),
+    "clearance": Asked(lambda: PLAIN, {"clearance": 0.03}, (CLEARANCE,)),
+    "clearance of the problem": Asked(lambda: replace(PLAIN, clearance=0.03), {}, (CLEARANCE,)),
+    "cone": Asked(_constrained(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2)), {}, (CONSTRAINTS,)),
+    "box": Asked(_constrained(rd.PositionBox(HAND, [0, -1, 0], [1, 1, 1])), {}, (CONSTRAINTS,)),
+    "plane": Asked(_constrained(rd.OnPlane(HAND, T_GOAL[:3, 3], [0, 0, 1], 0.05)), {}, (CONSTRAINTS,)),
+    "line": Asked(
+        _constrained(
+            rd.OnLine(HAND, T_GOAL[:3, 3], T_GOAL[:3, 3] - link_pose(PANDA, START, HAND)[:3, 3], 0.01)
+        ),
+        {},
+        (CONSTRAINTS,),
+    ),
+    "Cartesian line": Asked(_constrained(rd.CartesianLine(HAND, 0.002, 0.05, 0.2)), {}, (CONSTRAINTS,)),
+}
+
+
+def _all_of_it() -> Problem:
+    held = _held()
+    cone = rd.AxisCone("parcel", [0, 0, 1], [0, 0, -1], 0.2).moved(T_WORLD_BASE)
+    return Problem.in_world(
+        T_WORLD_BASE,
+        held.robot,
+        SCENE.moved(T_WORLD_BASE),
+        START,
+        GOAL,
+        waypoints=[rd.JointGoal((START + GOAL) / 2)],
+        constraints=[cone],
+        blend=0.1,
+        payload=rd.Payload(0.5, link="parcel"),
+    )
+
+
+ASKED["all of it"] = Asked(_all_of_it, {"clearance": 0.02, "jerk": 100.0}, (CONSTRAINTS, CLEARANCE))
+PASSING = rd.MovingObstacle(rd.Sphere([0.9, -0.6, 0.5], 0.1, name="ball"), velocity=[0.0, 0.8, 0.0])
+ASKED["moving"] = Asked(lambda: replace(PLAIN, moving=(PASSING,)))
+ASKED["moving and waypoints"] = Asked(
+    lambda: replace(PLAIN, moving=(PASSING,), waypoints=(rd.JointGoal((START + GOAL) / 2),))
+)
+ASKED["moving and a cone"] = Asked(
+    lambda: replace(PLAIN, moving=(PASSING,), constraints=(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2),)),
+    {},
+    (CONSTRAINTS,),
+)
+ASKED["start velocity"] = Asked(lambda: replace(PLAIN, start_velocity=[0.1, 0, 0, 0, 0, 0, 0]))
+ASKED["views and a cone"] = Asked(
+    lambda: replace(_seen(), constraints=(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2),)), {}, (CONSTRAINTS,)
+)
+
+
+@cache
+def planner_named(name: str) -> Planner:
+    return load_planner(name)
+
+
+@cache
+def problem_of(asked: str) -> Problem:
+    return ASKED[asked].problem()
+
+
+@pytest.mark.parametrize("asked", ASKED)
+@pytest.mark.parametrize("name", PLANNERS)
+def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> None:
+    if name.startswith("ompl_"):
+        pytest.importorskip("ompl", reason="the extra `baselines` (ompl) is not installed")
+    planner, problem, (_, request, needs) = planner_named(name), problem_of(asked), ASKED[asked]
+    lacking = next((what for what in needs if what not in planner.keeps), None)
+    if lacking is not None:
+        with pytest.raises(InputError, match=f"planner {name} cannot keep {lacking}; these can: ") as refused:
+            planner.plan(problem, time_limit=3.0, **request)
+        assert "\n" not in str(refused.value)
+        return
+    result = planner.plan(problem, time_limit=40.0, **{"until": "first", **request})
+    assert result.path is not None and result.trajectory is not None, result.reason
+    assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
+
+
+@pytest.mark.parametrize("what", [CONSTRAINTS, CLEARANCE])
+def test_the_planners_that_can_are_those_that_messages_name(what: str) -> None:
+    able = {name for name in PLANNERS if not name.startswith("ompl_") and what in planner_named(name).keeps}
+    assert able == set(ABLE[what].split(", "))

@@ -1,0 +1,142 @@
+"""A flange that turns within a fork, closer to it than spheres can tell: a table over the joints between."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.robots.fitting.allowed_collisions import Links, SamplingSettings
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.fitting.convex_pair_tables import joint_table
+from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface
+from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.fitting.preparation import PreparationSettings, Prepared, prepare
+from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.core.transforms import transform
+
+PAIR = ("fork", "flange")
+QUICK = PreparationSettings(
+    parts=PartSettings(voxels=50_000),
+    spheres=SphereSettings(candidates=300, rounds=2),
+    sampling=SamplingSettings(samples=1000, descents=3),
+    samples=500,
+)
+
+
+def box(size: tuple[float, ...], at: tuple[float, ...]) -> Surface:
+    mesh = trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces))
+
+
+def disc(radius: float, thickness: float) -> Surface:
+    """About the x axis."""
+    turned = trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0])
+    mesh = trimesh.creation.cylinder(radius, thickness, transform=turned)
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces))
+
+
+@cache
+def made() -> Prepared:
+    """A flange, 3 mm from either prong of a fork wherever it is turned; bent far back, it hits what holds
+    them."""
+    y, x, rates = np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), (2.0, 8.0, 80.0)
+    joints = (
+        Joint("bend", "revolute", "fork", "wrist", np.eye(4), y, -3.0, 3.0, *rates),
+        Joint(
+            "spin", "continuous", "wrist", "flange", transform(np.array([0.09, 0, 0])), x, -9.0, 9.0, *rates
+        ),
+    )
+    prongs = (box((0.4, 0.04, 0.1), (0, 0.07, 0)), box((0.4, 0.04, 0.1), (0, -0.07, 0)))
+    surfaces = {
+        "fork": (*prongs, box((0.05, 0.1, 0.1), (-0.175, 0, 0))),
+        "wrist": (box((0.04, 0.04, 0.04), (0, 0, 0)),),
+        "flange": (disc(0.047, 0.14),),
+    }
+    robot = Robot("fork", "fork", "flange", joints, meshes=dict.fromkeys(surfaces, ()))
+    return prepare(robot, surfaces, QUICK)
+
+
+def shares(robot: Robot) -> tuple[float, int]:
+    """Of the configurations that are free by the meshes those refused, and the number wrongly called free."""
+    q = np.random.default_rng(3).uniform(robot.lower, robot.upper, (3000, robot.dof))
+    checker = CollisionChecker(robot, Scene())
+    free, exact = checker.free(q), ~ExactCollision(robot, Scene()).collides(q)
+    assert (checker.pair_clearances(q)[free] > 0).all()
+    return float(1 - free[exact].mean()), int((free & ~exact).sum())
+
+
+def test_a_pair_that_is_always_close_refuses_little() -> None:
+    prepared = made()
+    robot = prepared.robot
+    assert [table.links for table in robot.tables] == [PAIR]
+    assert prepared.refusals.by_spheres < 0.08
+    assert shares(replace(robot, tables=())) == (1.0, 0)
+    refused, wrong = shares(robot)
+    assert refused < 0.08 and wrong == 0
+
+
+def test_tables_are_kept_in_the_robots_folder(tmp_path: Path) -> None:
+    robot = made().robot
+    write_bundle(robot, tmp_path, {})
+    (table,), (kept,) = robot.tables, read_bundle(tmp_path).tables
+    assert (kept.links, kept.joints, kept.lower, kept.upper) == (
+        table.links,
+        table.joints,
+        table.lower,
+        table.upper,
+    )
+    assert (kept.apart == table.apart).all()
+
+
+def test_a_table_is_left_aside_where_one_of_its_joints_is_held() -> None:
+    refused, wrong = shares(made().robot.with_locked({"spin": 0.3}))
+    assert refused == 1.0 and wrong == 0
+
+
+def test_a_table_over_other_joints_is_left_aside() -> None:
+    robot = made().robot
+    (table,) = robot.tables
+    other = replace(robot, tables=(replace(table, joints=table.joints[::-1]),))
+    refused, wrong = shares(other)
+    assert refused == 1.0 and wrong == 0
+
+
+def test_joints_between_links_are_those_of_the_chain_and_all_planned() -> None:
+    robot = made().robot
+    assert robot.joints_between(*PAIR) == robot.joints_between(*PAIR[::-1]) == (0, 1)
+    assert robot.joints_between("wrist", "flange") == (1,)
+    assert robot.with_locked({"bend": 0.0}).joints_between(*PAIR) == ()
+
+
+@pytest.mark.parametrize("pair", [PAIR, ("wrist", "flange")])
+def test_tables_say_no_more_than_the_parts(pair: tuple[str, str]) -> None:
+    robot = made().robot
+    links = Links(robot)
+    table = joint_table(robot, links, pair, 1e-3)
+    q = links.random(2000, np.random.default_rng(1))
+    poses = links.poses(q)
+    apart = table.at(*(q[:, robot.joint_names.index(name)] for name in table.joints))
+    assert not any(links.collide(poses, *pair, int(i)) for i in np.flatnonzero(apart))
+
+
+def test_intervals_are_apart_if_all_that_is_within_them_is() -> None:
+    """Along a joint that ends, and along one that turns on and on."""
+    rng = np.random.default_rng(0)
+    apart = rng.random((8, 8)) < 0.9
+    table = JointTable(PAIR, ("a", "b"), (-1.0, -np.pi), (1.0, np.pi), apart)
+    low = [rng.uniform(-1.4, 1.2, 40), rng.uniform(-9, 8, 40)]
+    high = [low[0] + rng.uniform(0, 0.5, 40), low[1] + rng.uniform(0, 2, 40)]
+    found = table.throughout(*zip(low, high, strict=True))
+    share = np.linspace(0, 1, 60)
+    for i in range(40):
+        for k in range(40):
+            a = low[0][i] + share * (high[0][i] - low[0][i])
+            b = low[1][k] + share * (high[1][k] - low[1][k])
+            assert found[i, k] == table.at(np.repeat(a, 60), np.tile(b, 60)).all()

@@ -1,0 +1,119 @@
+"""Convex parts hold their mesh, follow it closely, and stay few and simple."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.fitting.convex_parts import (
+    PartSettings,
+    Surface,
+    convex_hull,
+    convex_parts,
+    planes_of,
+    simplified,
+)
+
+
+def surface(mesh: trimesh.Trimesh) -> Surface:
+    return Surface(np.array(mesh.vertices), np.array(mesh.faces))
+
+
+def _together(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    made = trimesh.util.concatenate(meshes)
+    assert isinstance(made, trimesh.Trimesh)
+    return made
+
+
+def boxes(*corners: tuple[tuple[float, ...], tuple[float, ...]]) -> trimesh.Trimesh:
+    """Axis-aligned boxes [low, high] in one mesh, as they are: with inner walls where they meet."""
+    made = [
+        trimesh.creation.box(
+            np.subtract(high, low),
+            transform=trimesh.transformations.translation_matrix(np.add(low, high) / 2),
+        )
+        for low, high in corners
+    ]
+    return _together(made)
+
+
+L = boxes(((0, 0, 0), (0.3, 0.1, 0.1)), ((0, 0, 0.1), (0.1, 0.1, 0.4)))
+FRAME = boxes(
+    ((0, 0, 0), (0.4, 0.1, 0.05)),
+    ((0, 0, 0.35), (0.4, 0.1, 0.4)),
+    ((0, 0, 0.05), (0.05, 0.1, 0.35)),
+    ((0.35, 0, 0.05), (0.4, 0.1, 0.35)),
+)
+TUBE = trimesh.creation.annulus(0.08, 0.1, 0.3, sections=48)
+BOWL = trimesh.creation.icosphere(3, 0.1).slice_plane([0, 0, 0], [0, 0, -1])  # open
+MESHES = {"L": L, "frame": FRAME, "tube": TUBE, "bowl": BOWL}
+
+
+def beyond(parts: tuple, points: np.ndarray) -> np.ndarray:
+    """How far points are outside of the nearest part, at most."""
+    return np.min([(points @ n.T - o).max(1) for n, o in map(planes_of, parts)], axis=0)
+
+
+@pytest.mark.parametrize("name", MESHES)
+def test_parts_hold_all_of_the_mesh(name: str) -> None:
+    parts = convex_parts((surface(MESHES[name]),))
+    points = trimesh.sample.sample_surface(MESHES[name], 20_000, seed=1)[0]
+    assert beyond(parts, points).max() < 1e-9
+    for part in parts:
+        solid = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        assert solid.is_convex and solid.is_watertight and solid.volume > 0
+
+
+def test_an_l_is_two_parts_of_its_own_volume() -> None:
+    parts = convex_parts((surface(L),))
+    assert len(parts) <= 4
+    volume = sum(trimesh.Trimesh(part.vertices, part.faces).volume for part in parts)
+    assert volume == pytest.approx(0.1 * 0.1 * 0.6, rel=0.1)
+
+
+def test_a_frame_stays_open() -> None:
+    """No single cut makes its hull smaller: it must not stop there."""
+    parts = convex_parts((surface(FRAME),))
+    assert 4 <= len(parts) <= 6
+    assert beyond(parts, np.array([[0.2, 0.05, 0.2]]))[0] > 0.1
+
+
+def test_parts_stick_out_little_about_tight_places() -> None:
+    """A wide hole is filled where that is allowed, but not beside the place where something passes."""
+    coarse = PartSettings(concavity=0.2)
+    tight = np.array([[0.06, 0.05, 0.06]])
+    whole = convex_parts((surface(FRAME),), coarse)
+    parts = convex_parts((surface(FRAME),), coarse, tight)
+    assert len(whole) == 1 < len(parts)
+    assert beyond(whole, tight)[0] < 0 < beyond(parts, tight + 0.01)[0]
+    points = trimesh.sample.sample_surface(FRAME, 5000, seed=1)[0]
+    assert beyond(parts, np.asarray(points)).max() < 1e-6
+
+
+def test_holes_that_are_closed_count_as_solid() -> None:
+    ball = trimesh.creation.icosphere(3, 0.1)
+    inner = trimesh.creation.icosphere(3, 0.08)
+    assert len(convex_parts((surface(_together([ball, inner])),))) == 1
+
+
+def test_simplified_hulls_hold_the_hull() -> None:
+    points = np.random.default_rng(0).normal(size=(4000, 3))
+    points *= np.array([0.1, 0.06, 0.08]) / np.linalg.norm(points, axis=1, keepdims=True)
+    hull = convex_hull(points)
+    few = simplified(hull)
+    assert len(hull.faces) > 5000 and len(few.faces) <= 480
+    assert beyond((few,), points).max() < 0
+    assert beyond((hull,), few.vertices).max() < 0.004
+
+
+def test_most_parts_are_a_bound() -> None:
+    comb = boxes(*(((0.04 * i, 0, 0), (0.04 * i + 0.01, 0.05, 0.1)) for i in range(12)))
+    parts = convex_parts((surface(comb),), PartSettings(most=5))
+    assert len(parts) <= 5
+    assert beyond(parts, trimesh.sample.sample_surface(comb, 5000, seed=1)[0]).max() < 1e-9
+
+
+@pytest.mark.parametrize("bad", [{"concavity": 0.0}, {"most": 0}, {"finest": -1.0}])
+def test_settings_out_of_range(bad: dict) -> None:
+    with pytest.raises(InputError, match="convex parts"):
+        PartSettings(**bad)

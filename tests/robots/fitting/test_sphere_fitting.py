@@ -1,0 +1,192 @@
+"""Covering spheres: every surface point inside, little sticking out; on shapes with sharp and round edges."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.fitting.convex_parts import convex_hull
+from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours, neighbours
+from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
+from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
+from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Solid
+from robotdiffuse.core.transforms import transform
+
+QUICK = SphereSettings(candidates=200, rounds=6, tries=1, starts=1)
+TOLERANCE = 0.015
+
+
+def box(size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> ConvexMesh:
+    return convex_hull(np.array(trimesh.creation.box(size).vertices) + np.array(at))
+
+
+SHAPES = {
+    "box": (box((0.1, 0.06, 0.2)),),
+    "cylinder": (convex_hull(np.array(trimesh.creation.cylinder(0.05, 0.25, sections=24).vertices)),),
+    "two boxes": (box((0.1, 0.05, 0.05)), box((0.05, 0.05, 0.15), (0.04, 0, 0.05))),
+}
+
+
+def surface_samples(meshes: tuple[ConvexMesh, ...], count: int, seed: int) -> np.ndarray:
+    """Points on the surface of each mesh, independent of the cells that the fit uses."""
+    parts = [trimesh.Trimesh(mesh.vertices, mesh.faces, process=False) for mesh in meshes]
+    return np.concatenate([trimesh.sample.sample_surface(part, count, seed=seed)[0] for part in parts])
+
+
+def gaps(points: np.ndarray, spheres: np.ndarray) -> np.ndarray:
+    """Signed distance of points from the union of spheres (upper bound inside)."""
+    return (np.linalg.norm(points[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]).min(1)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_spheres_cover_and_hardly_stick_out(name: str) -> None:
+    meshes = SHAPES[name]
+    solid = Solid.of(meshes, TOLERANCE)
+    spheres = fit_spheres(solid, Bounds(TOLERANCE), np.random.default_rng(0), QUICK)
+    assert covered(meshes, spheres)
+    assert gaps(surface_samples(meshes, 20_000, 1), spheres).max() <= 1e-9
+    assert stick_out(solid, spheres).max() <= TOLERANCE + solid.spacing
+    # by an independent way: points of the spheres against the solid
+    rng = np.random.default_rng(2)
+    unit = rng.normal(size=(200, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    outer = (spheres[:, None, :3] + spheres[:, None, 3:] * unit).reshape(-1, 3)
+    hulls = [trimesh.Trimesh(mesh.vertices, mesh.faces, process=False) for mesh in meshes]
+    outside = np.min([-trimesh.proximity.signed_distance(hull, outer) for hull in hulls], axis=0)
+    assert outside.max() <= TOLERANCE + solid.spacing / 3
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_nothing_inside_is_left_open(name: str) -> None:
+    """A point of a cloud could hide in a hole."""
+    meshes = SHAPES[name]
+    solid = Solid.of(meshes, TOLERANCE)
+    spheres = fit_spheres(solid, Bounds(TOLERANCE), np.random.default_rng(0), QUICK)
+    corners = np.concatenate([mesh.vertices for mesh in meshes])
+    points = np.random.default_rng(3).uniform(corners.min(0), corners.max(0), (20_000, 3))
+    hulls = [trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).convex_hull for mesh in meshes]
+    inside = np.any([hull.contains(points) for hull in hulls], axis=0)
+    assert gaps(points[inside], spheres).max() <= solid.spacing
+
+
+def test_grid_knows_signed_distances() -> None:
+    """Against the distance of a box by hand, and the inner corner of an L."""
+    solid = Solid.of(SHAPES["box"], TOLERANCE)
+    points, half = solid.points, np.array([0.05, 0.03, 0.1])
+    beyond = np.abs(points) - half
+    np.testing.assert_allclose(solid.distance.ravel(), beyond.max(1), atol=1e-9)
+    # inside two boxes that share a wall the wall is no surface
+    two = Solid.of((box((0.1, 0.1, 0.1)), box((0.1, 0.1, 0.1), (0.1, 0, 0))), TOLERANCE)
+    assert two.as_room().at(np.array([[0.05, 0.0, 0.0]]))[0] == pytest.approx(0.05, abs=two.spacing / 2)
+
+
+@pytest.mark.parametrize("size", [(0.002, 0.002, 0.002), (0.03, 0.02, 0.0005)])
+def test_what_is_finer_than_the_grid_is_covered_too(size: tuple[float, float, float]) -> None:
+    """Baxter's sonar ring is a ball of 1 mm: no point of the grid is inside."""
+    meshes = (box(size),)
+    solid = Solid.of(meshes, 0.009)
+    spheres = fit_spheres(solid, Bounds(0.004), np.random.default_rng(0), QUICK)
+    assert covered(meshes, spheres) and len(spheres) <= 210
+
+
+def test_what_neighbours_hide_wholly_is_covered_too() -> None:
+    """Baxter's sonar ring is within its torso: room without end was no number."""
+    solid = Solid.of((box((0.01, 0.01, 0.01)),), TOLERANCE)
+    hidden = Bounds(TOLERANCE, lambda points: np.ones(len(points), dtype=bool))
+    assert np.isfinite(solid.room(hidden).grid).all()
+    spheres = fit_spheres(solid, hidden, np.random.default_rng(0), QUICK)
+    assert covered(solid.meshes, spheres) and len(spheres) == 1
+
+
+def test_tight_places_are_kept_free() -> None:
+    solid = Solid.of(SHAPES["box"], TOLERANCE)
+    side = np.array([[0.05, 0.0, 0.0]])
+    bounds = Bounds(TOLERANCE, tight=np.column_stack([side, [0.002]]))
+    spheres = fit_spheres(solid, bounds, np.random.default_rng(0), QUICK)
+    assert covered(SHAPES["box"], spheres)
+    about = np.array([0.05, 0, 0]) + np.random.default_rng(1).uniform(-0.01, 0.01, (5000, 3))
+    held = gaps(about, spheres) < 0
+    assert about[held, 0].max() < 0.05 + 0.002 + 0.6 * solid.spacing
+
+
+def test_nothing_reaches_below_the_floor() -> None:
+    meshes = (box((0.1, 0.06, 0.2), (0, 0, 0.105)),)
+    solid = Solid.of(meshes, TOLERANCE)
+    free = fit_spheres(solid, Bounds(TOLERANCE), np.random.default_rng(0), QUICK)
+    assert (free[:, 2] - free[:, 3]).min() < -0.003
+    bounds = Bounds(TOLERANCE, floor=(np.array([0, 0, 1.0]), 0.0))
+    spheres = fit_spheres(solid, bounds, np.random.default_rng(0), QUICK)
+    assert covered(meshes, spheres) and (spheres[:, 2] - spheres[:, 3]).min() > -1e-3
+
+
+def test_a_ball_needs_one_sphere() -> None:
+    ball = (convex_hull(np.array(trimesh.creation.icosphere(2, 0.05).vertices)),)
+    spheres = fit_spheres(Solid.of(ball, 0.01), Bounds(0.01), np.random.default_rng(0), QUICK)
+    assert len(spheres) == 1
+    assert np.linalg.norm(spheres[0, :3]) < 3e-3
+    assert spheres[0, 3] == pytest.approx(0.05, abs=3e-3)
+
+
+def test_same_seed_same_spheres() -> None:
+    solid = Solid.of(SHAPES["box"], 0.025)
+    fits = [fit_spheres(solid, Bounds(0.025), np.random.default_rng(3), QUICK) for _ in range(2)]
+    np.testing.assert_array_equal(fits[0], fits[1])
+
+
+def test_covered_finds_a_small_gap() -> None:
+    meshes = (box((0.1, 0.1, 0.1)),)
+    spheres = np.array([[0, 0, 0, 0.05 * 3**0.5 + 1e-5]])
+    assert covered(meshes, spheres)
+    assert not covered(meshes, spheres - np.array([0, 0, 0, 2e-4]))
+
+
+def two_cylinders() -> Robot:
+    """Two upright cylinders, the upper one turning on the lower one."""
+    can = convex_hull(
+        np.array(trimesh.creation.cylinder(0.05, 0.2, sections=48).vertices) + np.array([0, 0, 0.1])
+    )
+    turn = Joint(
+        "turn", "revolute", "low", "high", transform(np.array([0, 0, 0.2])), np.array([0, 0, 1.0]), -3.0, 3.0
+    )
+    return Robot("cans", "low", "high", (turn,), meshes={"low": (can,), "high": (can,)})
+
+
+def test_spheres_may_reach_into_a_neighbour() -> None:
+    robot = two_cylinders()
+    (beside,) = neighbours(robot, "low")
+    assert beside.link == "high" and len(beside.T_link_neighbour) > 1
+    hidden = hidden_by_neighbours(robot, "low")
+    assert hidden(np.array([[0, 0, 0.21], [0.03, 0, 0.25]])).all()
+    assert not hidden(np.array([[0, 0, -0.02], [0.07, 0, 0.25]])).any()
+    solid = Solid.of(robot.meshes["low"], TOLERANCE)
+    spheres = fit_spheres(solid, Bounds(TOLERANCE, hidden), np.random.default_rng(0), QUICK)
+    plain = fit_spheres(solid, Bounds(TOLERANCE), np.random.default_rng(0), QUICK)
+    assert len(spheres) < len(plain)
+    assert covered(robot.meshes["low"], spheres)
+    assert stick_out(solid, spheres).max() > TOLERANCE
+
+
+def test_nothing_is_hidden_by_a_neighbour_that_turns_away() -> None:
+    robot = two_cylinders()
+    swing = Joint(
+        "turn", "revolute", "low", "high", transform(np.array([0, 0, 0.2])), np.array([0, 1.0, 0]), -1.0, 1.0
+    )
+    robot = Robot("cans", "low", "high", (swing,), meshes=robot.meshes)
+    assert not hidden_by_neighbours(robot, "low")(np.array([[0.04, 0, 0.23]])).any()
+
+
+def test_bundled_panda_is_covered() -> None:
+    robot = load_robot("panda")
+    assert set(robot.spheres) == set(robot.meshes)
+    for link, meshes in robot.meshes.items():
+        spheres = robot.spheres[link]
+        assert gaps(surface_samples(meshes, 3000, 4), spheres).max() <= 1e-9, link
+        assert covered(meshes, spheres), link
+    assert sum(map(len, robot.spheres.values())) <= 145
+
+
+@pytest.mark.parametrize("bad", [{"finest": 0.0}, {"second_half": 0.002}, {"finest": 0.01}])
+def test_contradictory_settings(bad: dict) -> None:
+    with pytest.raises(InputError, match="tolerances"):
+        SphereSettings(**bad)

@@ -1,0 +1,229 @@
+"""Which joints are planned: arms, grippers, hands, groups of an SRDF, joints that follow others."""
+
+from pathlib import Path
+
+import pytest
+
+from helpers.example_robots import urdf_file
+from helpers.made_arms import chain, joint, link, row, written
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
+from robotdiffuse.robots.parsing.urdf import read_urdf
+
+ARM = chain("base", row("j", 6))
+
+
+def finger(i: int, count: int) -> str:
+    return chain("j6_link", row(f"f{i}_", count))
+
+
+END = {
+    "nothing": ("", "j6_link"),
+    "flange": (link("flange", "") + joint("mount", "j6_link", "flange", "fixed"), "flange"),
+    "two fingers": (finger(1, 1) + finger(2, 1), "j6_link"),
+    "two fingers of two joints": (finger(1, 2) + finger(2, 2), "j6_link"),
+    "a hand of five fingers": ("".join(finger(i, 4) for i in range(5)), "j6_link"),
+    "a jaw": (chain("j6_link", ["gripper"]), "j6_link"),
+    "a jaw beside a fixed frame": (
+        chain("j6_link", ["left_jaw"]) + link("tcp", "") + joint("tool", "j6_link", "tcp", "fixed"),
+        "j6_link",
+    ),
+    "a gripper of one joint that five follow": (
+        chain("j6_link", ["drive"])
+        + "".join(
+            link(f"m{i}")
+            + joint(f"m{i}_joint", "j6_link", f"m{i}", more='<mimic joint="drive" multiplier="-1"/>')
+            for i in range(5)
+        ),
+        "j6_link",
+    ),
+}
+"""What an arm may have at its end, by name, and where the arm ends then."""
+
+
+@pytest.mark.parametrize("name", END)
+def test_grippers_and_hands_are_known_and_held(name: str, tmp_path: Path) -> None:
+    parts, tip = END[name]
+    robot = read_urdf(written(tmp_path, ARM, parts))
+    assert robot.tip == tip and robot.joint_names == tuple(row("j", 6))
+    held = {j.name for j in robot.joints if j.kind != "fixed"} - {*robot.joint_names}
+    assert robot.locked.keys() == held
+
+
+def test_a_joint_called_gripper_is_planned_if_the_tip_says_so(tmp_path: Path) -> None:
+    robot = read_urdf(written(tmp_path, ARM, chain("j6_link", ["gripper"])), tip="gripper_link")
+    assert robot.joint_names == (*row("j", 6), "gripper")
+
+
+def test_head_wheels_and_a_branch_along_the_arm_are_held(tmp_path: Path) -> None:
+    parts = (
+        chain("base", ["lift"], kind="prismatic"),
+        chain("base", ["wheel_1"]) + chain("base", ["wheel_2"]),
+        chain("lift_link", ["pan", "tilt"]),
+        chain("lift_link", row("j", 6)),
+        chain("j3_link", ["lid"]),
+    )
+    robot = read_urdf(written(tmp_path, *parts))
+    assert robot.joint_names == ("lift", *row("j", 6)) and robot.tip == "j6_link"
+    assert robot.locked.keys() == {"wheel_1", "wheel_2", "pan", "tilt", "lid"}
+
+
+TWO_ARMS = chain("base", row("left_", 7)), chain("base", row("right_", 7)), chain("base", ["head"])
+
+
+def test_two_arms_are_listed_and_asked_about(tmp_path: Path) -> None:
+    file = written(tmp_path, *TWO_ARMS)
+    with pytest.raises(InputError) as error:
+        read_urdf(file)
+    assert "has 2 arms: left (7 joints to left_7_link), right (7 joints to right_7_link)" in str(error.value)
+    assert "--group left" in str(error.value) and "\n" not in str(error.value)
+    for group in ("right", "right_7_link"):
+        robot = read_urdf(file, group=group)
+        assert robot.joint_names == tuple(row("right_", 7))
+        assert robot.locked.keys() == {*row("left_", 7), "head"}
+        assert "left_7_link" in robot.meshes  # held, and still there to be hit
+    with pytest.raises(InputError, match=r"unknown group of .* 'middle'; known: all, both, left, right"):
+        read_urdf(file, group="middle")
+
+
+@pytest.mark.parametrize(
+    "first, second, names",
+    [
+        ("left_fr3_joint", "right_fr3_joint", "left_fr3 .*, right_fr3 "),
+        ("l/joint_", "r/joint_", "l .*, r "),
+        ("joint_1", "joint_2", "joint_16_link .*, joint_26_link "),
+    ],
+)
+def test_names_of_arms(first: str, second: str, names: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"2 arms: {names}"):
+        read_urdf(written(tmp_path, chain("base", row(first, 6)), chain("base", row(second, 6))))
+
+
+def test_four_legs_are_no_arm(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="has 4 arms"):
+        read_urdf(written(tmp_path, *(chain("base", row(f"leg{i}_", 3)) for i in "abcd")))
+
+
+def test_published_arms_end_where_their_grippers_begin(tmp_path: Path) -> None:
+    pytest.importorskip("pinocchio")
+    data = urdf_file("panda", tmp_path).parents[2]
+    for file, tip, dof in (
+        ("so_arm_description/urdf/so100.urdf", "gripper", 5),
+        ("z1_description/urdf/z1.urdf", "gripperStator", 6),
+        ("tiago_description/robots/tiago.urdf", "hand_palm_link", 8),
+    ):
+        robot = read_urdf(data / file)
+        assert (robot.tip, robot.dof) == (tip, dof)
+    with pytest.raises(InputError, match=r"right .7 joints to right_gripper_base_link"):
+        read_urdf(data / "baxter_description/urdf/baxter.urdf")
+
+
+MIMIC = '<mimic joint="grip" multiplier="-0.5" offset="0.1"/>'
+
+
+def test_mimic_joints_follow(tmp_path: Path) -> None:
+    """Also one that follows a follower, and a robot that was written and read again."""
+    parts = (
+        chain("j6_link", ["grip"])
+        + link("b")
+        + joint("other", "j6_link", "b", more=MIMIC)
+        + link("c")
+        + joint("third", "b", "c", more='<mimic joint="other" multiplier="2"/>')
+    )
+    robot = read_urdf(written(tmp_path, ARM, parts))
+    assert robot.locked == {"grip": 0.0, "other": 0.1, "third": 0.2}
+    write_bundle(robot, tmp_path / "kept", {})
+    for arm in (robot, read_bundle(tmp_path / "kept")):
+        arm = arm.with_locked({"grip": 0.4})
+        assert arm.locked == pytest.approx({"grip": 0.4, "other": -0.1, "third": -0.2})
+        assert arm.with_locked({"grip": 0.4, "third": -0.2}).locked == arm.locked
+        with pytest.raises(InputError, match=r"third is 0.3; it follows other, .* at -0.2; lock other"):
+            arm.with_locked({"third": 0.3})
+
+
+def test_linkages_of_planned_joints_are_refused_unless_they_are_held(tmp_path: Path) -> None:
+    follow = '<mimic joint="j2" multiplier="-1"/>'
+    bar = link("bar") + joint("rod", "j1_link", "bar", more=follow)
+    with pytest.raises(InputError, match=r"rod follows j2, which is planned; .*--lock j2=VALUE"):
+        read_urdf(written(tmp_path, ARM, bar))
+    held = read_urdf(written(tmp_path, ARM, bar), locked={"j2": 0.5})
+    assert held.locked == {"rod": -0.5, "j2": 0.5} and held.dof == 5
+    bare = bar.replace(link("bar"), link("bar", ""))
+    assert read_urdf(written(tmp_path, ARM, bare)).dof == 6
+    inside = link("end") + joint("last", "j6_link", "end", more='<mimic joint="j5"/>')
+    with pytest.raises(InputError, match="last follows j5"):
+        read_urdf(written(tmp_path, ARM, inside), tip="end")
+
+
+@pytest.mark.parametrize("followed", ["nobody", "rod", "other"])
+def test_mimic_of_nothing_or_in_a_circle(followed: str, tmp_path: Path) -> None:
+    parts = (
+        link("bar")
+        + joint("rod", "base", "bar", more=f'<mimic joint="{followed}"/>')
+        + link("end")
+        + joint("other", "base", "end", more='<mimic joint="rod"/>')
+    )
+    with pytest.raises(InputError, match="joint of the file that does not follow it"):
+        read_urdf(written(tmp_path, ARM, parts))
+
+
+SRDF = """<robot name="made">
+  <group name="arm"><chain base_link="j1_link" tip_link="j6_link"/></group>
+  <group name="short"><joint name="j1"/><link name="j2_link"/></group>
+  <group name="hand"><joint name="grip"/></group>
+  <group name="all"><group name="arm"/><group name="hand"/></group>
+  <group name="wrong"><joint name="nobody"/></group>
+  <group name="circle"><group name="circle"/></group>
+  <group_state name="home" group="arm">
+    <joint name="j1" value="0.5"/><joint name="j3" value="9"/></group_state>
+  <group_state name="open" group="hand"><joint name="grip" value="0.7"/></group_state>
+  <passive_joint name="j4"/>
+  <disable_collisions link1="base" link2="j6_link" reason="User"/>
+  <disable_collisions link1="j1_link" link2="base" reason="Adjacent"/>
+</robot>"""
+
+
+def test_groups_poses_and_passive_joints_of_an_srdf(tmp_path: Path) -> None:
+    file = written(tmp_path, ARM, chain("j6_link", ["grip"]))
+    (tmp_path / "srdf").mkdir()
+    (tmp_path / "srdf" / "made.srdf").write_text(SRDF)
+    assert srdf_beside(file, "any") == tmp_path / "srdf" / "made.srdf"
+    assert srdf_beside(tmp_path / "nothing.urdf", "any") is None
+    srdf = read_srdf(tmp_path / "srdf" / "made.srdf")
+    assert srdf.allowed[frozenset(("base", "j6_link"))] == "User"
+    robot = read_urdf(file, group="arm", srdf=srdf)
+    assert robot.joint_names == ("j2", "j3", "j5", "j6") and robot.tip == "j6_link"
+    assert robot.locked == {"j1": 0.5, "j4": 0.0, "grip": 0.7}
+    assert any("j4 is passive" in note for note in robot.notes)
+    assert robot.poses["home"] == {"j1": 0.5, "j3": 9.0}
+    robot = read_urdf(file, group="short", srdf=srdf)
+    assert robot.joint_names == ("j1", "j2") and robot.locked["j3"] == 2.0  # the pose, clipped
+    assert read_urdf(file, group="all", srdf=srdf).joint_names == ("j2", "j3", "j5", "j6", "grip")
+    for group, message in (
+        ("wrong", "unknown joint of group wrong .* 'nobody'"),
+        ("circle", "unknown group .* 'circle'"),
+        ("nothing", "unknown group .* 'nothing'; known: all, arm, circle, hand, j, short, wrong"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_urdf(file, group=group, srdf=srdf)
+
+
+@pytest.mark.parametrize(
+    "text, message",
+    [
+        ("<robot", "well-formed"),
+        ("<mujoco/>", "not an SRDF"),
+        ("<robot><group/></robot>", "a <group> has no name"),
+        ("<robot><disable_collisions link1='a'/></robot>", "has no link2"),
+        (
+            "<robot><group_state name='s'><joint name='j' value='x'/></group_state></robot>",
+            "value is 'x'; it must be a number",
+        ),
+    ],
+)
+def test_damaged_srdf(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "a.srdf").write_text(text)
+    with pytest.raises(InputError, match=message) as error:
+        read_srdf(tmp_path / "a.srdf")
+    assert "a.srdf" in str(error.value) and "\n" not in str(error.value)

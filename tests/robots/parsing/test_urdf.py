@@ -1,0 +1,316 @@
+"""Reading URDFs, writing and reading robot folders, and the way from a URDF to a robot that can be used."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import robotdiffuse.robots as robots
+from helpers.example_robots import AWKWARD
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots import ROBOTS, load_robot
+from robotdiffuse.robots.fitting.add import add_robot
+from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
+from robotdiffuse.robots.robot_folder import read_bundle, read_source, write_bundle
+from robotdiffuse.robots.fitting.convex_parts import THIN, convex_hull
+from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
+from robotdiffuse.robots.fitting.preparation import PreparationSettings
+from robotdiffuse.robots.robot import TURNS, Robot
+from robotdiffuse.robots.fitting.sphere_fitting import covered
+from robotdiffuse.robots.parsing.urdf import UrdfTree, read_urdf
+from robotdiffuse.core.transforms import rotation_from_rpy
+
+ARM = """<robot name="tiny">
+  <link name="base"><collision><origin xyz="0 0 0.05"/>
+    <geometry><sphere radius="0.05"/></geometry></collision></link>
+  <link name="upper"><collision><origin xyz="0 0 0.15" rpy="0 0 0.3"/>
+    <geometry><box size="0.06 0.06 0.3"/></geometry></collision></link>
+  <link name="fore"><collision><origin xyz="0 0 0.1"/>
+    <geometry><cylinder radius="0.03" length="0.2"/></geometry></collision></link>
+  <joint name="turn" type="revolute"><parent link="base"/><child link="upper"/><origin xyz="0 0 0.1"/>
+    <axis xyz="0 0 2"/><limit lower="-2" upper="1" velocity="1.5" effort="1"/></joint>
+  <joint name="bend" type="continuous"><parent link="upper"/><child link="fore"/><origin xyz="0 0 0.3"/>
+    <axis xyz="0 1 0"/></joint>
+</robot>
+"""
+BOX, TUBE = '<box size="0.06 0.06 0.3"/>', '<cylinder radius="0.03" length="0.2"/>'
+GRIPPER = """
+  <link name="palm"/> <link name="left"/> <link name="right"/> <link name="tcp"/>
+  <joint name="mount" type="fixed"><parent link="fore"/><child link="palm"/></joint>
+  <joint name="tool" type="fixed"><parent link="palm"/><child link="tcp"/></joint>
+  <joint name="grip" type="prismatic"><parent link="palm"/><child link="left"/>
+    <limit lower="0.01" upper="0.04" velocity="0.1"/></joint>
+  <joint name="grip2" type="prismatic"><parent link="palm"/><child link="right"/>
+    <limit lower="0" upper="0.04" velocity="0.1"/><mimic joint="grip"/></joint>
+</robot>"""
+
+
+def urdf(folder: Path, text: str = ARM) -> Path:
+    file = folder / "tiny.urdf"
+    file.write_text(text)
+    return file
+
+
+def test_joints_limits_and_geometry(tmp_path: Path) -> None:
+    robot = read_urdf(urdf(tmp_path))
+    assert (robot.name, robot.base, robot.tip) == ("tiny", "base", "fore")
+    assert robot.joint_names == ("turn", "bend")
+    np.testing.assert_allclose(robot.lower, [-2, -TURNS])
+    np.testing.assert_allclose(robot.upper, [1, TURNS])
+    np.testing.assert_allclose(robot.velocity, [1.5, 1.0])
+    np.testing.assert_allclose(robot.acceleration, [6, 4])
+    np.testing.assert_allclose(robot.jerk, [60, 40])
+    np.testing.assert_allclose(robot.planned_joints[0].axis, [0, 0, 1])
+    assert any("bend" in note and "velocity" in note for note in robot.notes)
+    box = robot.meshes["upper"][0].vertices
+    assert len(box) == 8
+    np.testing.assert_allclose(np.linalg.norm(box[:, :2], axis=1), 0.03 * 2**0.5)
+    np.testing.assert_allclose(np.unique(box[:, 2].round(9)), [0, 0.3])
+    tube = robot.meshes["fore"][0]
+    solid = trimesh.Trimesh(tube.vertices, tube.faces, process=False)
+    assert solid.is_watertight and 0 < solid.volume / (np.pi * 0.03**2 * 0.2) - 1 < 0.01
+
+
+def test_gripper_is_left_out_and_locked(tmp_path: Path) -> None:
+    robot = read_urdf(urdf(tmp_path, ARM.replace("</robot>", GRIPPER)))
+    assert robot.tip == "palm"
+    assert robot.joint_names == ("turn", "bend")
+    assert robot.locked == {"grip": 0.01, "grip2": 0.01}
+    robot = read_urdf(urdf(tmp_path, ARM.replace("</robot>", GRIPPER)), locked={"grip": 0.03, "turn": 0.5})
+    assert robot.joint_names == ("bend",) and robot.locked["grip"] == 0.03
+
+
+def test_base_and_tip_are_selectable(tmp_path: Path) -> None:
+    file = urdf(tmp_path, AWKWARD)
+    whole, part = read_urdf(file), read_urdf(file, base="turret", tip="wrist")
+    assert (whole.base, whole.tip) == ("floor", "tool")
+    assert whole.locked == {"lid_joint": 0.0}
+    assert part.joint_names == ("arm_joint", "wrist_joint")
+    assert "rail" not in part.link_names
+
+
+def test_meshes_by_package_relative_and_scaled(tmp_path: Path) -> None:
+    package = tmp_path / "my_arm"
+    (package / "meshes").mkdir(parents=True)
+    (package / "urdf").mkdir()
+    trimesh.creation.annulus(0.02, 0.03, 0.1).export(package / "meshes" / "ring.stl")
+    for name in ("package://my_arm/meshes/ring.stl", "../meshes/ring.stl"):
+        text = ARM.replace(BOX, f'<mesh filename="{name}" scale="2 2 1"/>')
+        robot = read_urdf(urdf(package / "urdf", text))
+        assert np.linalg.norm(robot.meshes["upper"][0].vertices[:, :2], axis=1).max() == pytest.approx(0.06)
+
+
+@pytest.mark.parametrize(
+    "corners, thin",
+    [
+        ([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0]], 1),
+        ([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 1e-7]], 2),
+        ([[0.1, 0.1, 0.1]] * 4, 3),
+    ],
+)
+def test_what_has_no_thickness_is_given_some(corners: list[list[float]], thin: int) -> None:
+    """A sheet, a line and a point, turned: a hull about them, by half a millimetre each way."""
+    turned = np.array(corners, float) @ rotation_from_rpy(0.3, -0.8, 1.2).T
+    hull = convex_hull(turned)
+    solid = trimesh.Trimesh(hull.vertices, hull.faces, process=False)
+    size = np.sort(solid.bounding_box_oriented.primitive.extents)
+    np.testing.assert_allclose(size[:thin], THIN, rtol=0.01)
+    assert solid.is_watertight and solid.volume > 0 and solid.contains(turned.mean(0)[None]).all()
+
+
+MESH = '<mesh filename="package://a/b.stl"/>'
+FORE, LOOP = '<parent link="upper"/><child link="fore"/>', '<parent link="base"/><child link="upper"/>'
+BAD = {
+    "not XML": ("<robot", "well-formed"),
+    "not a robot": ("<mujoco/>", "<mujoco>"),
+    "two roots": (ARM.replace("</robot>", '<link name="loose"/></robot>'), "one root"),
+    "two parents": (ARM.replace(FORE, LOOP), "two parent"),
+    "unknown link": (ARM.replace('<child link="fore"/>', '<child link="hand"/>'), "'hand'"),
+    "floating": (ARM.replace('type="continuous"', 'type="floating"'), "joint bend has type 'floating'"),
+    "no limits": (ARM.replace('lower="-2" upper="1" ', ""), "joint turn is revolute and has no <limit"),
+    "limits swapped": (ARM.replace('lower="-2"', 'lower="2"'), "joint turn: lower limit 2"),
+    "not a number": (ARM.replace('upper="1"', 'upper="one"'), "joint turn: upper limit is 'one'"),
+    "zero axis": (ARM.replace("0 1 0", "0 0 0"), "joint bend: its axis is zero"),
+    "short vector": (ARM.replace("0 0 0.05", "0 0"), "origin xyz is '0 0'"),
+    "negative size": (ARM.replace("0.06 0.06 0.3", "0.06 -0.06 0.3"), "must be positive"),
+    "missing mesh": (ARM.replace(BOX, MESH), "b.stl"),
+    "unknown shape": (ARM.replace('box size="0.06 0.06 0.3"', 'torus size="1"'), "<torus>"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_urdf_gives_one_clear_line(name: str, tmp_path: Path) -> None:
+    text, message = BAD[name]
+    with pytest.raises(InputError) as error:
+        read_urdf(urdf(tmp_path, text))
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_bad_arguments_give_one_clear_line(tmp_path: Path) -> None:
+    file = urdf(tmp_path)
+    for call, message in (
+        (lambda: read_urdf(tmp_path / "none.urdf"), "none.urdf"),
+        (lambda: read_urdf(file, base="nowhere"), "'nowhere'; known: base, fore, upper"),
+        (lambda: read_urdf(file, base="fore", tip="base"), "'base'; known: fore"),
+        (lambda: read_urdf(file, base="fore"), "no movable joint"),
+        (lambda: read_urdf(file, locked={"wrist": 0.0}), "'wrist'"),
+        (lambda: load_robot("no_such_robot"), "baxter_left, baxter_right, "),
+        (lambda: load_robot("nowhere/arm.urdf"), "arm.urdf"),
+    ):
+        with pytest.raises(InputError, match=r"^[^\n]*$") as error:
+            call()
+        assert message in str(error.value)
+
+
+def same(a: Robot, b: Robot) -> None:
+    assert (a.name, a.base, a.tip, a.locked, a.notes) == (b.name, b.base, b.tip, b.locked, b.notes)
+    assert a.allowed_collisions == b.allowed_collisions
+    assert [(j.name, j.kind, j.lower, j.jerk) for j in a.joints] == [
+        (j.name, j.kind, j.lower, j.jerk) for j in b.joints
+    ]
+    np.testing.assert_allclose(a.frame_offsets, b.frame_offsets, atol=1e-12)
+    assert a.meshes.keys() == b.meshes.keys() and a.spheres.keys() == b.spheres.keys()
+    for link in a.meshes:
+        for first, second in zip(a.meshes[link], b.meshes[link], strict=True):
+            np.testing.assert_array_equal(first.vertices, second.vertices)
+            np.testing.assert_array_equal(first.faces, second.faces)
+    for link in a.spheres:
+        np.testing.assert_allclose(a.spheres[link], b.spheres[link], atol=1e-6)
+
+
+def test_robot_folder_round_trip(tmp_path: Path) -> None:
+    robot = replace(
+        read_urdf(urdf(tmp_path, ARM.replace("</robot>", GRIPPER))),
+        spheres={"upper": np.array([[0, 0, 0.1, 0.2], [0, 0, 0.2, 0.1]])},
+        allowed_collisions=frozenset({frozenset(("base", "upper"))}),
+    )
+    folder = tmp_path / "out" / "tiny"
+    write_bundle(robot, folder, {"urdf": "tiny.urdf", "sha256": "x"})
+    (folder / "other.txt").write_text("kept")
+    write_bundle(robot, folder, {"urdf": "tiny.urdf", "sha256": "y"})
+    same(robot, read_bundle(folder))
+    assert read_source(folder)["sha256"] == "y"
+    assert sorted(file.name for file in folder.iterdir()) == ["meshes.npz", "other.txt", "robot.json"]
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_bundled_robots_are_complete(name: str) -> None:
+    robot = load_robot(name)
+    assert robot.dof > 0 and robot.spheres.keys() == robot.meshes.keys()
+    assert (robot.velocity > 0).all() and (robot.acceleration > 0).all() and (robot.jerk > 0).all()
+    assert read_source(robots.DATA / name)["licence"]
+    assert load_robot(name) is robot
+
+
+def test_panda() -> None:
+    robot = load_robot("panda", locked={"panda_finger_joint1": 0.065})
+    assert (robot.base, robot.tip, robot.dof) == ("panda_link0", "panda_hand", 7)
+    assert robot.locked == {"panda_finger_joint1": 0.065, "panda_finger_joint2": 0.04}
+    np.testing.assert_allclose(robot.upper, [2.8973, 1.7628, 2.8973, -0.0698, 2.8973, 3.7525, 2.8973])
+    np.testing.assert_allclose(robot.acceleration, [15, 7.5, 10, 12.5, 15, 20, 20])
+    np.testing.assert_allclose(robot.jerk, [7500, 3750, 5000, 6250, 7500, 10000, 10000])
+
+
+def damage_json(**change: object) -> str:
+    data = json.loads((robots.DATA / "panda" / "robot.json").read_text()) | change
+    return json.dumps({key: value for key, value in data.items() if value is not None})
+
+
+@pytest.mark.parametrize(
+    "file, content",
+    [
+        ("robot.json", "{"),
+        ("robot.json", "[]"),
+        ("robot.json", damage_json(format=99)),
+        ("robot.json", damage_json(joints=None)),
+        ("robot.json", damage_json(joints=[])),
+        ("robot.json", damage_json(spheres={"panda_link1": [[0, 0, 0]]})),
+        ("robot.json", damage_json(spheres={"nobody": [[0, 0, 0, 1]]})),
+        ("robot.json", damage_json(tip="nobody")),
+        ("robot.json", damage_json(locked={"panda_joint1": "x"})),
+        ("meshes.npz", "no archive"),
+        ("meshes.npz", ""),
+    ],
+)
+def test_damaged_folder_names_the_file(file: str, content: str, tmp_path: Path) -> None:
+    for name in ("robot.json", "meshes.npz"):
+        (tmp_path / name).write_bytes((robots.DATA / "panda" / name).read_bytes())
+    (tmp_path / file).write_text(content)
+    with pytest.raises(InputError, match=file):
+        read_bundle(tmp_path)
+    (tmp_path / file).unlink()
+    with pytest.raises(InputError, match=file):
+        read_bundle(tmp_path)
+
+
+def test_limits_file(tmp_path: Path) -> None:
+    file = tmp_path / "limits.yaml"
+    file.write_text(
+        "joint_limits:\n"
+        "  turn: {has_velocity_limits: true, max_velocity: 2, has_jerk_limits: false, max_jerk: 1}\n"
+        "  bend: {max_acceleration: 3.5, min_position: -1}\n"
+    )
+    robot = with_limits(read_urdf(urdf(tmp_path)), read_limits(file))
+    np.testing.assert_allclose(robot.velocity, [2, 1])
+    np.testing.assert_allclose(robot.acceleration, [8, 3.5])
+    np.testing.assert_allclose(robot.jerk, [80, 35])
+    np.testing.assert_allclose(robot.lower, [-2, -1])
+    for text, message in (
+        ("joint_limits: [", "not valid YAML"),
+        ("limits: {}", "no joint_limits"),
+        ("joint_limits: {turn: {max_speed: 1}}", "'max_speed'"),
+        ("joint_limits: {turn: {max_velocity: -1}}", "max_velocity of turn is -1"),
+        ("joint_limits: {wrist: {max_velocity: 1}}", "'wrist'"),
+        ("joint_limits: {turn: {min_position: 5}}", "turn: min_position"),
+    ):
+        file.write_text(text)
+        with pytest.raises(InputError) as error:
+            with_limits(read_urdf(urdf(tmp_path)), read_limits(file))
+        assert message in str(error.value)
+
+
+def test_add_and_load_by_name_and_by_urdf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROBOTDIFFUSE_ROBOTS", str(tmp_path / "robots"))
+    # balls, which are fitted in no time
+    balls = ARM.replace(BOX, '<sphere radius="0.15"/>').replace(TUBE, '<sphere radius="0.1"/>')
+    file, steps = urdf(tmp_path, balls), []
+    report = add_robot(
+        file,
+        settings=PreparationSettings(sampling=SamplingSettings(samples=200), samples=200, rounds=0),
+        progress=lambda what, step, count: steps.append((step, count)),
+    )
+    assert report.folder == tmp_path / "robots" / "tiny"
+    assert steps[0] == (0, 7) and steps[-1] == (7, 7)
+    for link in report.links:
+        assert link.covered and link.stick_out <= 0.0151
+        assert covered(report.robot.meshes[link.link], report.robot.spheres[link.link])
+    assert {pair.links: pair.reason for pair in report.pairs}["base", "upper"] == "adjacent"
+    for key in ("tiny", str(file), file, str(report.folder)):
+        same(load_robot(key), report.robot)
+    with pytest.raises(InputError, match=r"known: .*panda, .*tiny"):
+        load_robot("other")
+
+    # a changed URDF is another robot: it is fitted anew, and kept
+    larger = urdf(tmp_path, balls.replace('radius="0.15"', 'radius="0.16"'))
+    changed = load_robot(larger)
+    assert any("spheres were fitted" in note for note in changed.notes)
+    assert np.ptp(changed.meshes["upper"][0].vertices[:, 2]) == pytest.approx(0.32, rel=0.05)
+    kept = tmp_path / "robots" / f"tiny-{UrdfTree(larger, {}).digest[:8]}"
+    stamp = (kept / "robot.json").stat().st_mtime_ns
+    assert load_robot(larger) is load_robot(larger)
+    assert (kept / "robot.json").stat().st_mtime_ns == stamp
+
+
+def test_add_refuses_what_cannot_work(tmp_path: Path) -> None:
+    joint = "<joint name='j' type='continuous'><parent link='a'/><child link='b'/></joint>"
+    bare = f"<robot name='bare'><link name='a'/><link name='b'/>{joint}</robot>"
+    with pytest.raises(InputError, match="collision geometry"):
+        add_robot(urdf(tmp_path, bare), out=tmp_path / "bare")
+    with pytest.raises(InputError, match="robot name"):
+        add_robot(urdf(tmp_path), name="../up")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot write"):
+        write_bundle(read_urdf(urdf(tmp_path)), tmp_path / "file" / "robot", {})

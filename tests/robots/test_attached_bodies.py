@@ -1,0 +1,181 @@
+"""Tools and held objects: against the same geometry on a robot of its own, by hand, and by sampling."""
+
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy import ndarray
+
+import robotdiffuse as rd
+from helpers.box_arm import box_arm, box_mesh
+from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.robots.bodies import ConvexMesh
+from robotdiffuse.robots.fitting.convex_parts import convex_hull, planes_of
+from robotdiffuse.robots.fitting.covering_spheres import MOST, cover
+from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.shapes import Shape
+from robotdiffuse.core.transforms import rotation_about, transform
+
+rng = np.random.default_rng(0)
+CLOUD = rng.normal(size=(40, 3)) * [0.05, 0.03, 0.1]
+SOLIDS = {
+    "cube": box_mesh(np.full(3, -0.02), np.full(3, 0.02)),
+    "box": box_mesh(np.array([-0.03, -0.03, -0.1]), np.array([0.03, 0.03, 0.1])),
+    "tray": box_mesh(np.array([-0.2, -0.15, -0.005]), np.array([0.2, 0.15, 0.005])),
+    "stone": convex_hull(CLOUD),
+    "tilted": convex_hull(
+        box_mesh(np.zeros(3), np.array([0.3, 0.02, 0.02])).vertices
+        @ rotation_about(np.array([1.0, 2.0, 3.0]) / np.sqrt(14), 0.7)
+    ),
+}
+SHAPES = [
+    rd.Sphere([0.1, 0.0, 0.05], 0.03, name="ball"),
+    rd.Box([0.1, 0.02, 0.05], [0.05, 0.08, 0.1], [0.9, 0.1, 0.3, 0.0], name="crate"),
+    rd.Cylinder([0.0, 0.0, 0.1], 0.03, 0.12, [0.7, 0.7, 0.0, 0.1], name="cup"),
+    rd.Capsule([0.0, 0.1, 0.1], 0.02, 0.2, name="pen"),
+    rd.Mesh(SOLIDS["stone"].vertices, SOLIDS["stone"].faces, [0.1, 0, 0], name="stone"),
+]
+
+
+def inside(mesh: ConvexMesh, points: ndarray, slack: float = 0.0) -> ndarray:
+    normals, offsets = planes_of(mesh)
+    return (offsets + slack - points @ normals.T).min(axis=1) >= 0
+
+
+@pytest.mark.parametrize("mesh", SOLIDS.values(), ids=SOLIDS)
+def test_spheres_cover_surface_and_inside(mesh: ConvexMesh) -> None:
+    spheres = cover(mesh)
+    points = np.random.default_rng(1).uniform(mesh.vertices.min(0), mesh.vertices.max(0), (100_000, 3))
+    points = np.concatenate([points[inside(mesh, points)], mesh.vertices])
+    held = np.zeros(len(points), dtype=bool)
+    for x, y, z, r in spheres:
+        held |= np.linalg.norm(points - [x, y, z], axis=1) <= r
+    assert held.all()
+    assert len(spheres) <= MOST
+
+
+def surface_points(shape: Shape) -> ndarray:
+    """Points on the true surface of a shape, where it stands."""
+    if isinstance(shape, rd.Mesh):
+        return shape.world_vertices
+    d = np.random.default_rng(2).normal(size=(2000, 3))
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    if isinstance(shape, rd.Sphere):
+        return shape.center + shape.radius * d
+    if isinstance(shape, rd.Box):
+        local = d / np.abs(d).max(axis=1, keepdims=True) * shape.size / 2
+    elif isinstance(shape, rd.Cylinder):
+        flat = d[:, :2] / np.linalg.norm(d[:, :2], axis=1, keepdims=True)
+        local = np.column_stack([shape.radius * flat, shape.height / 2 * np.sign(d[:, 2])])
+    else:
+        assert isinstance(shape, rd.Capsule)
+        local = shape.radius * d + np.sign(d[:, 2:]) * [0, 0, shape.height / 2]
+    return local @ shape.rotation.T + shape.center
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: shape.kind)
+def test_polyhedra_hold_shapes_and_are_little_larger(shape: Shape) -> None:
+    robot = box_arm().attach(shape, "l3")
+    [body] = robot.attached
+    T = body.T_link_body
+    points = (surface_points(shape) - T[:3, 3]) @ T[:3, :3]
+    [mesh] = robot.meshes[shape.name]
+    assert inside(mesh, points, 1e-9).all()
+    size = np.ptp(mesh.vertices, axis=0)
+    assert (size <= np.ptp(points, axis=0) * 1.03 + 1e-3).all()
+
+
+def test_what_is_made_of_the_arm_is_what_is_made_anew() -> None:
+    robot = box_arm().attach(SHAPES[1], "l3").attach(SHAPES[2], "crate")
+    anew = replace(robot, attached=(), bare=None)
+    assert np.allclose(motion_radii(robot), motion_radii(anew), atol=1e-12)
+    for a, b in zip(compile_robot(robot), compile_robot(anew), strict=True):
+        assert np.array_equal(np.asarray(a), np.asarray(b))
+    assert robot.joint_names == box_arm().joint_names and robot.dof == 3
+
+
+def test_same_content_is_the_same_robot() -> None:
+    box = {"center": [0.1, 0, 0], "size": [0.05, 0.05, 0.1]}
+    one, two = (box_arm().attach(rd.Box(**box), "l3") for _ in range(2))
+    assert one is two
+    assert box_arm().attach(rd.Box(**box, name="other"), "l3") is not one
+    assert box_arm().attach(rd.Box(**box), "l3", ["l1"]) is not one
+    assert one.detach("box") is box_arm() and one.arm is box_arm()
+    assert robot_fingerprint(one) != robot_fingerprint(box_arm())
+    assert robot_fingerprint(pickle.loads(pickle.dumps(one))) == robot_fingerprint(one)
+
+
+def test_allowed_contacts_are_named_and_all_else_is_checked() -> None:
+    robot = box_arm().attach(SHAPES[1], "l3", ["l2"])
+    pairs = {frozenset(pair) for pair in robot.checked_pairs()}
+    assert frozenset(("l1", "crate")) in pairs
+    assert frozenset(("l2", "crate")) not in pairs, "it is named"
+    assert frozenset(("l3", "crate")) not in pairs, "it moves with it"
+
+
+def test_held_objects_stay_with_other_locked_joints() -> None:
+    panda = rd.load_robot("panda")
+    held = panda.attach(SHAPES[2], "panda_hand")
+    closed = held.with_locked({"panda_finger_joint1": 0.0})
+    assert closed is panda.with_locked({"panda_finger_joint1": 0.0}).attach(SHAPES[2], "panda_hand")
+    assert closed.detach("cup") is panda.with_locked({"panda_finger_joint1": 0.0})
+
+
+def test_a_tool_is_the_tip_and_its_shapes_are_in_the_frame_of_its_link() -> None:
+    panda = rd.load_robot("panda")
+    T_hand_tool = transform(np.array([0.0, 0.0, 0.15]), rotation_about(np.array([1.0, 0, 0]), 0.3))
+    robot = panda.with_tool("panda_hand", T_hand_tool, [rd.Cylinder([0, 0, 0.1], 0.01, 0.1)])
+    q = np.array([0.1, 0.2, 0.3, -1.5, 0.2, 1.5, 0.3])
+    T_base_tool = link_pose(panda, q, "panda_hand") @ T_hand_tool
+    assert robot.tip == "tool"
+    assert np.allclose(link_pose(robot, q, "tool"), T_base_tool)
+    on_axis = np.array([0.0, 0.0, 0.05, 1.0]), np.array([0.0, 0.0, 0.15, 1.0])
+    for point in on_axis:
+        local = np.linalg.inv(T_hand_tool) @ point
+        assert inside(robot.meshes["tool"][0], local[None, :3], 1e-9).all()
+    assert "tool" not in panda.with_tool("panda_hand", T_hand_tool).spheres, "a mere frame"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (lambda r: r.attach(SHAPES[0], "hand"), "unknown link in attached.link: 'hand'; known: l1, l2, l3"),
+        (lambda r: r.attach(SHAPES[0], r.base), "no planned joint moves; these are moved: l1"),
+        (lambda r: r.attach(rd.Sphere([0, 0, 0], 0.1, name="l2"), "l3"), "is a link of"),
+        (lambda r: r.attach(SHAPES[0], "l3", ["l9"]), "unknown link in attached.touch_links: 'l9'"),
+        (
+            lambda r: r.attach(rd.PointCloud([[0, 0, 0]]), "l3"),
+            "'point_cloud' is a point_cloud; it must be one of sphere",
+        ),
+        (lambda r: r.detach("cup"), "unknown body to detach: 'cup'"),
+        (lambda r: r.with_tool("l3", np.eye(4)).with_tool("l3", np.eye(4), name="b"), "'tool' already"),
+        (lambda r: r.with_tool("l3", np.eye(4)).attach(SHAPES[0], "tool").detach("tool"), "holds ball"),
+    ],
+)
+def test_what_cannot_be_held_is_refused_in_one_line(wrong, message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        wrong(box_arm())
+    assert "\n" not in str(raised.value)
+
+
+def test_scene_objects_are_taken_up_and_put_down_where_the_arm_is() -> None:
+    robot: Robot = rd.load_robot("panda")
+    cup = rd.Cylinder([0.5, 0.1, 0.3], 0.03, 0.1, name="cup")
+    scene = rd.Scene([rd.Box([0.5, 0, 0.1], [0.4, 0.4, 0.2], name="table"), cup])
+    q0, q1 = np.array([0.0, -0.3, 0, -2.2, 0, 2.0, 0.8]), np.array([0.5, -0.5, 0, -2.0, 0, 2.0, 0.8])
+    left, holding = scene.attach("cup", robot, q0)
+    assert [shape.name for shape in left.shapes] == ["table"]
+    assert np.allclose(link_pose(holding, q0, "cup")[:3, 3], cup.center)
+    again, free = left.detach("cup", holding, q1)
+    assert free is robot
+    put = again.shapes[-1]
+    assert isinstance(put, rd.Cylinder) and put.name == "cup"
+    T = link_pose(robot, q1, "panda_hand") @ np.linalg.inv(link_pose(robot, q0, "panda_hand"))
+    assert np.allclose(put.center, T[:3, :3] @ cup.center + T[:3, 3])
+    with pytest.raises(InputError, match="unknown obstacle to attach: 'mug'; known: cup, table"):
+        scene.attach("mug", robot, q0)

@@ -1,0 +1,89 @@
+"""Motion radii: never below the truth, and close to it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.example_robots import TIPS, example_robot, planar_arm
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.robots.motion_bounds import motion_radii
+from robotdiffuse.robots.robot import Robot
+
+
+def with_spheres(robot: Robot) -> Robot:
+    """The robot with three random spheres on each link but the second, which has none."""
+    rng = np.random.default_rng(5)
+    links = [link for link in robot.link_names if link != robot.link_names[1]]
+    spheres = {
+        link: np.hstack([rng.uniform(-0.1, 0.1, (3, 3)), rng.uniform(0, 0.05, (3, 1))]) for link in links
+    }
+    return replace(robot, spheres=spheres)
+
+
+def sampled_radii(robot: Robot, count: int) -> np.ndarray:
+    """Largest distances over random configurations, many of them with joints at a limit."""
+    rng = np.random.default_rng(1)
+    q = rng.uniform(robot.lower, robot.upper, (count, robot.dof))
+    q = np.where(rng.random(q.shape) < 0.3, np.where(rng.random(q.shape) < 0.5, robot.lower, robot.upper), q)
+    frames = ForwardKinematics(robot, torch.float64)(torch.tensor(q)).numpy()
+    out = np.zeros((len(robot.spheres), robot.dof))
+    for i, link in enumerate(link for link in robot.link_names if link in robot.spheres):
+        last = robot.link_frame(link)
+        T_base_link = frames[:, last] @ robot.T_frame_link(link)
+        spheres = robot.spheres[link]
+        points = (
+            np.einsum("nik,sk->nsi", T_base_link[:, :3, :3], spheres[:, :3]) + T_base_link[:, None, :3, 3]
+        )
+        for j in robot.chain(link):
+            axis, origin = frames[:, j + 1, :3, 2], frames[:, j + 1, :3, 3]
+            lever = np.linalg.norm(np.cross(axis[:, None], points - origin[:, None]), axis=-1)
+            out[i, j] = 1.0 if robot.prismatic[j] else (lever + spheres[:, 3]).max()
+    return out
+
+
+@pytest.mark.parametrize("name", TIPS)
+def test_never_below_and_close_to_sampled_maxima(name: str) -> None:
+    robot = with_spheres(example_robot(name))
+    radii, sampled = motion_radii(robot), sampled_radii(robot, 20_000)
+    assert (radii >= sampled).all()
+    assert ((radii > 0) == (sampled > 0)).all()
+    # The bound itself is within 1 %; the rest is what random sampling misses of the maximum.
+    assert (radii <= 1.04 * sampled + 1e-3).all()
+
+
+@pytest.mark.parametrize("name", TIPS)
+def test_bounds_every_displacement(name: str) -> None:
+    robot = with_spheres(example_robot(name))
+    rng = np.random.default_rng(2)
+    a, b = rng.uniform(robot.lower, robot.upper, (2, 500, robot.dof))
+    b = a + (b - a) * rng.random((500, 1)) ** 3
+    bounds = np.abs(b - a) @ motion_radii(robot).T
+    fk = ForwardKinematics(robot, torch.float64)
+    T_a, T_b = (fk.links(torch.tensor(q)).numpy() for q in (a, b))
+    for i, link in enumerate(link for link in robot.link_names if link in robot.spheres):
+        centers = np.hstack([robot.spheres[link][:, :3], np.ones((3, 1))])
+        k = robot.link_names.index(link)
+        moved = np.linalg.norm((T_b[:, k] - T_a[:, k]) @ centers.T, axis=1).max(-1)
+        assert (moved <= bounds[:, i] + 1e-12).all()
+
+
+def test_planar_arm_by_hand() -> None:
+    arm = planar_arm(0.5, 0.4, 0.3)
+    joints = tuple(replace(joint, lower=-3.0, upper=3.0) for joint in arm.joints)
+    robot = replace(arm, joints=joints, spheres={"l0": np.ones((1, 4)), "tip": np.array([[0, 0, 9.0, 0.05]])})
+    # Heights along the axes do not count. Stretched out, the sphere at the tip is furthest.
+    radii = motion_radii(robot)
+    np.testing.assert_array_equal(radii[0], 0)
+    exact = np.array([1.25, 0.75, 0.35])
+    assert (radii[1] >= exact).all()
+    np.testing.assert_allclose(radii[1], exact, rtol=0.02)
+
+
+def test_limits_tighten_the_bound() -> None:
+    arm = planar_arm(0.5, 0.5)
+    bent = replace(arm.joints[1], lower=np.pi / 2, upper=3.0)
+    joints = (replace(arm.joints[0], lower=-3.0, upper=3.0), bent, arm.joints[2])
+    robot = replace(arm, joints=joints, spheres={"tip": np.array([[0, 0, 0, 0.0]])})
+    np.testing.assert_allclose(motion_radii(robot), [[np.sqrt(0.5), 0.5]], rtol=0.03)

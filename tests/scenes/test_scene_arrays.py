@@ -1,0 +1,95 @@
+"""Packed scenes: there and back, floors apart, distances as the shapes' own, also when they are turned."""
+
+import numpy as np
+import pytest
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.families.rop_dense import ROP_DENSE
+from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
+
+FLOOR = Box([0, 0, -0.05], [2, 2, 0.1], name="floor")
+
+
+def some_scenes(n: int, seed: int = 5) -> list[Scene]:
+    """Dense scenes with a floor, all their boxes turned anyhow."""
+    rng = np.random.default_rng(seed)
+    scenes = []
+    for _ in range(n):
+        shapes = ROP_DENSE.scene(rng).shapes[1:]
+        turned = [Box(s.center, s.size, rng.normal(size=4)) if isinstance(s, Box) else s for s in shapes]
+        scenes.append(Scene([FLOOR, *turned]))
+    return scenes
+
+
+def distance(shape: Shape, place: np.ndarray) -> float:
+    if isinstance(shape, Sphere):
+        return float(np.linalg.norm(place - shape.center) - shape.radius)
+    assert isinstance(shape, Box)
+    beyond = np.abs(shape.rotation.T @ (place - shape.center)) - shape.size / 2
+    return float(np.linalg.norm(beyond.clip(0)) if (beyond > 0).any() else beyond.max())
+
+
+@pytest.mark.parametrize("floor", [True, False])
+def test_scenes_come_back(floor: bool) -> None:
+    scenes = some_scenes(4)
+    packed = PackedScenes.pack(scenes, 13, floor)
+    assert packed.kinds.shape == (4, 13) and packed.params.shape == (4, 13, 10)
+    back = [packed.scene(i) for i in range(4)]
+    for scene, again in zip(scenes, back, strict=True):
+        assert [type(shape) for shape in scene.shapes] == [type(shape) for shape in again.shapes]
+        assert isinstance(again.shapes[0], Box) and again.shapes[0].bounds[1, 2] == pytest.approx(0, abs=1e-8)
+    twice = PackedScenes.pack(back, 13, floor)
+    assert (twice.kinds == packed.kinds).all()
+    # unpacking makes a quaternion of float32 one of length 1 in float64
+    np.testing.assert_allclose(twice.params, packed.params, atol=1e-7)
+    if floor:
+        assert back[0].shapes[0].name == "floor" and (twice.floors == packed.floors).all()
+
+
+def test_rows_and_parts() -> None:
+    scenes = some_scenes(5)
+    packed = PackedScenes.pack(scenes, 12, floor=True)
+    parts = PackedScenes.joined([packed[3:], packed[np.array([0, 2, 1])]])
+    assert len(parts) == 5
+    for i, j in enumerate((3, 4, 0, 2, 1)):
+        np.testing.assert_array_equal(parts.params[i], packed.params[j])
+        assert len(parts.scene(i).shapes) == len(scenes[j].shapes)
+    without = PackedScenes(packed.kinds, packed.params)
+    assert PackedScenes.joined([without[:2], without[2:]]).floors is None
+    assert without.floor(0) is None and len(without.scene(0).shapes) == len(scenes[0].shapes) - 1
+    assert packed.floors is not None
+    packed.floors[0] = 0
+    assert packed.floor(0) is None and packed.floor(1) is not None
+
+
+def test_distances_are_those_of_the_shapes() -> None:
+    scenes = [Scene([FLOOR]), *some_scenes(12)]
+    at = np.random.default_rng(0).uniform([-1, -1, 0], [1, 1, 1.2], (25, 3))
+    for scene, row in zip(scenes, PackedScenes.pack(scenes, 12, floor=True).distances(at), strict=True):
+        for place, found in zip(at, row, strict=True):
+            wanted = min((distance(shape, place) for shape in scene.shapes[1:]), default=np.inf)
+            assert found == pytest.approx(wanted, abs=1e-6)
+
+
+def test_turned_scenes_have_turned_distances() -> None:
+    scenes, rng = PackedScenes.pack(some_scenes(6), 12, floor=True), np.random.default_rng(1)
+    angle = rng.uniform(-np.pi, np.pi, 6).astype(np.float32)
+    turned, at = scenes.turned(angle), rng.uniform(-1, 1, (20, 3))
+    for i, (c, s) in enumerate(zip(np.cos(angle), np.sin(angle), strict=True)):
+        moved = at @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+        near, far = scenes[i : i + 1].distances(at), turned[i : i + 1].distances(moved)
+        np.testing.assert_allclose(far, near, atol=1e-5)
+    assert turned.floors is scenes.floors
+
+
+def test_what_cannot_be_packed() -> None:
+    (scene,) = some_scenes(1)
+    with pytest.raises(InputError, match="2 slots"):
+        PackedScenes.pack([scene], 2)
+    with pytest.raises(InputError, match="cylinder"):
+        PackedScenes.pack([Scene([Cylinder([0, 0, 0], 1, 1)])], 2)
+    for floor in (Capsule([0, 0, 0], 1, 1), Box([0, 0, 0], [1, 1, 1], [1, 1, 0, 0])):
+        with pytest.raises(InputError, match=f"is a {floor.kind}; it must be a box that is not turned"):
+            PackedScenes.pack([Scene([floor])], 2, floor=True)

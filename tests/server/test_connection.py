@@ -1,0 +1,223 @@
+"""Clients that speak no HTTP, send or take too slowly, or go: each found by benchmarks/fuzz_socket.py."""
+
+import asyncio
+import json
+import socket
+from collections.abc import Iterator
+from typing import Any
+
+import h11
+import httpx
+import numpy as np
+import pytest
+
+from helpers.box_arm import box_arm
+from helpers.serving import serving
+
+pytest.importorskip("fastapi")
+
+from uvicorn import Config
+from uvicorn.server import ServerState
+
+from robotdiffuse.planning.context import Call
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.server import connection
+from robotdiffuse.server import worker
+from robotdiffuse.server.connection import Connection
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[httpx.Client]:
+    with serving("--workers", "1") as (client, _):
+        yield client
+
+
+def answer(server: httpx.Client, sent: bytes) -> tuple[int, Any]:
+    """Code and body of what raw bytes are answered with."""
+    with socket.create_connection((server.base_url.host, server.base_url.port or 0), 10) as client:
+        client.sendall(sent)
+        stream = client.makefile("rb")
+        code, headers = int(stream.readline().split()[1]), {}
+        while line := stream.readline().strip():
+            name, _, value = line.partition(b": ")
+            headers[name.lower()] = value
+        body = b"" if sent.startswith(b"HEAD") else stream.read(int(headers.get(b"content-length", 0)))
+    return code, json.loads(body) if body else None
+
+
+RIGHT = b"Host: localhost\r\n"
+CASES = {
+    "a host without its bracket": (b"GET /robots HTTP/1.1\r\nHost: [::1\r\n\r\n", 421, "the host is '[::1'"),
+    "no HTTP": (b"hello\r\n\r\n", 400, "this is no request of HTTP/1.1"),
+    "a huge head": (b"GET / HTTP/1.1\r\n" + RIGHT + b"X: " + b"y" * 100_000, 400, "head is too large"),
+    "a slash more": (b"GET /robots/ HTTP/1.1\r\n" + RIGHT + b"\r\n", 404, "there is no '/robots/'"),
+    "a damaged chunk": (
+        b"POST /plan HTTP/1.1\r\n"
+        + RIGHT
+        + b"Content-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
+        b"0x5\r\n{}\r\n",
+        400,
+        "this is no request",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_wrong_is_one_line_of_json(server: httpx.Client, case: str) -> None:
+    sent, code, message = CASES[case]
+    given, record = answer(server, sent)
+    assert given == code and message in record["error"]
+    assert server.get("/health").status_code == 200
+
+
+def test_a_damaged_chunk_after_head_is_answered_without_a_body(server: httpx.Client) -> None:
+    head = b"HEAD /plan HTTP/1.1\r\n" + RIGHT + b"Transfer-Encoding: chunked\r\n\r\n0x5\r\n"
+    assert answer(server, head) == (400, None) or answer(server, head) == (405, None)
+    assert server.get("/health").status_code == 200
+
+
+class Transport(asyncio.Transport):
+    """Keeps what is written."""
+
+    def __init__(self, connection: Connection) -> None:
+        super().__init__()
+        self.connection, self.written, self.closed = connection, b"", False
+
+    def write(self, data: Any) -> None:
+        assert not self.closed
+        self.written += data
+
+    def is_closing(self) -> bool:
+        return self.closed
+
+    def close(self) -> None:
+        if self.closed:
+            return
+        self.closed = True
+        self.connection.connection_lost(None)
+
+    abort = close
+
+
+def connected(application: Any) -> Connection:
+    config = Config(application, interface="asgi3", lifespan="off", log_level="critical")
+    return Connection(config, ServerState(), {})
+
+
+def talked(sent: bytes, monkeypatch: pytest.MonkeyPatch, stuck: bool = False) -> tuple[bytes, bool]:
+    """What a connection has written a while after it got these bytes, and whether it closed itself; its
+    application never answers."""
+
+    async def never(scope: Any, receive: Any, send: Any) -> None:
+        while (await receive())["type"] != "http.disconnect":
+            pass
+
+    async def talk() -> tuple[bytes, bool]:
+        made = connected(never)
+        transport = Transport(made)
+        made.connection_made(transport)
+        if sent:
+            made.data_received(sent)
+        if stuck:
+            made.pause_writing()
+        assert not transport.closed
+        await asyncio.sleep(0.2)
+        found = transport.written, transport.closed
+        transport.close()
+        return found
+
+    monkeypatch.setattr(connection, "SENDING", 0.05)
+    monkeypatch.setattr(connection, "TAKING", 0.05)
+    return asyncio.run(talk())
+
+
+WHOLE = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
+
+
+def test_half_a_head_is_waited_for_so_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    written, closed = talked(WHOLE[:-5], monkeypatch)
+    assert closed and written.startswith(b"HTTP/1.1 408") and b"took more than 0.05 s" in written
+
+
+def test_silence_is_not_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert talked(b"", monkeypatch) == (b"", True)
+
+
+def test_a_request_that_is_being_answered_is_not_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert talked(WHOLE, monkeypatch) == (b"", False)
+
+
+def test_a_client_that_does_not_read_is_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert talked(WHOLE, monkeypatch, stuck=True) == (b"", True)
+
+
+def test_nothing_is_written_after_a_refusal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A chunk went wrong while the application was about to answer: h11 raised LocalProtocolError."""
+
+    async def slow(scope: Any, receive: Any, send: Any) -> None:
+        await asyncio.sleep(0.01)
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await send({"type": "http.response.body", "body": b"late"})
+
+    async def talk() -> Connection:
+        made = connected(slow)
+        transport = Transport(made)
+        made.connection_made(transport)
+        made.data_received(b"POST / HTTP/1.1\r\nHost: a\r\nTransfer-Encoding: chunked\r\n\r\n0x5\r\n")
+        await asyncio.sleep(0.05)
+        assert transport.written.startswith(b"HTTP/1.1 400") and b"late" not in transport.written
+        return made
+
+    assert asyncio.run(talk()).conn.our_state in (h11.MUST_CLOSE, h11.CLOSED, h11.DONE)
+
+
+@pytest.mark.parametrize("head", [b"HTTP/1.0\r\n", b"HTTP/1.1\r\nHost: a\r\nConnection: close\r\n"])
+def test_bytes_after_the_last_request_do_not_cut_its_answer_off(head: bytes) -> None:
+    """They were taken for what is no HTTP, and the connection closed before the body was written."""
+
+    async def slow(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+        await asyncio.sleep(0.01)
+        await send({"type": "http.response.body", "body": b"late"})
+
+    async def talk() -> Transport:
+        made = connected(slow)
+        transport = Transport(made)
+        made.connection_made(transport)
+        made.data_received(b"POST / " + head + b"Content-Length: 2\r\n\r\n{}]]")
+        await asyncio.sleep(0.005)
+        made.data_received(b"]]]]")
+        await asyncio.sleep(0.05)
+        return transport
+
+    ended = asyncio.run(talk())
+    assert ended.written.startswith(b"HTTP/1.1 200") and b"late" in ended.written and ended.closed
+
+
+def test_a_call_that_was_left_before_it_began_is_left() -> None:
+    """The signal came while the worker still took the request: it planned on, and was killed for it."""
+    shared = worker.Shared(cancelled=7)
+    worker.accept({}, 1.0, shared)
+    with pytest.raises(worker.Cancelled):
+        worker.respond(7, worker.PLAN, b"{}")
+    assert worker.respond(8, worker.PLAN, b"{}").code == 400
+
+
+def test_a_call_is_left_when_it_looks_at_its_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A signal's handler raised wherever the call was: where compiled code handed its results over, the
+    worker died of it."""
+    shared = worker.Shared()
+    worker.accept({}, 1.0, shared)
+
+    def planning(*_: object) -> worker.Answer:
+        call = Call("aorrtc", Problem(box_arm(), Scene(), np.zeros(3), np.ones(3)), 1.0, 0)
+        assert call.remaining > 0
+        shared.cancelled = 7
+        assert call.remaining > 0
+        return worker.failed(500, "it was not left")
+
+    monkeypatch.setattr(worker, "_plan", planning)
+    with pytest.raises(worker.Cancelled):
+        worker.respond(7, worker.PLAN, b"{}")
+    assert worker.respond(8, worker.PLAN, b"{}").code == 500

@@ -1,0 +1,42 @@
+"""Speeds along a course: limits hold from any place on, however often it is looked at anew."""
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
+from robotdiffuse.planning.reactive.timed_path import Course, Speeds
+
+PANDA = rd.load_robot("panda")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_steps_keep_limits_and_end_at_rest(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    waypoints = np.cumsum(rng.normal(size=(6, 7)) * 0.4, axis=0)
+    line = BlendedPolyline(waypoints, half_widths(waypoints, np.full(4, 0.1)))
+    course, left = Course(PANDA, line, True), Speeds(np.zeros(2), np.zeros(2))
+    for k in range(400):
+        s, speed = float(left.s[0]), float(left.speeds[0])
+        if s >= course.end:
+            break
+        if k % 7 < 5:  # else the arm brakes for a while
+            left = course.on_then_rest(s, speed, 0.02)
+            assert left.speeds[0] == pytest.approx(speed, abs=1e-9)
+        assert left.speeds[-1] == 0
+        motion = course.rows(left, 0.005)
+        assert (np.abs(motion.velocities) <= PANDA.velocity).all()
+        assert (np.abs(motion.accelerations) <= PANDA.acceleration).all()
+        assert motion.duration < 1.0, "stops that take that long are none"
+        left = left.rest(0.02)
+    assert left.s[0] >= course.end
+
+
+def test_fastest_motion_to_the_end_is_that_of_the_timing() -> None:
+    """Within what the course spares of the limits, about 4 % of accelerations."""
+    from robotdiffuse.trajectories.speed_limits import TimingSettings, timed_piece
+
+    waypoints = np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)])
+    line = BlendedPolyline(waypoints, half_widths(waypoints, np.array([0.1])))
+    fastest = timed_piece(PANDA, line, TimingSettings())[0][-1]
+    assert Course(PANDA, line, True).onwards(0.0, 0.0).duration == pytest.approx(fastest, rel=0.05)

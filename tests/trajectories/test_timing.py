@@ -1,0 +1,288 @@
+"""Timing: limits, rest at both ends, geometry that stays on verified ground."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.trajectories.corner_rounding import DEVIATION, BlendedPolyline, half_widths
+from robotdiffuse.trajectories.speed_limits import TimingSettings
+from robotdiffuse.trajectories.timing import SAME, time_parameterize
+from robotdiffuse.validation.rates import RateTolerances, wrong_rates
+from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.core.types import Path, Trajectory
+
+VELOCITY = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
+ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
+JUDGES = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
+
+
+def arm(velocity: tuple[float, ...] = VELOCITY, acceleration: tuple[float, ...] = ACCELERATION) -> Robot:
+    """A chain of revolute joints: timing looks at the limits alone."""
+    joints = tuple(
+        Joint(
+            f"j{i}", "revolute", f"l{i}", f"l{i + 1}", np.eye(4), np.array([0.0, 0.0, 1.0]), -3.0, 3.0, v, a
+        )
+        for i, (v, a) in enumerate(zip(velocity, acceleration, strict=True))
+    )
+    return Robot("arm", "l0", f"l{len(joints)}", joints)
+
+
+def path(robot: Robot, positions: object) -> Path:
+    return Path(robot.joint_names, np.asarray(positions, dtype=np.float64))
+
+
+def always(_: object) -> bool:
+    return True
+
+
+def never(_: object) -> bool:
+    return False
+
+
+def distance_to_polyline(points: np.ndarray, waypoints: np.ndarray) -> np.ndarray:
+    best = np.full(len(points), np.inf)
+    for a, b in pairwise(waypoints):
+        ab = b - a
+        t = np.clip((points - a) @ ab / max(ab @ ab, 1e-300), 0, 1)
+        best = np.minimum(best, np.linalg.norm(points - a - t[:, None] * ab, axis=1))
+    return best
+
+
+def check(robot: Robot, p: Path, t: Trajectory, settings: TimingSettings) -> None:
+    assert t.times[0] == 0 and (np.diff(t.times) > 0).all()
+    assert np.diff(t.times).max() <= 1.1 * settings.sample_time + 1e-9
+    assert np.array_equal(t.positions[0], p.positions[0])
+    assert np.array_equal(t.positions[-1], p.positions[-1])
+    assert not t.velocities[[0, -1]].any()
+    assert (np.abs(t.velocities) <= 1.01 * settings.velocity_scale * robot.velocity).all()
+    assert (np.abs(t.accelerations) <= 1.01 * settings.acceleration_scale * robot.acceleration).all()
+    assert distance_to_polyline(t.positions, p.positions).max() <= settings.corner_deviation + 2 * SAME
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(2, 40),
+    scale=st.floats(-6, 0.3),
+    settings=st.builds(
+        TimingSettings,
+        velocity_scale=st.floats(0.05, 1),
+        acceleration_scale=st.floats(0.05, 1),
+        corner_deviation=st.sampled_from([0.0, 1e-4, 0.01, 0.1, 1.0]),
+    ),
+    kind=st.sampled_from(
+        ["random", "there and back", "nearly straight", "repeated", "one joint", "steps of all sizes"]
+    ),
+)
+def test_limits_rest_and_geometry(
+    seed: int, count: int, scale: float, settings: TimingSettings, kind: str
+) -> None:
+    rng = np.random.default_rng(seed)
+    q = 10**scale * rng.uniform(-1, 1, (count, 7))
+    if kind == "there and back":
+        q = q[np.arange(count) % 2]
+    elif kind == "nearly straight":
+        q = np.linspace(0, 1, count)[:, None] * q[0] + 1e-7 * q
+    elif kind == "repeated":
+        q = np.repeat(q, 3, axis=0)
+    elif kind == "one joint":
+        q[:, :6] = 0
+    elif kind == "steps of all sizes":  # toppra failed on steps below 1e-6 among long ones
+        q = q[0] + 10 ** rng.uniform(-9, 0, (count, 1)) * q
+    robot = arm()
+    p = path(robot, q)
+    valid = (lambda _: rng.random() < 0.5) if seed % 2 else always
+    check(robot, p, time_parameterize(robot, p, valid, valid, settings), settings)
+
+
+def test_a_wide_reversal_keeps_its_velocity_limit() -> None:
+    """The path velocity of a rounded reversal peaks between grid points: it was 1.8 % too fast there."""
+    q = np.random.default_rng(0).uniform(-1, 1, (3, 7))[[0, 1, 0]]
+    settings = TimingSettings(velocity_scale=0.0625, corner_deviation=1.0)
+    p = path(arm(), q)
+    check(arm(), p, time_parameterize(arm(), p, always, always, settings), settings)
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_velocities_and_accelerations_are_the_derivatives(seed: int) -> None:
+    robot = arm()
+    p = path(robot, np.cumsum(np.random.default_rng(seed).normal(0, 0.5, (6, 7)), axis=0))
+    t = time_parameterize(robot, p, always, always, TimingSettings(sample_time=0.001))
+    dt = np.diff(t.times)[:-1]
+    middle = 0.5 * (t.velocities[:-2] + t.velocities[1:-1])
+    assert np.abs(np.diff(t.positions[:-1], axis=0) / dt[:, None] - middle).max() < 0.01
+    # Acceleration jumps at the switching points, so that the integral is compared, not the slope.
+    gained = np.cumsum(0.5 * (t.accelerations[:-2] + t.accelerations[1:-1]) * dt[:, None], axis=0)
+    assert np.abs(gained - t.velocities[1:-1]).max() < 0.15
+
+
+def test_one_joint_against_the_closed_form() -> None:
+    """Bang-bang: 2 sqrt(d / a) below the velocity limit, d / v + v / a above it."""
+    robot = arm((2.0,), (8.0,))
+    for d, expected in ((0.125, 2 * np.sqrt(0.125 / 8)), (3.0, 3.0 / 2 + 2.0 / 8)):
+        t = time_parameterize(robot, path(robot, [[0.0], [d]]), always, always)
+        assert t.duration == pytest.approx(expected, rel=0.01)
+
+
+def test_halved_scales_are_slower_by_their_factor() -> None:
+    robot = arm((2.0,), (8.0,))
+    p = path(robot, [[0.0], [0.1]])
+    fast, slow = (
+        time_parameterize(robot, p, always, always, TimingSettings(acceleration_scale=a)).duration
+        for a in (1.0, 0.25)
+    )
+    assert slow == pytest.approx(2 * fast, rel=1e-3)
+
+
+def test_path_of_length_zero_is_two_rows_at_rest() -> None:
+    robot = arm()
+    for rows in (1, 2, 5):
+        t = time_parameterize(robot, path(robot, np.full((rows, 7), 0.3)), always, always)
+        assert t.times.tolist() == [0.0, 0.01]
+        assert (t.positions == 0.3).all() and not t.velocities.any() and not t.accelerations.any()
+
+
+def corner(robot: Robot) -> Path:
+    q = np.zeros((3, 7))
+    q[1:, 0] = 1.0
+    q[2, 1] = 1.0
+    return path(robot, q)
+
+
+def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:
+    robot = arm()
+    p = corner(robot)
+    rounded = time_parameterize(robot, p, always, always)
+    stopped = time_parameterize(robot, p, never, never)
+    assert rounded.duration < 0.9 * stopped.duration
+    nearest = np.linalg.norm(stopped.positions - p.positions[1], axis=1).argmin()
+    assert np.array_equal(stopped.positions[nearest], p.positions[1])
+    assert np.abs(stopped.velocities[nearest]).max() < 1e-9
+    assert distance_to_polyline(stopped.positions, p.positions).max() < 1e-12
+
+
+@pytest.mark.parametrize("size", [1e-5, 1e-4, 1e-3, 5e-3, 0.02, 0.1])
+def test_rows_of_the_shortest_pieces_agree(size: float) -> None:
+    """Between two stops so near to each other, rows at sample times did not tell the acceleration."""
+    robot = arm()
+    q = np.zeros((4, 7))
+    q[1:, 0], q[2:, 2], q[3, 1] = 1.0, size, 1.0
+    for accept in (never, always):
+        t = time_parameterize(robot, path(robot, q), accept, accept)
+        assert wrong_rates(robot, t, JUDGES) == []
+
+
+def test_only_the_corner_that_fails_is_tightened() -> None:
+    """An obstacle inside the first corner alone: the second keeps its rounding."""
+    robot = arm()
+    q = np.zeros((4, 7))
+    q[1:, 0] = 1.0
+    q[2:, 1] = 1.0
+    q[3, 2] = 1.0
+    p = path(robot, q)
+
+    def cuts(positions: np.ndarray, k: int) -> float:
+        return float(np.linalg.norm(positions - q[k], axis=1).min())
+
+    def valid(piece: Path | Trajectory) -> bool:
+        near = np.linalg.norm(piece.positions - q[1], axis=1) < 0.4
+        return not near.any() or distance_to_polyline(piece.positions[near], q).max() < 0.03
+
+    t = time_parameterize(robot, p, valid, valid)
+    assert valid(t)
+    assert cuts(t.positions, 1) < 0.03
+    assert cuts(t.positions, 2) > 0.09
+
+
+def test_blend_reaches_the_deviation_and_is_twice_differentiable() -> None:
+    waypoints = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0]])
+    d = half_widths(waypoints, np.array([0.05]))
+    line = BlendedPolyline(waypoints, d)
+    assert np.linalg.norm(line(np.array([1.0]), 0) - waypoints[1]) == pytest.approx(0.05)
+    assert d[0] * DEVIATION * np.sqrt(2) == pytest.approx(0.05)
+    s = np.linspace(0, line.length, 20001)
+    for order in (0, 1):
+        slope = np.gradient(line(s, order), s, axis=0)[1:-1]
+        assert np.abs(slope - line(s, order + 1)[1:-1]).max() < 2e-3
+
+
+def test_refusals() -> None:
+    robot = arm((2.0, 0.0), (8.0, 8.0))
+    with pytest.raises(InputError, match=r"velocity limit of j1 is 0\.0"):
+        time_parameterize(robot, path(robot, [[0.0, 0.0], [1.0, 1.0]]), always, always)
+    with pytest.raises(InputError, match=r"timing\.velocity_scale is 1.5"):
+        TimingSettings(velocity_scale=1.5)
+    with pytest.raises(InputError, match=r"timing\.acceleration_scale is 0.0"):
+        TimingSettings(acceleration_scale=0.0)
+    with pytest.raises(InputError, match=r"timing\.sample_time is 0.0"):
+        TimingSettings(sample_time=0.0)
+    with pytest.raises(InputError, match="corner_deviation"):
+        TimingSettings(corner_deviation=-0.1)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    count=st.integers(2, 8),
+    jerk=st.floats(5.0, 5000.0),
+    sample_time=st.sampled_from([0.001, 0.004, 0.01]),
+    stops=st.booleans(),
+)
+def test_a_limit_of_jerk_is_kept_with_the_others(
+    seed: int, count: int, jerk: float, sample_time: float, stops: bool
+) -> None:
+    robot = arm()
+    q = np.cumsum(np.random.default_rng(seed).normal(0, 0.3, (count, 7)), axis=0)
+    settings = TimingSettings(jerk=jerk, sample_time=sample_time)
+    answer = never if stops else always
+    t = time_parameterize(robot, path(robot, q), answer, answer, settings)
+    steps = np.diff(t.times)[:, None]
+    assert steps.min() > 0 and steps.max() <= 1.1 * sample_time + 1e-9
+    assert np.abs(np.diff(t.accelerations, axis=0) / steps).max() <= jerk * (1 + 1e-6)
+    assert (np.abs(t.velocities) <= robot.velocity * (1 + 1e-9)).all()
+    assert (np.abs(t.accelerations) <= robot.acceleration * (1 + 1e-9)).all()
+    assert np.array_equal(t.positions[0], q[0]) and np.array_equal(t.positions[-1], q[-1])
+    assert not t.velocities[[0, -1]].any() and np.abs(t.accelerations[[0, -1]]).max() < 1e-9
+    # rates are those of the positions: second differences agree to what the jerk does in two steps
+    middle = 0.5 * (t.velocities[1:] + t.velocities[:-1])
+    assert np.abs(np.diff(t.positions, axis=0) / steps - middle).max() < jerk * sample_time**2 + 1e-6
+    if stops:
+        assert distance_to_polyline(t.positions, q).max() < 1e-8
+
+
+def test_a_limit_of_jerk_costs_what_it_must() -> None:
+    """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs next to nothing."""
+    robot = arm((20.0,), (80.0,))
+    p = path(robot, [[0.0], [1.0]])
+    free, gentle, slight = (
+        time_parameterize(robot, p, always, always, TimingSettings(jerk=jerk)).duration
+        for jerk in (None, 50.0, 1e5)
+    )
+    least = (32 / 50.0) ** (1 / 3)
+    assert least <= gentle < 1.4 * least
+    assert slight == pytest.approx(free, abs=0.005)
+
+
+def test_fine_rows_keep_the_limits_to_the_letter() -> None:
+    """Accelerations were 0.025 % too great between the places in a curve that were looked at."""
+    robot = arm()
+    for seed in range(20):
+        q = np.cumsum(np.random.default_rng(seed).normal(0, 0.5, (6, 7)), axis=0)
+        t = time_parameterize(robot, path(robot, q), always, always, TimingSettings(sample_time=0.001))
+        assert (np.abs(t.velocities) <= robot.velocity).all()
+        assert (np.abs(t.accelerations) <= robot.acceleration).all()
+
+
+@given(seed=st.integers(0, 2**32 - 1), deviation=st.sampled_from([0.0, 0.02, 0.1]))
+def test_durations_are_those_of_toppra(seed: int, deviation: float) -> None:
+    rng, robot = np.random.default_rng(seed), arm()
+    p = path(robot, np.cumsum(rng.normal(0, 0.4, (rng.integers(2, 8), 7)), axis=0))
+    ours, theirs = (
+        time_parameterize(
+            robot, p, always, always, TimingSettings(corner_deviation=deviation, solver=solver)
+        ).duration
+        for solver in ("compiled", "toppra")
+    )
+    assert ours == pytest.approx(theirs, rel=1e-3)

@@ -1,0 +1,472 @@
+"""The judge: what it must refuse, what it must accept, and that its certificate holds."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from helpers.box_arm import box_arm
+from robotdiffuse.collision import exact_meshes as exact_collision
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.validation.validator import (
+    Report,
+    VerifySettings,
+    Violation,
+    verifier,
+    verify,
+    verify_trajectory,
+)
+
+Z = np.array([0.0, 0.0, 1.0])
+RATES = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
+
+
+def vector(*values: float) -> np.ndarray:
+    return np.array(values, float)
+
+
+def judge(rows: np.ndarray, *shapes: Shape, robot: Robot | None = None, **settings: float) -> Report:
+    """The verdict on a path whose problem asks for its own first and last waypoint."""
+    robot = robot or box_arm()
+    problem = Problem(robot, Scene(shapes), rows[0], JointGoal(rows[-1:]))
+    return verify(problem, Path(robot.joint_names, rows), VerifySettings(**settings))  # type: ignore[arg-type]
+
+
+def refused(report: Report, kind: str) -> Violation:
+    assert not report.valid
+    assert report.min_clearance is None
+    assert report.violation is not None
+    assert report.violation.kind == kind, report.violation
+    assert "\n" not in report.violation.message
+    return report.violation
+
+
+def dense(rows: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Configurations at most `step` apart in any joint along a path, and their indices with fractions."""
+    counts = np.maximum(np.ceil(np.abs(np.diff(rows, axis=0)).max(axis=1) / step).astype(int), 1)
+    at = [i + np.arange(n) / n for i, n in enumerate(counts)]
+    where = np.concatenate([*at, [len(rows) - 1.0]])
+    return np.stack([np.interp(where, np.arange(len(rows)), column) for column in rows.T], axis=1), where
+
+
+SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3]])
+
+
+def test_a_free_motion_is_accepted_with_a_certified_clearance() -> None:
+    shapes = (Sphere(vector(1.3, 0.3, 0), 0.1), Sphere(vector(0, -1, 0), 0.2))
+    report = judge(SWING, *shapes)
+    assert report.valid
+    assert report.violation is None
+    exact = ExactCollision(
+        box_arm(), Scene([Sphere(vector(1.3, 0.3, 0), 0.1), Sphere(vector(0, -1, 0), 0.2)])
+    )
+    for found, distances in (
+        (report.scene_clearance, exact.link_distances),
+        (report.self_clearance, exact.pair_distances),
+    ):
+        least = min(d.distance for q in dense(SWING, 0.01)[0] for d in distances(q))
+        assert found is not None
+        # Spheres stick out of the boxes by 2 cm, towards each other by 4; the certificate may give away half.
+        assert 0.5 * (least - 0.04) <= found <= least
+    assert report.min_clearance == report.scene_clearance
+
+
+def test_an_empty_scene_and_a_motion_of_one_waypoint() -> None:
+    report = judge(np.zeros((1, 3)))
+    assert report.valid
+    assert report.min_clearance is not None
+    assert 0.2 < report.min_clearance < 0.4
+    assert report.scene_clearance == pytest.approx(1.0, abs=1e-4)
+    assert report.self_clearance == report.min_clearance
+    refused(judge(vector(1, 2.6, 2.6)[None]), "self_collision")
+    assert judge(np.zeros((3, 3))).valid
+
+
+@given(st.floats(0.02, 0.98), st.floats(0.25, 1.1), st.floats(0.0005, 0.01), st.integers(0, 3), st.booleans())
+def test_a_thin_wall_between_two_waypoints_is_found(
+    share: float, reach: float, thickness: float, extra: int, spheres: bool
+) -> None:
+    """A straight arm swings through a wall that no coarse sampling need meet."""
+    angle = -1 + 2 * share
+    turn = vector(np.cos(angle / 2), 0, 0, np.sin(angle / 2))
+    wall = Box(reach * vector(np.cos(angle), np.sin(angle), 0), vector(0.2, thickness, 0.5), turn)
+    rows = np.zeros((2 + extra, 3))
+    rows[:, 0] = np.linspace(-1, 1, len(rows))
+    half = np.arctan2(0.03 + thickness / 2, reach - 0.1)
+    if np.abs(angle - rows[[0, -1], 0]).min() < half:
+        return
+    found = refused(judge(rows, wall, robot=box_arm(spheres)), "scene_collision")
+    assert found.other == "box"
+    exact = ExactCollision(box_arm(), Scene([wall]))
+    q, at = dense(rows, 1e-3)
+    first = at[exact.collides(q)].min()
+    assert first - 0.02 < found.time < first + 0.002
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> list[Shape]:
+    shapes: list[Shape] = []
+    for _ in range(draw(st.integers(1, 4))):
+        place = vector(draw(st.floats(-1.2, 1.2)), draw(st.floats(-1.2, 1.2)), draw(st.floats(-0.1, 0.1)))
+        size = draw(st.floats(0.005, 0.15))
+        kind = draw(st.sampled_from(["sphere", "box", "cylinder", "points"]))
+        if kind == "sphere":
+            shapes.append(Sphere(place, size))
+        elif kind == "box":
+            shapes.append(Box(place, vector(size, 0.1, 2 * size), vector(1, size, 0, 3 * size)))
+        elif kind == "cylinder":
+            shapes.append(Cylinder(place, size, 0.3))
+        else:
+            spread = np.random.default_rng(int(1e6 * size)).normal(size=(30, 3)) * size
+            shapes.append(PointCloud(place + spread, 0.01))
+    return shapes
+
+
+@given(scenes(), st.integers(0, 2**31), st.integers(2, 5))
+def test_the_certificate_agrees_with_dense_sampling(shapes: list[Shape], seed: int, count: int) -> None:
+    rng, robot = np.random.default_rng(seed), box_arm()
+    rows = rng.uniform(-2, 2, (1, 3)) + rng.uniform(-0.8, 0.8, (count, 3))
+    report = judge(rows, *shapes)
+    exact = ExactCollision(robot, Scene(shapes))
+    q, at = dense(rows, 2e-3)
+    hits = exact.collides(q)
+    if report.valid:
+        assert not hits.any()
+        assert report.min_clearance is not None
+        least = min(d.distance for row in q[::50] for d in exact.link_distances(row))
+        assert 0 < report.min_clearance <= least
+        return
+    found = report.violation
+    assert found is not None
+    assert found.excess is not None
+    if not hits.any():  # a touch between the samples: no deeper than they are apart
+        assert found.excess < 2e-3 * 3 * 1.2
+        return
+    # The first contact is located to 1 mm of motion, and counts from a gap of 0.1 mm on.
+    here = np.stack([np.interp(found.time, np.arange(count), column) for column in rows.T])
+    distances = [
+        d for d in (*exact.link_distances(here), *exact.pair_distances(here)) if d.link == found.subject
+    ]
+    assert min(d.distance for d in distances) <= 1.001e-4
+    assert not hits[at < found.time - 0.02].any()
+    assert found.time <= at[hits].min() + 1e-6 + 0.01
+
+
+def test_the_first_of_two_collisions_is_reported() -> None:
+    early, late = (
+        Sphere(1.1 * vector(np.cos(a), np.sin(a), 0), 0.05, name) for a, name in ((0.1, "b"), (0.5, "a"))
+    )
+    rows = np.array([[-0.6, 0, 0], [0.2, 0, 0], [1.0, 0, 0]])
+    forward, backward = judge(rows, early, late), judge(rows[::-1].copy(), early, late)
+    assert refused(forward, "scene_collision").other == "b"
+    assert refused(backward, "scene_collision").other == "a"
+    found = refused(forward, "scene_collision")
+    assert found.subject == "l3"
+    # The contact begins where the arm's edge meets the sphere and is deepest in its middle.
+    assert found.time == pytest.approx((0.6 + 0.1 - np.arcsin(0.08 / 1.1)) / 0.8, abs=0.003)
+    assert found.excess == pytest.approx(0.08, abs=0.006)
+    assert found.message.startswith("l3 is 7.") or found.message.startswith("l3 is 8.0 cm inside b")
+
+
+def test_a_contact_with_two_obstacles_at_once_has_a_depth() -> None:
+    """The nearer of two that the arm starts in, whichever the search met first."""
+    deep, shallow = Sphere(vector(1.1, 0.02, 0), 0.1, "deep"), Sphere(vector(1.15, 0.12, 0), 0.1, "shallow")
+    for shapes in ((deep, shallow), (shallow, deep)):
+        found = refused(judge(np.array([[0, 0, 0], [-0.5, 0, 0]]), *shapes), "scene_collision")
+        assert (found.time, found.subject, found.other) == (0, "l3", "deep")
+        assert found.excess == pytest.approx(0.11, abs=0.003)
+
+
+def test_self_collision_between_waypoints() -> None:
+    rows = np.array([[0, 2.7, 1.0], [0, 2.7, 2.7]])
+    found = refused(judge(rows), "self_collision")
+    assert {found.subject, found.other} == {"l1", "l3"}
+    assert 0 < found.time < 1
+    allowed = frozenset({*box_arm().allowed_collisions, frozenset(("l1", "l3"))})
+    assert judge(rows, robot=replace(box_arm(), allowed_collisions=allowed)).valid
+
+
+def meshes_asked(*shapes: Shape) -> int:
+    """How many distances Coal is asked for to judge the swing among these."""
+    asked: list[int] = []
+
+    class Counting(ExactCollision):
+        def nearest(self, q: np.ndarray, *rest: Any, **more: Any) -> Any:
+            asked.append(len(q))
+            return super().nearest(q, *rest, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exact_collision, "ExactCollision", Counting)
+        judge(SWING, *shapes)
+    return sum(asked)
+
+
+def test_meshes_decide_where_spheres_are_too_coarse() -> None:
+    shelf = Box(vector(0.6, 0, -0.032 - 0.05), vector(1.5, 1.5, 0.1))
+    sides = trimesh.creation.box(shelf.size)
+    surface = Mesh(np.asarray(sides.vertices), np.asarray(sides.faces), shelf.center)
+    for shape, by_coal in ((shelf, False), (surface, True)):
+        report = judge(SWING, shape)
+        assert report.valid
+        assert bool(meshes_asked(shape)) == by_coal
+        assert report.min_clearance is not None
+        assert 0.001 <= report.min_clearance <= 0.002
+    touching = Box(vector(0.6, 0, -0.03005 - 0.05), vector(1.5, 1.5, 0.1))
+    assert refused(judge(SWING, touching), "scene_collision").time == 0
+    assert judge(SWING[:1], touching, contact=1e-5).valid
+
+
+def test_a_clear_motion_needs_no_meshes() -> None:
+    far = Sphere(vector(-1, 0, 0), 0.2)
+    assert judge(SWING, far).valid
+    assert meshes_asked(far) == 0
+
+
+def problem_and_path(rows: np.ndarray) -> tuple[Problem, Path]:
+    robot = box_arm()
+    return Problem(robot, Scene(), SWING[0], JointGoal(SWING[1:])), Path(robot.joint_names, rows)
+
+
+def test_limits_start_and_goal() -> None:
+    over = np.array([SWING[0], [0, 2.8 + 1e-3, 0], [0, 2.9, 0], SWING[1]])
+    found = refused(verify(*problem_and_path(over)), "limits")
+    assert (found.subject, found.time) == ("j1", 1.0)
+    assert found.excess == pytest.approx(1e-3)
+    hair = np.array([SWING[0], [0, 2.8 + 1e-7, 0.5], SWING[1]])
+    assert verify(*problem_and_path(hair)).valid
+    assert refused(verify(*problem_and_path(SWING + vector(1e-4, 0, 0))), "start").time == 0
+    found = refused(verify(*problem_and_path(SWING + np.array([[0, 0, 0], [0, 2e-4, 0]]))), "goal")
+    assert found.time == 1
+    assert found.excess == pytest.approx(2e-4)
+    assert verify(*problem_and_path(SWING + np.array([[0, 0, 0], [0, 5e-5, 0]]))).valid
+
+
+def test_the_earliest_of_different_violations_is_reported() -> None:
+    ball = Sphere(vector(1.2, 0, 0), 0.05)
+    rows = np.array([[-0.6, 0, 0], [0.6, 0, 0], [0.6, 2.9, 0]])
+    problem = Problem(box_arm(), Scene([ball]), rows[0], JointGoal(rows[:1]))
+    assert verify(problem, Path(box_arm().joint_names, rows)).violation.kind == "scene_collision"  # type: ignore[union-attr]
+    problem = Problem(box_arm(), Scene(), rows[0], JointGoal(rows[:1]))
+    assert verify(problem, Path(box_arm().joint_names, rows)).violation.kind == "limits"  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("shift", "angle", "valid"),
+    [(0.0, 0.0, True), (0.009, 14.0, True), (0.011, 0.0, False), (0.0, 16.0, False)],
+)
+def test_pose_goals_within_the_papers_tolerances(shift: float, angle: float, valid: bool) -> None:
+    robot = box_arm()
+    T = link_pose(robot, SWING[1], "l3") @ transform(
+        vector(0, 0, shift), rotation_about(Z, np.radians(angle))
+    )
+    problem = Problem(robot, Scene(), SWING[0], PoseGoal("l3", T))
+    report = verify(problem, Path(robot.joint_names, SWING))
+    assert report.valid == valid
+    if not valid:
+        assert refused(report, "goal").subject == "l3"
+
+
+def test_any_of_a_goal_set_will_do() -> None:
+    robot = box_arm()
+    problem = Problem(robot, Scene(), SWING[0], JointGoal(np.stack([SWING[0], SWING[1], -SWING[1]])))
+    assert verify(problem, Path(robot.joint_names, SWING)).valid
+
+
+def test_values_that_are_not_finite() -> None:
+    rows = SWING.copy()
+    rows[1, 2] = np.nan
+    assert refused(verify(*problem_and_path(rows)), "not_finite").time == 1
+
+
+@pytest.mark.parametrize("rows", [np.zeros((0, 3)), np.zeros((2, 4))])
+def test_wrong_shapes_raise(rows: np.ndarray) -> None:
+    with pytest.raises(InputError, match=r"path.positions has shape .* it must be n x 3 with n >= 1"):
+        verify(*problem_and_path(rows))
+
+
+def test_wrong_joint_names_raise() -> None:
+    problem, path = problem_and_path(SWING)
+    with pytest.raises(InputError, match=r"path.joint_names is j2, j1, j0; .* are j0, j1, j2"):
+        verify(problem, Path(path.joint_names[::-1], SWING))
+
+
+@pytest.mark.parametrize("spacing", [0.3, 0.02])
+def test_twitching(spacing: float) -> None:
+    """Back and forth along one line, in long steps or densely sampled."""
+    there = np.linspace(0, 0.3, round(0.3 / spacing), endpoint=False)
+    along = np.concatenate([there, 0.3 - there, there, 0.3 - there, there, [0.3]])
+    rows = np.column_stack([along, np.zeros((len(along), 2))])
+    assert "4 sharp reversals" in refused(judge(rows), "twitch").message
+    assert judge(rows, reversals=4).valid
+    assert judge(rows * 0.1).valid
+
+
+def trajectory(duration: float) -> Trajectory:
+    """The swing in a smooth motion from rest to rest, of this duration."""
+    s = np.linspace(0, 1, 101)
+    way, span = 3 * s**2 - 2 * s**3, SWING[1] - SWING[0]
+    return Trajectory(
+        box_arm().joint_names,
+        s * duration,
+        SWING[0] + way[:, None] * span,
+        (6 * s - 6 * s**2)[:, None] * span / duration,
+        (6 - 12 * s)[:, None] * span / duration**2,
+    )
+
+
+def test_trajectories() -> None:
+    problem, _ = problem_and_path(SWING)
+    assert verify_trajectory(problem, trajectory(2.0)).valid
+    # The peak speed is 1.5 * 1.2 / duration, the peak acceleration 6 * 1.2 / duration^2.
+    assert refused(verify_trajectory(problem, trajectory(0.94)), "acceleration").time == 0
+    strong = replace(box_arm(), joints=tuple(replace(j, acceleration=20.0) for j in box_arm().joints))
+    found = refused(verify_trajectory(replace(problem, robot=strong), trajectory(0.8)), "velocity")
+    assert found.subject == "j0"
+    assert found.excess == pytest.approx(1.5 * 1.2 / 0.8 - 2.0, abs=0.25)
+    late = Scene([Sphere(1.1 * vector(np.cos(0.8), np.sin(0.8), 0), 0.05)])
+    found = refused(verify_trajectory(replace(problem, scene=late), trajectory(2.0)), "scene_collision")
+    assert 1.0 < found.time < 2.0
+
+
+def test_trajectories_that_jump_or_run_backwards() -> None:
+    problem, _ = problem_and_path(SWING)
+    good = trajectory(2.0)
+    positions = good.positions.copy()
+    positions[50:60, 1] += 0.3
+    found = refused(verify_trajectory(problem, replace(good, positions=positions)), "jump")
+    assert found.subject == "j1"
+    assert found.time == pytest.approx(0.98)
+    times = good.times.copy()
+    times[7] = times[6]
+    assert (
+        "from row 6 to row 7"
+        in refused(verify_trajectory(problem, replace(good, times=times)), "time").message
+    )
+    rates = np.full_like(good.velocities, np.inf)
+    refused(verify_trajectory(problem, replace(good, velocities=rates)), "not_finite")
+    object.__setattr__(good, "velocities", good.velocities[1:])
+    with pytest.raises(InputError, match=r"trajectory\.velocities has 100 rows; positions has 101"):
+        verify_trajectory(problem, good)
+
+
+def at_the_limit() -> Trajectory:
+    """The swing as fast as the velocity limit of 2 rad/s allows."""
+    return trajectory(1.5 * 1.2 / 2.0 * 1.0001)
+
+
+@pytest.mark.parametrize(
+    ("factor", "kind"), [(1.0, ""), (1.02, "velocity"), (1.49, "velocity"), (1.6, "jump")]
+)
+def test_times_compressed_under_rates_of_zero(factor: float, kind: str) -> None:
+    """Rates that a trajectory does not own up to are recomputed."""
+    robot = replace(box_arm(), joints=tuple(replace(joint, acceleration=1e3) for joint in box_arm().joints))
+    problem = Problem(robot, Scene(), SWING[0], JointGoal(SWING[1:]))
+    good = at_the_limit()
+    assert verify_trajectory(problem, good).valid
+    still = np.zeros_like(good.velocities)
+    quick = replace(good, times=good.times / factor, velocities=still, accelerations=still)
+    kinds = {wrong.kind for wrong in wrong_rates(robot, quick, RATES)}
+    assert kinds == ({kind, "velocity", "rates"} if kind else {"rates"})
+    assert not verify_trajectory(problem, quick).valid
+
+
+@pytest.mark.parametrize(
+    ("what", "factor"), [("velocities", -1), ("velocities", 0), ("accelerations", -1), ("accelerations", 0)]
+)
+def test_rates_that_are_not_those_of_the_positions(what: str, factor: float) -> None:
+    problem, _ = problem_and_path(SWING)
+    good = trajectory(1.0)
+    bad = replace(good, **{what: factor * getattr(good, what)})
+    found = {wrong.kind: wrong for wrong in wrong_rates(problem.robot, bad, RATES)}
+    assert set(found) == {"rates"}
+    assert refused(verify_trajectory(problem, bad), "rates").subject == "j0"
+    assert what[:5] in found["rates"].message
+
+
+@pytest.mark.parametrize("end", [0, -1])
+def test_motions_begin_and_end_at_rest(end: int) -> None:
+    """By what they say, and by their positions where they say that they rest."""
+    problem, _ = problem_and_path(SWING)
+    good = trajectory(2.0)
+    moving = good.velocities.copy()
+    moving[end, 0] = 0.5
+    kinds = {w.kind for w in wrong_rates(problem.robot, replace(good, velocities=moving), RATES)}
+    assert "rest" in kinds
+    assert not verify_trajectory(problem, replace(good, velocities=moving)).valid
+    times = np.linspace(0, 1.2, 121)
+    steady = SWING[0] + (times / 1.2)[:, None] * (SWING[1] - SWING[0])
+    rates = np.tile((SWING[1] - SWING[0]) / 1.2, (121, 1))
+    rates[[0, -1]] = 0
+    at_once = Trajectory(good.joint_names, times, steady, rates, np.zeros((121, 3)))
+    refused(verify_trajectory(problem, at_once), "acceleration")
+
+
+@given(st.integers(0, 2**31), st.sampled_from([0.01, 0.05, 0.3]))
+def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
+    """Full acceleration, coasting and braking in random turns, from rest to rest, at random rows."""
+    rng, robot = np.random.default_rng(seed), box_arm()
+    limit = robot.acceleration[0]
+    fine = np.repeat(rng.choice([-1.0, 0.0, 1.0], (12, 3)), 40, axis=0) * limit
+    step = 0.5 * robot.velocity[0] / np.abs(np.cumsum(fine, axis=0)).max()
+    fine = np.concatenate([fine, -fine])  # back to rest
+    speed = np.concatenate([np.zeros((1, 3)), np.cumsum(fine, axis=0)]) * step
+    place = np.concatenate([np.zeros((1, 3)), np.cumsum((speed[1:] + speed[:-1]) / 2, axis=0)]) * step
+    every = max(int(most / step), 1)
+    rows = np.unique([0, *np.sort(rng.choice(len(place), len(place) // every + 1)), len(place) - 1])
+    accelerations = np.concatenate([fine, fine[-1:]])[rows]
+    motion = Trajectory(robot.joint_names, rows * step, place[rows], speed[rows], accelerations)
+    wrong = {w.message for w in wrong_rates(robot, motion, replace(RATES, agreement=2.0))}
+    assert not wrong
+
+
+def test_rows_far_apart_are_judged_as_controllers_move_between_them() -> None:
+    """Out and back within one step: the rows stand in one place, the arm does not."""
+    robot = box_arm()
+    rows = np.zeros((4, 3))
+    speed = np.zeros((4, 3))
+    speed[1:3, 0] = 1.0, -1.0
+    rows[1:3, 0] = 0.5
+    rates = np.zeros((4, 3))
+    rates[:, 0] = 1.0, 0.0, -2.0, 2.0
+    out = Trajectory(robot.joint_names, np.array([0.0, 1.0, 2.0, 3.0]), rows, speed, rates)
+    problem = Problem(robot, Scene(), rows[0], JointGoal(rows[:1]))
+    assert verify_trajectory(problem, out).valid
+    ball = Sphere(1.1 * vector(np.cos(0.73), np.sin(0.73), 0), 0.02)
+    found = refused(verify_trajectory(replace(problem, scene=Scene([ball])), out), "scene_collision")
+    assert 1.0 < found.time < 1.5
+    times, positions = between_rows(out, 1e-3)
+    assert np.isin(out.times, times).all()
+    assert np.abs(positions[:, 0]).max() == pytest.approx(0.75, abs=1e-3)
+
+
+def test_a_motion_of_a_century_is_refused() -> None:
+    problem, _ = problem_and_path(SWING)
+    refused(verify_trajectory(problem, trajectory(3e9)), "time")
+
+
+def test_collision_alone_can_be_asked_for() -> None:
+    """Neither limits nor the ends matter then."""
+    problem, path = problem_and_path(np.array([[-0.6, 0, 0], [0.6, 0, 0], [0.6, 2.9, 0]]))
+    assert verifier(problem, VerifySettings()).collision_free(path)
+    blocked = replace(problem, scene=Scene([Sphere(vector(1.2, 0, 0), 0.05)]))
+    assert not verifier(blocked, VerifySettings()).collision_free(path)
+
+
+def test_settings_are_checked() -> None:
+    with pytest.raises(InputError, match="tightness is 1"):
+        VerifySettings(tightness=1.0)
+    with pytest.raises(InputError, match="contact is 0"):
+        VerifySettings(contact=0.0)

@@ -1,0 +1,79 @@
+"""What the page begins with, what it takes from a browser, and what it hands out."""
+
+import json
+import re
+
+import pytest
+
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.visualization.live.files import first_problem, problem_for, problem_text, replay_page, uploaded_problem
+from robotdiffuse.planning import load_planner
+from robotdiffuse.problems.files import problem_record
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots import load_robot
+
+
+@pytest.fixture(scope="module")
+def demo() -> Problem:
+    return first_problem(None, None)
+
+
+def test_problems_go_out_and_come_back(demo: Problem) -> None:
+    back = uploaded_problem(problem_text(demo), "problem.yaml", demo.robot)
+    assert problem_record(back) == problem_record(demo)
+    text = json.dumps(problem_record(demo)).encode()
+    assert problem_record(uploaded_problem(text, "problem.json", demo.robot)) == problem_record(demo)
+
+
+def test_a_replay_holds_the_motion(demo: Problem) -> None:
+    result = load_planner("aorrtc").plan(demo, 5.0)
+    page = replay_page(demo, result).decode()
+    assert page.startswith("<!doctype html>") and "bottle" in page and "src=" not in page
+
+
+@pytest.mark.parametrize("name", ["panda", "so101", "ur10"])
+def test_every_arm_has_a_first_problem(name: str) -> None:
+    problem = problem_for(load_robot(name))
+    assert problem.robot.name == name
+
+
+def test_a_problem_and_a_robot_at_once() -> None:
+    with pytest.raises(InputError, match=r"p\.yaml names its robot; give a problem or --robot ur5, not both"):
+        first_problem("p.yaml", "ur5")
+
+
+GOOD = """robot: panda
+scene: []
+start: [0, 0, 0, -1.5, 0, 1.5, 0]
+goal: {joints: [1, 0, 0, -1.5, 0, 1.5, 0]}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        (GOOD.replace("panda", "pandora"), "unknown robot 'pandora'; known: "),
+        (GOOD.replace("panda", "/etc/robot.urdf"), "unknown robot '/etc/robot.urdf'; known: "),
+        (GOOD.replace("panda", "[panda]"), r"robot is \['panda'\]"),
+        (GOOD.replace("[]", "secret.yaml"), "scene is 'secret.yaml'; the page reads no other files"),
+        (GOOD.replace("[]", "[{mesh: {file: /etc/passwd}}]"), "file is '/etc/passwd'; the page reads no"),
+        (GOOD + "views: [{cloud: x.ply}]\n", "views is .*; the page reads no other files"),
+        (GOOD + "attached: [{link: panda_hand, mesh: {file: x.stl}}]\n", "file is 'x.stl'; the page reads"),
+        (GOOD.replace("-1.5", "9"), "start: panda_joint4 is 9 rad; its limits are"),
+        (GOOD.replace("start", "begin"), "unknown field of problem: 'begin'"),
+        ("[1, 2", "p.yaml.*"),
+        ("", "problem is None"),
+    ],
+)
+def test_what_is_wrong_with_an_uploaded_problem_is_one_line(text: str, wrong: str, demo: Problem) -> None:
+    with pytest.raises(InputError) as error:
+        uploaded_problem(text.encode(), "p.yaml", demo.robot)
+    assert str(error.value).startswith("p.yaml") and "\n" not in str(error.value)
+    assert re.search(wrong, str(error.value)), error.value
+
+
+def test_uploads_that_are_no_text_or_too_long(demo: Problem) -> None:
+    with pytest.raises(InputError, match=r"p\.yaml is not a text in UTF-8"):
+        uploaded_problem(b"\xff\xfe", "p.yaml", demo.robot)
+    with pytest.raises(InputError, match="at most 5000000 are read"):
+        uploaded_problem(b" " * 5_000_001, "p.yaml", demo.robot)

@@ -1,0 +1,218 @@
+"""The page in a browser: what is clicked and dragged there, and what it shows."""
+
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pytest
+
+from robotdiffuse.visualization.live.access import bound
+from robotdiffuse.visualization.live.files import first_problem, problem_text
+from robotdiffuse.visualization.live.session import Choice, Session
+from robotdiffuse.problems.goals import PoseGoal
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.core.transforms import rotation_from_quaternion, transform
+
+if TYPE_CHECKING:
+    from robotdiffuse.visualization.live.page import Page
+
+pytest.importorskip("viser", reason="the page needs viser: pip install 'robotdiffuse[live]'")
+playwright = pytest.importorskip("playwright.sync_api", reason="browsers are driven by playwright")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+]
+"""WebGL without a graphics card."""
+PATIENCE, COMPILING = 30_000, 300_000
+"""[ms]; a new machine compiles before the first plan."""
+FREE, WRONG = "[data-certificate=free]", "[data-certificate=wrong]"
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=CHROMIUM, headless=True, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def live() -> Iterator["tuple[Page, str]"]:
+    from robotdiffuse.visualization.live.page import Page
+
+    listening = bound("127.0.0.1", 0)
+    page = Page(Session(first_problem(None, None), Choice("aorrtc")), listening)
+    yield page, "http://{}:{}/".format(*listening.getsockname())
+    page.close()
+
+
+@pytest.fixture(scope="module")
+def view(browser: Any, live: "tuple[Page, str]") -> Any:
+    """A browser on the page, which is green."""
+    view = browser.new_page(viewport={"width": 900, "height": 500})
+    view.set_default_timeout(PATIENCE)
+    view.goto(live[1])
+    view.locator(FREE).wait_for(timeout=COMPILING)
+    return view
+
+
+def until(holds: Callable[[], object]) -> None:
+    end = time.monotonic() + PATIENCE / 1000
+    while not holds():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def beside(view: Any, label: str) -> Any:
+    """The entry that a label stands beside."""
+    return view.get_by_text(label, exact=True).locator("xpath=following::input[not(@type='hidden')][1]")
+
+
+def test_an_obstacle_in_the_way_turns_it_red_and_the_next_plan_green(
+    view: Any, live: "tuple[Page, str]"
+) -> None:
+    session = live[0].session
+    beside(view, "Keep planning").uncheck(force=True)
+    until(lambda: not session.state.choice.follow)
+    view.get_by_role("tab", name="Obstacles").click()
+    view.get_by_role("button", name="Add").click()
+    view.get_by_role("button", name="Delete").wait_for()
+    motion = session.state.motion
+    assert motion is not None and motion.trajectory is not None
+    q = motion.trajectory.positions[len(motion.trajectory.times) // 2]
+    session.move_obstacle("sphere", transform(link_pose(session.state.problem.robot, q, "panda_hand")[:3, 3]))
+    red = view.locator(WRONG)
+    red.wait_for()
+    assert "inside sphere" in red.inner_text() and "at 0." in red.inner_text()
+    assert session.state.motion is motion
+    session.move_obstacle("sphere", transform(np.array([-0.5, 0.0, 1.2])))
+    view.locator(FREE).wait_for()
+    view.get_by_role("button", name="Delete").click()
+    until(lambda: all(shape.name != "sphere" for shape in session.state.problem.scene.shapes))
+    session.choose(follow=True)
+    until(lambda: session.state.answer is not None)
+
+
+def test_a_size_is_typed_beside_its_slider(view: Any, live: "tuple[Page, str]") -> None:
+    page = live[0]
+    view.get_by_role("tab", name="Obstacles").click()
+    page.select("ball")
+    entry = beside(view, "radius")
+    entry.fill("0.05")
+    entry.press("Enter")
+    until(lambda: page.session.obstacle("ball").radius == 0.05)  # type: ignore[attr-defined]
+    page.select("")
+
+
+def test_the_target_is_dragged(view: Any, live: "tuple[Page, str]") -> None:
+    """By an arrow of its gizmo."""
+    page = live[0]
+    before = page.session.state.goal_pose.copy()
+    dragged = any(drag_arrow(view, page, before, axis) for axis in (2, 0, 1))
+    assert dragged and isinstance(page.session.state.problem.goal, PoseGoal)
+    page.session.move_goal(before)
+    until(lambda: page.session.state.answer is not None)
+    view.locator(FREE).wait_for()
+
+
+def drag_arrow(view: Any, page: "Page", T: np.ndarray, axis: int) -> bool:
+    """Whether the target goes along when the mouse takes an arrow of its gizmo, which may be seen end-on."""
+    arrow = page._goal_gizmo._handle.scale * T[:3, axis]
+    view.mouse.move(*on_screen(view, page, T[:3, 3] + 0.7 * arrow))
+    time.sleep(0.1)
+    view.mouse.down()
+    view.mouse.move(*on_screen(view, page, T[:3, 3] + 0.9 * arrow), steps=4)
+    view.mouse.up()
+    time.sleep(0.3)
+    return not np.array_equal(page.session.state.goal_pose, T)
+
+
+def on_screen(view: Any, page: "Page", point: np.ndarray) -> tuple[float, float]:
+    """Pixel of a point [m], by the camera as the browser reports it."""
+    [client] = page._server.get_clients().values()
+    camera = client.camera
+    x, y, z = rotation_from_quaternion(np.array(camera.wxyz)).T @ (point - camera.position)
+    size = view.viewport_size
+    focal = 0.5 * size["height"] / np.tan(0.5 * camera.fov)
+    return 0.5 * size["width"] + focal * x / z, 0.5 * size["height"] + focal * y / z
+
+
+def test_the_trees_of_the_search_are_drawn_when_asked_for(view: Any, live: "tuple[Page, str]") -> None:
+    page = live[0]
+    drawn = page._server.scene._handle_from_node_name
+    answer = page.session.state.answer
+    view.get_by_role("tab", name="Plan").click()
+    box = beside(view, "Search trees")
+    box.check(force=True)
+    until(lambda: {"/trees/start", "/trees/goal"} <= drawn.keys())
+    box.uncheck(force=True)
+    until(lambda: not {"/trees/start", "/trees/goal"} & drawn.keys())
+    assert answer is not None and len(answer.trees) == 2
+    assert page.session.state.answer is answer, "drawing them is no reason to plan"
+
+
+def test_it_plays_and_is_scrubbed(view: Any, live: "tuple[Page, str]") -> None:
+    page = live[0]
+    view.get_by_role("button", name="Play").click()
+    until(lambda: page._player.playing and page._player.time > 0)
+    view.get_by_role("button", name="Pause").click()
+    view.get_by_role("button", name="Play").wait_for()
+    entry = beside(view, "Time")
+    entry.fill("0.5")
+    entry.press("Enter")
+    until(lambda: page._player.time == 0.5)
+    assert not page._player.playing
+
+
+def test_files_are_loaded_and_saved_and_broken_ones_are_a_note(
+    view: Any, live: "tuple[Page, str]", tmp_path: Path
+) -> None:
+    session = live[0].session
+    view.get_by_role("tab", name="Files").click()
+    with view.expect_download() as saved:
+        view.get_by_role("button", name="Save problem").click()
+    assert Path(saved.value.path()).read_bytes() == problem_text(session.state.problem)
+    with view.expect_download() as saved:
+        view.get_by_role("button", name="Save replay").click()
+    assert b"shelf" not in Path(saved.value.path()).read_bytes()[:100]
+    assert Path(saved.value.path()).read_bytes().startswith(b"<!doctype html>")
+    before = session.state.problem
+    upload = view.locator("input[type=file]")
+    broken = {"name": "broken.yaml", "mimeType": "text/yaml", "buffer": b"robot: panda\nscene: 3\n"}
+    upload.set_input_files(broken)
+    view.get_by_text("broken.yaml: problem has no start").wait_for()
+    assert session.state.problem is before
+    other = problem_text(first_problem(None, "ur5e"))
+    upload.set_input_files({"name": "other.yaml", "mimeType": "text/yaml", "buffer": other})
+    until(lambda: session.state.problem.robot.name == "ur5e" and session.state.answer is not None)
+    view.locator(FREE).wait_for()
+
+
+def test_it_comes_back_after_the_server_restarts(browser: Any, live: "tuple[Page, str]") -> None:
+    from robotdiffuse.visualization.live.page import Page
+
+    view = browser.new_page(viewport={"width": 500, "height": 400})
+    number = 0
+    for planner in ("aorrtc", "rrt_connect"):
+        listening = bound("127.0.0.1", number)
+        page = Page(Session(live[0].session.state.problem, Choice(planner)), listening)
+        if not number:
+            number = listening.getsockname()[1]
+            view.goto(f"http://127.0.0.1:{number}/")
+        until(lambda: beside(view, "Planner").input_value() == planner)  # noqa: B023
+        view.locator(FREE).wait_for()
+        page.close()
+    view.close()
