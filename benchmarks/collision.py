@@ -39,9 +39,9 @@ from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud
+from robotdiffuse.scenes.surface_points import sample_surface
 
 SEED = 20261121
 SCENES = 20

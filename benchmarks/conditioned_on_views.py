@@ -1,4 +1,4 @@
-"""A diffusion model that is told what the completing network imagines: whether its code changes anything.
+"""A diffusion model that is told what the completing network predicts: whether its code changes anything.
 
     python benchmarks/conditioned_on_views.py --data FOLDER --out FOLDER [--samples 1000000] [--motions 3000]
     python benchmarks/conditioned_on_views.py --report --out FOLDER
@@ -7,12 +7,12 @@ FOLDER of data: as for encoders_on_views.py. Killed, the same command goes on wi
 
 The model of the config `compact` is trained on views of one depth camera, one of every motion: it has the
 code of the completing auto-encoder, and clearances and gradients of the scene as the planner takes it, points
-seen and voxels imagined by one of the rungs' thresholds, the ends carved free; L_collision looks at the true
+seen and voxels predicted by one of the assumptions' thresholds, the ends carved free; L_collision looks at the true
 scene. So it has in training what it has in planning. Tried are batches of 16 on held-out problems that the
-straight line does not solve and a search in the true scene does, in the scene imagined by the first rung; the
-judge has the true one. The controls are the code of another problem of the family, the condition hidden, the
+straight line does not solve and a search in the true scene does, in the scene predicted by the first assumption; the
+validator has the true one. The controls are the code of another problem of the family, the condition hidden, the
 clearances hidden, the weights that ship, which were trained on exact scenes, and smooth noise without a
-network. `guided`: under collision guidance by the same imagined scene.
+network. `guided`: under collision guidance by the same predicted scene.
 """
 
 import argparse
@@ -41,11 +41,11 @@ from numpy import ndarray
 from report import header, print_table, progress
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.methods import judged, nothing_near
 from robotdiffuse.core.output_files import JsonLines, write_atomically
+from robotdiffuse.evaluation.methods import nothing_near, validated
 from robotdiffuse.learning.checkpoint import load_encoder, load_model
 from robotdiffuse.learning.clearance_features import link_clearances
-from robotdiffuse.learning.completion import imagine
+from robotdiffuse.learning.completion import predict
 from robotdiffuse.learning.completion.samples import camera_view
 from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
@@ -56,15 +56,15 @@ from robotdiffuse.learning.training.planner import PlannerTrainee
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.task import train
 from robotdiffuse.learning.weights_registry import BUNDLED
-from robotdiffuse.planning.diffusion.diffusion import encode
-from robotdiffuse.perception.assumptions import rungs
-from robotdiffuse.planning.pipeline.unknown_space import with_rung
-from robotdiffuse.problems.held_out import goal_of, held_out_problem
-from robotdiffuse.problems.problem import IMAGINED, JointGoal, Problem
-from robotdiffuse.perception.depth_view import DepthView, SeenPoints, UnseenPoints
+from robotdiffuse.perception.assumptions import assumptions
+from robotdiffuse.perception.depth_view import AssumedPoints, DepthView, SeenPoints
 from robotdiffuse.perception.observed_volume import observe
-from robotdiffuse.scenes.scene_arrays import PackedScenes
+from robotdiffuse.planning.diffusion.diffusion import encode
+from robotdiffuse.planning.pipeline.unknown_space import with_assumption
+from robotdiffuse.problems.held_out import goal_of, held_out_problem
+from robotdiffuse.problems.problem import PREDICTED, JointGoal, Problem
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 ENCODER = "completing_autoencoder"
 KEPT_ASIDE = 200
@@ -74,18 +74,18 @@ PART = 100
 RETRAINED, SHIPPED = "retrained", "as it ships"
 
 
-def imagined_scene(problem: Problem, view: DepthView, goal: Float[ndarray, "dof"], rung: int) -> Scene:
-    """The scene that a rung plans with, of what the view saw of the problem's scene; the floor is known."""
+def imagined_scene(problem: Problem, view: DepthView, goal: Float[ndarray, "dof"], assumption: int) -> Scene:
+    """The scene that an assumption plans with, of what the view saw of the problem's scene; the floor is known."""
     known = Scene(problem.scene.shapes[:1])
-    seen = Problem(problem.robot, known, problem.start, problem.goal, views=[view], unseen=IMAGINED)
+    seen = Problem(problem.robot, known, problem.start, problem.goal, views=[view], unknown=PREDICTED)
     volume = observe(seen.views, seen.robot, seen.start)
-    chosen = list(rungs(seen, volume, imagine(volume)))[rung]
-    return with_rung(seen, chosen, goal[None]).scene
+    chosen = list(assumptions(seen, volume, predict(volume)))[assumption]
+    return with_assumption(seen, chosen, goal[None]).scene
 
 
 @dataclass(frozen=True, eq=False)
 class ImaginedScenes(PackedScenes):
-    """Scenes with what is imagined of each."""
+    """Scenes with what is predicted of each."""
 
     checkers: ndarray = field(default_factory=lambda: np.zeros(0, object))
     """[n] CollisionChecker."""
@@ -96,11 +96,11 @@ class ImaginedScenes(PackedScenes):
 
 
 class Trainee(PlannerTrainee):
-    """The diffusion model that is told of imagined scenes."""
+    """The diffusion model that is told of predicted scenes."""
 
     def __init__(self, settings: PlannerTraining, folder: Path, motions: int) -> None:
         super().__init__(settings, Processes(settings.device))
-        self.kept = self._imagined(self.kept, folder / "imagined", motions)
+        self.kept = self._imagined(self.kept, folder / "predicted", motions)
         self.held_out = self._imagined(self.held_out, folder / "imagined_validation", KEPT_ASIDE)
         self.clearances = lambda scenes, q: told(scenes, q, self.model.settings)
 
@@ -114,16 +114,16 @@ class Trainee(PlannerTrainee):
         """So many motions, random ones, with what a view of each says."""
         rows = np.sort(np.random.default_rng(5).permutation(len(data))[:count])
         codes, checkers, encoder = [], np.empty(len(rows), object), load_encoder(ENCODER)
-        for i in progress(range(0, len(rows), PART), "imagined scenes"):
+        for i in progress(range(0, len(rows), PART), "predicted scenes"):
             part = prepared(folder / f"{i}.npz", data, rows[i : i + PART], i, self.robot, encoder)
             codes.append(part["codes"])
             for k in range(len(part["codes"])):
                 scene = data.scenes.scene(int(rows[i + k]))
                 checkers[i + k] = CollisionChecker(self.robot, stored(part, k, scene))
         scenes = data.scenes[rows]
-        imagined = ImaginedScenes(scenes.kinds, scenes.params, scenes.floors, checkers)
+        predicted = ImaginedScenes(scenes.kinds, scenes.params, scenes.floors, checkers)
         return replace(
-            data, q=data.q[rows], scenes=imagined, trivial=data.trivial[rows], codes=np.concatenate(codes)
+            data, q=data.q[rows], scenes=predicted, trivial=data.trivial[rows], codes=np.concatenate(codes)
         )
 
 
@@ -135,7 +135,7 @@ def told(scenes: ImaginedScenes, q: ndarray, settings: MotionModelSettings) -> n
 def prepared(
     file: Path, data: TrajectoryData, rows: ndarray, seed: int, robot: Any, encoder: Encoder
 ) -> dict[str, ndarray]:
-    """Codes and imagined obstacles of views of some motions' scenes, made once."""
+    """Codes and predicted obstacles of views of some motions' scenes, made once."""
     if not file.is_file():
         rng = np.random.default_rng([6, seed])
         codes, points, radii, first = [], [], [], [0]
@@ -147,7 +147,7 @@ def prepared(
                 codes.append(encoder.of_views([view], robot, start).float().numpy())
             first.append(first[-1])
             for shape in imagined_scene(problem, view, goal, int(rng.integers(4))).shapes[1:]:
-                assert isinstance(shape, SeenPoints | UnseenPoints)
+                assert isinstance(shape, SeenPoints | AssumedPoints)
                 points.append(shape.points)
                 radii.append(np.full(len(shape.points), shape.point_radius))
                 first[-1] += len(shape.points)
@@ -165,10 +165,10 @@ def prepared(
 
 
 def stored(part: dict[str, ndarray], k: int, scene: Scene) -> Scene:
-    """The imagined scene of one of them, on the same floor."""
+    """The predicted scene of one of them, on the same floor."""
     own = slice(*part["first"][k : k + 2])
     points, radii = part["points"][own], part["radii"][own]
-    clouds = [UnseenPoints(points[radii == radius], float(radius)) for radius in np.unique(radii)]
+    clouds = [AssumedPoints(points[radii == radius], float(radius)) for radius in np.unique(radii)]
     return Scene([*scene.shapes[:1], *clouds])
 
 
@@ -190,7 +190,7 @@ def batches(
     checker: CollisionChecker,
     seed: int,
 ) -> Iterator[tuple[str, Float[ndarray, "n waypoints dof"]]]:
-    """What a model makes of an imagined scene, under each control."""
+    """What a model makes of an predicted scene, under each control."""
     start, goals, nothing = problem.start, goal_of(problem)[None], nothing_near(model)
     controls = {
         "own": (own, None),
@@ -213,10 +213,10 @@ def run(arguments: argparse.Namespace) -> None:
     assert encoder is not None
     codes: dict[str, list[ndarray]] = {name: [] for name in models}
     checkers = list[CollisionChecker]()
-    for case in progress(todo, "imagined scenes"):
+    for case in progress(todo, "predicted scenes"):
         problem, view = held_out_problem(*case), view_of(*case)
-        imagined = imagined_scene(problem, view, goal_of(problem), 0)
-        checkers.append(CollisionChecker(problem.robot, imagined))
+        predicted = imagined_scene(problem, view, goal_of(problem), 0)
+        checkers.append(CollisionChecker(problem.robot, predicted))
         with torch.inference_mode():
             codes[RETRAINED].append(encoder.of_views([view], problem.robot, problem.start).float().numpy())
         points = UNGUIDED.settings.points
@@ -231,7 +231,7 @@ def run(arguments: argparse.Namespace) -> None:
             else:
                 pair = codes[name][i], codes[name][other]
                 tried = dict(batches(models[name], *pair, problem, checker, case[1]))
-            passed = {which: float(judged(problem, q).passed.mean()) for which, q in tried.items()}
+            passed = {which: float(validated(problem, q).passed.mean()) for which, q in tried.items()}
             kept.append({"model": name, "family": case[0], "number": case[1], "passed": passed})
 
 
@@ -257,7 +257,7 @@ def report(arguments: argparse.Namespace) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(
-        description="A diffusion model told of imagined scenes, and its controls."
+        description="A diffusion model told of predicted scenes, and its controls."
     )
     parser.add_argument("--data", help="data set of motions")
     parser.add_argument("--out", required=True, help="folder for the network and records")

@@ -35,19 +35,24 @@ from sscbirrt.testing import PlanarIK
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.transforms import (
+    rotation_angle,
+    rotation_from_quaternion,
+    rotation_from_rpy,
+    transform,
+)
+from robotdiffuse.core.types import Path
 from robotdiffuse.planning import context
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems import constraint_kernel as kernel
-from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.compiled_constraints import PathConstraints
+from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.validator import PyBulletOracle
 from robotdiffuse.simulation.world import World
-from robotdiffuse.core.transforms import rotation_angle, rotation_from_quaternion, rotation_from_rpy, transform
-from robotdiffuse.core.types import Path
 from robotdiffuse.validation.validator import verifier
 
 SHORT, LONG = 1.0, 10.0
@@ -296,7 +301,7 @@ def compared(kind: str, number: int, with_peer: bool) -> None:
         "in collision by PyBullet",
         "beyond the tolerance at 1 mm steps",
         "most of the tolerance that any takes",
-        "motions proved by the judge",
+        "motions proved by the validator",
     )
     table = list(zip(rows, *columns, strict=True))
     print_table(f"{kind}: {number} problems", ("", *answers), table)

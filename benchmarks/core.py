@@ -35,20 +35,19 @@ from robotdiffuse.collision.kernels.lane_collision import make_workspace, place_
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.kernels.simd import W, lanes_array
 from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.methods import planned
 from robotdiffuse.evaluation.problem_sets import gather_cases
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.runs import Clock, tried
-from robotdiffuse.trajectories.timing import TimingSettings, time_parameterize
-from robotdiffuse.planning import load_planner
-from robotdiffuse.planning import context
+from robotdiffuse.planning import context, load_planner
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud
-from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.scenes.surface_points import sample_surface
+from robotdiffuse.trajectories.timing import TimingSettings, time_parameterize
 
 SEED = 20261122
 REPEATS = 50

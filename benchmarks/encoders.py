@@ -5,7 +5,7 @@
 FOLDER: of `robotdiffuse train encoder --encoder compression_autoencoder`; without it the paper's is left out.
 Prints the report that is kept in benchmarks/results/encoders.txt. Scenes are held out: of all families, and
 boxes and spheres as auto-encoders learn from. Each is told to an encoder as a cloud of its surfaces, or as
-one camera sees it. Judged is what lies within the arm's reach and above the floor.
+one camera sees it. Validated is what lies within the arm's reach and above the floor.
 
 - decoded: what its own decoder makes of it, as points. The paper's decodes 1,400, the one that ships 192; of
   the completing one these are the centres of voxels of 2 cm at the border of what it finds likelier occupied
@@ -47,11 +47,11 @@ from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoder
 from robotdiffuse.learning.training.batches import random_scenes
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.encoder import linear_readout
+from robotdiffuse.perception.observed_volume import LOW, ObservedVolume, observe
+from robotdiffuse.perception.seen_points import seen_points
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.family import base_spheres
-from robotdiffuse.perception.seen_points import seen_points
 from robotdiffuse.robots import load_robot
-from robotdiffuse.perception.observed_volume import LOW, ObservedVolume, observe
 from robotdiffuse.scenes.surface_points import PANDA_REGION, sample_surface
 
 SEED = 20261123
@@ -104,7 +104,7 @@ FILLABLE = reachable()
 FILLABLE[:, :, : int((PANDA_REGION.floor - LOW[2]) / (2 * FINE)) + 1] = False  # the floor's voxels
 
 
-def judged(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
+def validated(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
     """Those within the arm's reach and above the floor."""
     near = np.linalg.norm(points - SHOULDER, axis=-1) < REACH
     return points[near & (points[:, 2] > PANDA_REGION.floor)]
@@ -134,7 +134,7 @@ def _tensor(cloud: Float[ndarray, "n 3"]) -> torch.Tensor:
 
 def figures(truth: Float[ndarray, "n 3"], found: Float[ndarray, "m 3"]) -> tuple[float, float, float]:
     """Chamfer distance [m], share near and share found; of nothing found, 1 m and zeros."""
-    truth, found = judged(truth), judged(found)
+    truth, found = validated(truth), validated(found)
     if not len(found) or not len(truth):
         return (1.0, 0.0, 0.0) if len(truth) else (np.nan, np.nan, np.nan)
     there, back = KDTree(truth).query(found)[0], KDTree(found).query(truth)[0]
@@ -173,7 +173,7 @@ def distances(encoders: dict[str, Encoder]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="What encoders keep of a scene.")
     parser.add_argument("--cae", metavar="FOLDER", help="the paper's encoder, trained")
-    parser.add_argument("--scenes", type=int, default=70, help="that are judged, of each kind (70)")
+    parser.add_argument("--scenes", type=int, default=70, help="that are validated, of each kind (70)")
     parser.add_argument("--fitted", type=int, default=700, help="that read-outs are fitted to (700)")
     arguments = parser.parse_args()
     torch.set_num_threads(1)

@@ -10,7 +10,7 @@ The diffusion model, trained and tried without clearances, is told what one came
 one of every motion: points, or by the completing auto-encoder the volume that they carve. Rows differ in the
 encoder alone: the paper's and the completing one are frozen, PointNet and DGCNN are trained along. Tried are
 16 samples, without guidance, on held-out problems of the four families that the straight line does not solve
-and a search in the true scene does, and the judge has the true scene. The controls are the code of another
+and a search in the true scene does, and the validator has the true scene. The controls are the code of another
 problem, the mean of all codes, which tells nothing, and smooth noise about the straight line, without a
 network. `guided`: the same batch under collision guidance by what was seen.
 """
@@ -25,12 +25,12 @@ import torch
 from jaxtyping import Float
 from numpy import ndarray
 from report import header, print_table, progress
-from unseen import problems
+from unknown import problems
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.methods import NETWORK_ALONE, judged
-from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.evaluation.methods import NETWORK_ALONE, validated
+from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.completion.samples import camera_view
 from robotdiffuse.learning.guidance import CollisionGuidance
@@ -39,11 +39,11 @@ from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import planner_training
 from robotdiffuse.learning.training.encoder import train_encoder
 from robotdiffuse.learning.training.planner import train_planner
+from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.problems.held_out import SEED, goal_of, held_out_problem
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.scenes.scene import Scene
 
 FAMILIES = ("shelf", "crate", "table", "clutter")
@@ -145,7 +145,7 @@ def run(arguments: argparse.Namespace) -> None:
         for code, q in control(problem, as_seen(problem, views[case]), case[1]).items():
             if (CONTROL, 0, code, *case) in done:
                 continue
-            verdict = judged(problem, q)
+            verdict = validated(problem, q)
             keep(CONTROL, 0, code, case, float(verdict.passed.mean()), float(verdict.hit.mean()))
     for row, folders in places.items():
         for seed, folder in enumerate(folders):
@@ -169,7 +169,7 @@ def run(arguments: argparse.Namespace) -> None:
                     if (row, seed, code, *case) in done:
                         continue
                     checker = as_seen(problem, views[case]) if "guided" in code else None
-                    verdict = judged(problem, sample(model, problem, z, case[1], checker))
+                    verdict = validated(problem, sample(model, problem, z, case[1], checker))
                     keep(row, seed, code, case, float(verdict.passed.mean()), float(verdict.hit.mean()))
 
 

@@ -327,20 +327,20 @@ def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
     if rng.random() < 0.2:
         data["goal"] = {"pose": POSE}
     if rng.random() < 0.1:
-        data["views"], data["unseen"] = [VIEW], "optimistic"
+        data["views"], data["unknown"] = [VIEW], "optimistic"
     else:
         data |= (*({},) * 3, EQUIPPED, CONSTRAINED, MOVING, IN_MOTION)[rng.integers(7)]
     ending = (".yaml", ".json", ".jsonl")[rng.integers(3)]
     file = folder / f"problem{ending}"
     file.write_bytes(text_of(rng, data, ending))
-    return lambda: _judged(file)
+    return lambda: _validated(file)
 
 
-def _judged(file: FilePath) -> None:
-    """A problem that is read is judged: its straight line, if it has a goal configuration."""
+def _validated(file: FilePath) -> None:
+    """A problem that is read is validated: its straight line, if it has a goal configuration."""
+    from robotdiffuse.core.types import Path
     from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
     from robotdiffuse.problems.problem import JointGoal
-    from robotdiffuse.core.types import Path
     from robotdiffuse.validation.validator import Verifier
 
     problem = load_problem(file)
@@ -418,7 +418,7 @@ def _mesh(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     file = mesh_file(rng, folder, "part", MESHES[rng.integers(len(MESHES))])
     problem = PROBLEM | {"scene": [{"mesh": {"file": file.name, "xyz": [2, 2, 2]}}]}
     (folder / "problem.json").write_text(json.dumps(problem))
-    return lambda: _judged(folder / "problem.json")
+    return lambda: _validated(folder / "problem.json")
 
 
 def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
@@ -462,8 +462,8 @@ def numbers_changed(rng: np.random.Generator, content: bytes) -> bytes:
 
 
 def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.problems.files import problem_from_record
     from robotdiffuse.core.results import load_result
+    from robotdiffuse.problems.files import problem_from_record
     from robotdiffuse.validation.validator import Verifier
 
     rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
@@ -490,10 +490,10 @@ def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     def read() -> None:
         saved = load_result(file)
         if saved.problem is not None and saved.result.path is not None:
-            judge = Verifier(problem_from_record(saved.problem))
-            judge.path(saved.result.path)
+            validator = Verifier(problem_from_record(saved.problem))
+            validator.path(saved.result.path)
             if saved.result.trajectory is not None:
-                judge.trajectory(saved.result.trajectory)
+                validator.trajectory(saved.result.trajectory)
 
     return read
 
@@ -539,13 +539,13 @@ def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
     plan |= {"velocity_scaling": 0.5, "acceleration_scaling": 0.5, "clearance": 0.01}
     motion = {"joint_names": JOINTS, "positions": rows}
     rates = {"velocities": [[0.0] * 7] * 3, "accelerations": [[0.0] * 7] * 3}
-    judged = {
+    validated = {
         "problem": problem,
         "path": motion,
         "trajectory": motion | {"times": [0.0, 1.0, 2.0]} | rates,
     }
     what = "verify" if rng.random() < 0.5 else "plan"
-    body = judged if what == "verify" else plan
+    body = validated if what == "verify" else plan
     if right and rng.random() < right:
         return what, json.dumps(body).encode()
     return what, text_of(rng, body, ".json")
@@ -591,11 +591,11 @@ def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.interop import read_motion, write_motion
-    from robotdiffuse.interop.recorded_motion import fitted
-    from robotdiffuse.interop.plain_messages import joint_trajectory
-    from robotdiffuse.problems.files import problem_from_record
     from robotdiffuse.core.types import Trajectory
+    from robotdiffuse.interop import read_motion, write_motion
+    from robotdiffuse.interop.plain_messages import joint_trajectory
+    from robotdiffuse.interop.recorded_motion import fitted
+    from robotdiffuse.problems.files import problem_from_record
     from robotdiffuse.validation.validator import Verifier
 
     problem = problem_from_record(PROBLEM | {"scene": PROBLEM["scene"][:1]})
@@ -622,8 +622,8 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
     def read() -> None:
         motion = fitted(read_motion(file), problem.robot).motion
-        judge = Verifier(problem)
-        judge.trajectory(motion) if isinstance(motion, Trajectory) else judge.path(motion)
+        validator = Verifier(problem)
+        validator.trajectory(motion) if isinstance(motion, Trajectory) else validator.path(motion)
 
     return read
 
@@ -633,8 +633,8 @@ def _certificate_record() -> dict[str, Any]:
     import tempfile
 
     from robotdiffuse.certificates.search import certify
-    from robotdiffuse.problems.files import problem_from_record
     from robotdiffuse.core.types import Path
+    from robotdiffuse.problems.files import problem_from_record
 
     start = PROBLEM["start"]
     rows = np.array([start, start])
@@ -667,18 +667,18 @@ def _depth(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         file.write_bytes(damaged(rng, file.read_bytes()))
     view = VIEW | {"depth": file.name, "intrinsics": [6.0, 6.0, 4, 3], "scale": 0.001}
     del view["cloud"]
-    problem = PROBLEM | {"scene": PROBLEM["scene"][:1], "views": [view], "unseen": "padded"}
+    problem = PROBLEM | {"scene": PROBLEM["scene"][:1], "views": [view], "unknown": "padded"}
     (folder / "problem.json").write_bytes(
         text_of(rng, problem, ".json") if rng.random() < 0.5 else json.dumps(problem).encode()
     )
-    return lambda: _judged(folder / "problem.json")
+    return lambda: _validated(folder / "problem.json")
 
 
 def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Problem files that browsers send to the live page."""
+    from robotdiffuse.robots import load_robot
     from robotdiffuse.visualization.live.files import problem_text, uploaded_problem
     from robotdiffuse.visualization.live.session import Session
-    from robotdiffuse.robots import load_robot
 
     problem = PROBLEM | ({}, EQUIPPED, CONSTRAINED, MOVING)[rng.integers(4)]
     ending = (".yaml", ".json")[rng.integers(2)]

@@ -31,8 +31,8 @@ from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
-from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.generation.shard_maker import draw, solve, with_near_goals
+from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.problems.families.family import Drawn
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
@@ -40,7 +40,7 @@ from robotdiffuse.robots.robot import Robot
 STAGES = {
     "drawing scene, start and goals (inverse kinematics)": ("shard_maker.py", "draw"),
     "search": ("shared_tree/planner.py", "run"),
-    "judge": ("verify.py", "path"),
+    "validator": ("verify.py", "path"),
 }
 
 

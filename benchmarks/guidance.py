@@ -4,7 +4,7 @@
 
 Prints the report that is kept in benchmarks/results/guidance.txt and draws guidance.png beside it, or where
 --plot says. Held-out problems that the straight line does not solve and ten seconds of search do; 16 samples
-of each, straight from the sampler, judged as they are. Every setting of a table gets the same problems; the
+of each, straight from the sampler, validated as they are. Every setting of a table gets the same problems; the
 classifier-free scales get half of them, and 50 and 200 sampling steps, which take long, are tried with no and
 with the usual gradient steps only.
 """
@@ -22,10 +22,10 @@ from report import WIDTH, header
 from problems import PANDA, Case, draw_cases
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled
 from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.runs import tried
 from robotdiffuse.evaluation.statistics import wilson_interval
 from robotdiffuse.evaluation.summary import BEST, CPU, SINGLE, half_width, summary
 from robotdiffuse.evaluation.tables import show
-from robotdiffuse.evaluation.runs import tried
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
 from robotdiffuse.problems.families import FAMILIES
 
@@ -105,7 +105,7 @@ def draw(collision: Found, free: Found, title: str, file: Path) -> None:
         axes.minorticks_off()
         axes.legend(frameon=False, loc="lower left")
     for axes in panels[:, 0]:
-        axes.set_ylabel("motions that pass the judge, %")
+        axes.set_ylabel("motions that pass the validator, %")
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=130)
 
@@ -134,7 +134,7 @@ def main() -> None:
     else:
         print("Classifier-free guidance: left out, these weights were trained without dropping the condition")
     print("single: of 16 samples; best: problems with one that passes. 95 % intervals over the problems;")
-    print("CPU time of a batch, encoder included, without the judge")
+    print("CPU time of a batch, encoder included, without the validator")
     draw(collision, free, arguments.family, arguments.plot)
 
 

@@ -12,10 +12,10 @@ import time
 import numpy as np
 from report import header
 
+from robotdiffuse.core.transforms import rotation_angle, transform
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.core.transforms import rotation_angle, transform
 
 FRAME = "panda_hand"
 

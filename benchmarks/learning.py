@@ -21,8 +21,8 @@ Methods, all with the same checks, and with the straight line where what they se
 - shared tree: the anytime planner of the data factory, of which a round is some RRT-Connect and RRT*.
 
 Time is CPU time of this process from the ends to the shortened path, the encoder included; what all share
-(tables of robot and scene) and the judge are not in it. At a mark a method has the paths that it had by then,
-and answers with the shortest one that passes the judge for what it sees. Methods take turns on each problem.
+(tables of robot and scene) and the validator are not in it. At a mark a method has the paths that it had by then,
+and answers with the shortest one that passes the validator for what it sees. Methods take turns on each problem.
 """
 
 import argparse
@@ -42,9 +42,9 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, searched
 from robotdiffuse.evaluation.problem_sets import gather_cases
 from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.runs import Trial, tried
 from robotdiffuse.evaluation.statistics import compare
 from robotdiffuse.evaluation.tables import Cell, Column, Table, show
-from robotdiffuse.evaluation.runs import Trial, tried
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import Problem
@@ -228,7 +228,7 @@ def main() -> None:
         show(found_table(f"\n== {name}, {len(cases)} problems", found), pairs, width=WIDTH)
         words += certain
     print(
-        "has a plan: it passes the judge for what the method sees; solved: it is free in the whole scene\n"
+        "has a plan: it passes the validator for what the method sees; solved: it is free in the whole scene\n"
         "*  joint-space length over the shortest that any method found, mean and 95th percentile over the\n"
         "   problems that the method solved by then\n"
         "** integral of |q''(u)|^2 du over u in [0, 1], over the squared length, of the path before it is\n"

@@ -6,7 +6,7 @@
 Prints the report that is kept in benchmarks/results/many_goals.txt. Scenes of held-out problems; from the
 problem's start to so many goals, drawn with the tip in the family's region, that RRT-Connect reaches with a
 few thousand nodes and the straight line does not. Every method gives at most one motion to each goal, and no
-other where the judge, which is not timed, refuses it.
+other where the validator, which is not timed, refuses it.
 
 - network: 4 samples to each goal in one call, refined where none of the 4 is free, the shortest free one.
 - bumps: its control, the line and 3 random bumps to each goal, refined.
@@ -28,16 +28,16 @@ from searches import Arena, Candidates
 
 from problems import PANDA, Case, draw_cases
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.core.types import Path
 from robotdiffuse.evaluation.methods import NETWORK_ALONE
-from robotdiffuse.evaluation.tables import Column
 from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial, tried
-from robotdiffuse.trajectories.simplification import shortcut
-from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.evaluation.tables import Column
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, unlearned_starts
+from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.family import Family, uniform_configurations
 from robotdiffuse.problems.problem import JointGoal
-from robotdiffuse.core.types import Path
+from robotdiffuse.trajectories.simplification import shortcut
 from robotdiffuse.validation.validator import VerifySettings, verifier
 
 EACH = 4
@@ -131,12 +131,12 @@ def method(name: str, planner: RobotDiffuse, first_took: dict[int, float]) -> Me
 
     def call(trial: Trial) -> Iterator[Fields]:
         arena, names = Arena(trial, planner), PANDA.joint_names
-        judge = verifier(trial.problem, VerifySettings())
+        validator = verifier(trial.problem, VerifySettings())
         with Clock() as clock:
             paths = METHODS[name](arena, first_took.get(trial.place, 0.1))
         first_took.setdefault(trial.place, clock.cpu)
         for g, path in enumerate(paths):
-            passed = path is not None and judge.path(Path(names, arena.ends.complete(path))).valid
+            passed = path is not None and validator.path(Path(names, arena.ends.complete(path))).valid
             about = {"name": f"{trial.case.name}#{g}", "time": clock.wall, "cpu": clock.cpu / len(paths)}
             length = {"joint_length": float(path_length(path))} if passed else {}
             yield about | length | {"status": "solved" if passed else "no_path"}

@@ -1,4 +1,4 @@
-"""Obstacles that cross an arm's way: the reactive loop, on one core, judged by PyBullet.
+"""Obstacles that cross an arm's way: the reactive loop, on one core, validated by PyBullet.
 
     python benchmarks/moving.py [--runs 100] [--lattice-runs 5]
 
@@ -21,10 +21,10 @@ from report import header, print_table, progress
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.planning.baselines.lattice.planner import DStarLiteSearch, DStarLiteSettings
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.validator import PyBulletOracle
-from robotdiffuse.core.transforms import transform
 
 SPEED, RADIUS = 0.4, 0.1
 START, GOAL = [-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8], [1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]
@@ -83,7 +83,7 @@ class Run:
     """CPU time of each step but the first, which looks for nothing yet [ms]."""
 
 
-def judged(
+def validated(
     run: Run,
     oracle: PyBulletOracle,
     balls: tuple[rd.MovingObstacle, ...],
@@ -114,7 +114,7 @@ def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOrac
             if doing is not None:
                 for at in np.arange(now, now + PERIOD - 1e-9, LOOK):
                     q, moves = followed(doing.motion, at - doing.begins)
-                    judged(run, oracle, balls, q, at, moves)
+                    validated(run, oracle, balls, q, at, moves)
             doing = command
             if command.arrived:
                 run.arrived, run.took = True, command.begins
@@ -131,7 +131,7 @@ def played(problem: rd.Problem, oracle: PyBulletOracle, seed: int) -> Run:
     assert trajectory is not None
     for at in np.arange(0.0, trajectory.duration, LOOK):
         q, moves = followed(trajectory, at)
-        judged(run, oracle, problem.moving, q, at, moves)
+        validated(run, oracle, problem.moving, q, at, moves)
     run.arrived, run.took = True, trajectory.duration
     return run
 

@@ -5,7 +5,7 @@
 
 Prints the report that is kept in benchmarks/results/network.txt; FOLDER as in problems.py. Problems are not
 trivial (the straight line does not solve them) and ten seconds of search do solve them. Everything that is
-called solved passed the judge; motions of the whole planner are confirmed by PyBullet on meshes.
+called solved passed the validator; motions of the whole planner are confirmed by PyBullet on meshes.
 
 What the network is told of the obstacles is the code z of their point cloud, and the clearances of the links
 along the noisy motion. Each is taken away in rows of its own: in place of z the code of another scene of the
@@ -28,6 +28,7 @@ from searches import bumps, network, search
 
 from problems import PANDA, SEARCH_TIME, Case, Drawn, draw_cases, families_of
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.types import Path
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     Draw,
@@ -40,17 +41,16 @@ from robotdiffuse.evaluation.methods import (
     without_network,
 )
 from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial, tried
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, SOLVED, summary
 from robotdiffuse.evaluation.tables import show
-from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial, tried
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.diffusion.diffusion import encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.simulation.validator import PyBulletOracle
-from robotdiffuse.core.types import Path
 
 TIME_LIMIT = 5.0
 """Of the whole planner [s]."""
@@ -175,7 +175,7 @@ def report(family: str, drawn: Drawn, weights: str | None, parts: str) -> dict[s
         }
         methods = {name: searched(search(planner, of, line=False), (np.inf,)) for name, of in starts.items()}
         found = tried(hard, methods, seeds=(2,), title=family)
-        show(summary("(b) refinement, shortcuts, judge", found, (SOLVED, LENGTH, CPU)), width=WIDTH)
+        show(summary("(b) refinement, shortcuts, validator", found, (SOLVED, LENGTH, CPU)), width=WIDTH)
     if "c" in parts:
         whole = confirmed(RobotDiffuse(RobotDiffuseSettings(weights=weights)))
         found = tried(hard, {"robotdiffuse": whole}, limit=TIME_LIMIT, title=family)
@@ -215,7 +215,7 @@ def main() -> None:
         equal_time(every, RobotDiffuseSettings(weights=arguments.weights))
     print(
         "\n* joint-space length against a path of `aorrtc`, mean of "
-        "ratios\nsingle: share of samples that pass the judge; best: problems with one that does. Shares "
+        "ratios\nsingle: share of samples that pass the validator; best: problems with one that does. Shares "
         "with 95 %\nintervals; times are CPU time, as the machine may do other work."
     )
 

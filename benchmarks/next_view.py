@@ -4,7 +4,7 @@
     python benchmarks/next_view.py --report --records next_view.jsonl
 
 Problems, cameras and limits are those of `unseen.py`. From what one view shows a motion is planned; with a
-second view it is planned anew, and judged in the true scene. Random poses are of those that `next_view`
+second view it is planned anew, and validated in the true scene. Random poses are of those that `next_view`
 chooses among; the opposite pose is that of the first camera, half a turn about the base.
 """
 
@@ -13,20 +13,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import unseen
+import unknown
 from report import header, print_table, progress
 
-from robotdiffuse.evaluation.statistics import compare
 from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.evaluation.statistics import compare
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.planning import context
 from robotdiffuse.planning.context import Request
 from robotdiffuse.planning.next_view import next_view, poses_around
-from robotdiffuse.planning.pipeline.unknown_space import plan_beside_unseen
+from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.problems.problem import IMAGINED, Problem
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.ray_caster import ray_cast
+from robotdiffuse.problems.problem import PREDICTED, Problem
 from robotdiffuse.scenes.scene import Scene
 
 SECOND = ("next_view", "random", "opposite")
@@ -35,24 +35,24 @@ UNSURE = 0.9
 
 
 def run(records: str, count: int) -> None:
-    context.time = unseen.CpuClock  # type: ignore[attr-defined]
+    context.time = unknown.CpuClock  # type: ignore[attr-defined]
     kept = JsonLines(Path(records))
     done = {(row["family"], row["number"]) for row in kept.rows}
     for family in FAMILIES:
         known = {number for of, number in done if of == family}
-        some = list(unseen.problems(family, count // len(FAMILIES), known))
+        some = list(unknown.problems(family, count // len(FAMILIES), known))
         for number, problem in progress(some, family):
             if (family, number) not in done:
                 kept.append({"family": family, "number": number, **_tried(problem, family, number)})
 
 
 def _tried(problem: Problem, family: str, number: int) -> dict[str, Any]:
-    [view] = unseen.views(problem, family, number, 1, False)
+    [view] = unknown.views(problem, family, number, 1, False)
     one = _planned(problem, view)
-    row = {"one": unseen.is_free(problem, one[1]), "confidence": one[1].confidence}
+    row = {"one": unknown.is_free(problem, one[1]), "confidence": one[1].confidence}
     if one[1].path is None:
         return row
-    rng = np.random.default_rng([unseen.SEED, number, 15])
+    rng = np.random.default_rng([unknown.SEED, number, 15])
     poses = poses_around()
     chosen = {
         "next_view": next_view(*one, poses).T_base_camera,
@@ -60,16 +60,16 @@ def _tried(problem: Problem, family: str, number: int) -> dict[str, Any]:
         "opposite": np.diag([-1.0, -1.0, 1.0, 1.0]) @ view.T_base_camera,
     }
     for name, T in chosen.items():
-        second = ray_cast(problem.scene, T, view.intrinsics, unseen.SIZE, problem.robot, problem.start)
+        second = ray_cast(problem.scene, T, view.intrinsics, unknown.SIZE, problem.robot, problem.start)
         result = _planned(problem, view, second)[1]
-        row |= {name: unseen.is_free(problem, result), f"{name} confidence": result.confidence or 0.0}
+        row |= {name: unknown.is_free(problem, result), f"{name} confidence": result.confidence or 0.0}
     return row
 
 
 def _planned(problem: Problem, *views: DepthView) -> tuple[Problem, PlanResult]:
     known = Scene(problem.scene.shapes[:1])
-    partial = Problem(problem.robot, known, problem.start, problem.goal, views=views, unseen=IMAGINED)
-    return partial, plan_beside_unseen(unseen.PLANNER, partial, unseen.LIMIT, 0, Request())
+    partial = Problem(problem.robot, known, problem.start, problem.goal, views=views, unknown=PREDICTED)
+    return partial, plan_with_unknown_space(unknown.PLANNER, partial, unknown.LIMIT, 0, Request())
 
 
 def report(rows: list[dict[str, Any]]) -> None:

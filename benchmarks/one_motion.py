@@ -22,6 +22,7 @@ from scipy.interpolate import CubicHermiteSpline
 
 import robotdiffuse as rd
 from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.planning import context
 from robotdiffuse.problems.goals import JointGoal, PoseGoal
 from robotdiffuse.problems.held_out import SEED, held_out_problem
@@ -29,7 +30,6 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.simulation.validator import PyBulletOracle
-from robotdiffuse.core.types import Trajectory
 
 HAND = "panda_hand"
 BLENDS = (0.02, 0.05, 0.1, 0.2)

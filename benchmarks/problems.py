@@ -14,7 +14,7 @@ from typing import NamedTuple
 from rich.console import Console
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.evaluation.problem_sets import SEARCH_TIME, case_file, judge, search
+from robotdiffuse.evaluation.problem_sets import SEARCH_TIME, case_file, search, validator
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import SEED, Case, goal_of
 from robotdiffuse.robots import load_robot
@@ -37,8 +37,8 @@ def draw_cases(family: str, count: int, folder: File | None = None) -> Drawn:
     """Solvable problems, `count` hard ones among them; a folder keeps what is known of them."""
     kept = case_file(folder, family)
     with Console(stderr=True).status(f"problems of {family}") as status:
-        hard = kept.held_out(family, count, judge, search, status.update)
-    drawn = kept.held_out(family, 1 + int(hard[-1].name.partition("/")[2]), judge)
+        hard = kept.held_out(family, count, validator, search, status.update)
+    drawn = kept.held_out(family, 1 + int(hard[-1].name.partition("/")[2]), validator)
     cases = [case for case in drawn if case.trivial or case.hard]
     return Drawn(hard, cases, len(drawn) - len(cases))
 

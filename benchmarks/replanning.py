@@ -17,7 +17,7 @@ from report import header, print_table
 
 from problems import goal_of
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.problem_sets import case_file, judge
+from robotdiffuse.evaluation.problem_sets import case_file, validator
 from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial, tried
 from robotdiffuse.planning.baselines.lattice.planner import DStarLiteSearch, DStarLiteSettings, Outcome
 from robotdiffuse.problems.problem import Problem
@@ -83,7 +83,9 @@ def main() -> None:
     found, number = [], arguments.problems
     kept = case_file(None, "rop")
     while len(found) < arguments.problems:
-        found = [c for c in kept.held_out("rop", number, judge) if not c.trivial and ran(begun(c.problem))[0]]
+        found = [
+            c for c in kept.held_out("rop", number, validator) if not c.trivial and ran(begun(c.problem))[0]
+        ]
         number += arguments.problems
     methods = {f"{100 * distance:g} cm": repaired(distance) for distance in MOVES}
     rows = []

@@ -32,24 +32,24 @@ from report import header, print_table, progress
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.motions import levers
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
+from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.planning import context
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import usable_ends
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.simulation.validator import PyBulletOracle
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.tolerances import goal_error
-from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
-from robotdiffuse.core.types import Path as JointPath
 
 SHORT, LONG = 1.0, 10.0
 """Time limits, of CPU time [s]; the longer one says what can be solved."""
@@ -101,7 +101,7 @@ def carried(folder: Path, places: int) -> Iterator[Asked]:
         for _ in range(TRIES):
             goal = PoseGoal(CAN, _place(scene, entry.problem.scene, rng), [0, 0, 0], [0, 0, np.pi])
             problem = Problem(holding, scene, q, goal)
-            if not isinstance(usable_ends(Call("places", problem, LOOKING, 0)), PlanResult):
+            if not isinstance(usable_start_goal(PlanningContext("places", problem, LOOKING, 0)), PlanResult):
                 yield Asked(f"{entry.name}-{kept}", problem)
                 kept += 1
             if kept == places:
@@ -249,7 +249,7 @@ def attaching() -> None:
     """CPU time of taking up a box of a size that was not seen before."""
     robot, rng = rd.load_robot("panda"), np.random.default_rng(0)
     rows = []
-    for what, prepared in (("robot.attach", False), ("and all arrays of search and judge", True)):
+    for what, prepared in (("robot.attach", False), ("and all arrays of search and validator", True)):
         spent = []
         for _ in range(30):
             began = time.process_time()

@@ -19,12 +19,12 @@ from robotdiffuse.collision.motions import search_space
 from robotdiffuse.evaluation.methods import Search
 from robotdiffuse.evaluation.runs import Trial
 from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.trajectories.simplification import shortcut
-from robotdiffuse.planning.start_goal import Ends
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, unlearned_starts
 from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSearch, SharedTreeSettings
+from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.held_out import SEED
 from robotdiffuse.problems.problem import JointGoal
+from robotdiffuse.trajectories.simplification import shortcut
 
 DRAFT = {"samples": 4, "sampling_steps": 3}
 """Of the network's repeated batches."""
@@ -38,7 +38,7 @@ RESOLUTION = 0.02
 
 
 class Candidates(NamedTuple):
-    """Trajectories between the ends of a problem, not yet judged."""
+    """Trajectories between the ends of a problem, not yet validated."""
 
     q: Float[ndarray, "count waypoints dof"]
     free: Bool[ndarray, "count"]
@@ -54,13 +54,13 @@ class Arena:
         self.planner, self.rng, self.robot = planner, trial.rng(), problem.robot
         self.state = random_state(SEED, trial.place)
         self.checker = CollisionChecker(problem.robot, problem.scene)
-        self.ends = Ends(self.checker, problem.start, problem.goal.positions)
+        self.start_goal = StartGoal(self.checker, problem.start, problem.goal.positions)
         model = planner.model(problem.robot)
         assert model is not None
         self.model: MotionModel = model
-        if self.ends.reachable:
-            self.start, self.goals = self.ends.rows()
-            self.clearance = self.ends.kept_clearance(CLEARANCE)
+        if self.start_goal.reachable:
+            self.start, self.goals = self.start_goal.rows()
+            self.clearance = self.start_goal.kept_clearance(CLEARANCE)
             self.space = search_space(self.checker, RESOLUTION, self.clearance)
 
     def line(self) -> Float[ndarray, "2 dof"] | None:
@@ -103,11 +103,11 @@ def search(planner: RobotDiffuse, tries: Tries, line: bool = True) -> Search:
 
     def begin(trial: Trial) -> Iterator[ndarray | None]:
         arena = Arena(trial, planner)
-        if not arena.ends.reachable:
+        if not arena.start_goal.reachable:
             return iter(())
         straight = arena.line() if line else None
         paths = tries(arena) if straight is None else iter([straight])
-        return (path if path is None else arena.ends.complete(path) for path in paths)
+        return (path if path is None else arena.start_goal.complete(path) for path in paths)
 
     return begin
 

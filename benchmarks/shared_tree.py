@@ -24,8 +24,8 @@ from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.evaluation.methods import planned
-from robotdiffuse.evaluation.tables import Column
 from robotdiffuse.evaluation.runs import Fields, Method, Trial, tried
+from robotdiffuse.evaluation.tables import Column
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.shard_maker import draw as draw_problem
 from robotdiffuse.planning import load_planner

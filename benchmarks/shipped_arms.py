@@ -21,10 +21,10 @@ from report import header, print_table, progress
 
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.simulation.validator import PyBulletOracle

@@ -1,19 +1,19 @@
-"""What the camera does not see: motions planned on depth views, judged in the true scene.
+"""What the camera does not see: motions planned on depth views, validated in the true scene.
 
-    python benchmarks/unseen.py [--problems 300] [--views 1] [--noise] [--records unseen.jsonl]
+    python benchmarks/unseen.py [--problems 300] [--views 1] [--noise] [--records unknown.jsonl]
     python benchmarks/unseen.py --weights FOLDER ... --families shelf clutter
-    python benchmarks/unseen.py --report [--odd] --records unseen.jsonl
-    python benchmarks/unseen.py --fit --records unseen.jsonl
+    python benchmarks/unseen.py --report [--odd] --records unknown.jsonl
+    python benchmarks/unseen.py --fit --records unknown.jsonl
     python benchmarks/unseen.py --times
 
 Problems are held-out ones of the families that the straight line does not solve and a search in the true
 scene does. Cameras stand where a person would place them, 1.4 to 1.8 m away, in front more often than behind;
 the floor is known, all else is seen. Every method plans with AORRTC, but for the one that is said to plan
-with the hybrid, and the same CPU time. A motion is free if the judge finds path and timed motion valid in the
+with the hybrid, and the same CPU time. A motion is free if the validator finds path and timed motion valid in the
 true scene. What was tried is kept in a file of records and not tried again; `--report` prints the tables that
 are kept in benchmarks/results/unseen.txt, and `--fit` the constants of perception/confidence.py, from the
 calibration half: problems with even numbers. Settings were chosen on them, too; `--odd` leaves them out of
-the report. `--weights` adds the chain 'imagined' with other weights of the completing network, folders of
+the report. `--weights` adds the chain 'predicted' with other weights of the completing network, folders of
 `train completion`, as methods that are named by the folder: those of a training that left families out are
 tried on these families. `--times` prints what the network takes of a core.
 """
@@ -31,24 +31,23 @@ from jaxtyping import Float
 from numpy import ndarray
 from report import header, print_table, progress
 
-from robotdiffuse.evaluation.statistics import compare, wilson_interval
 from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.evaluation.statistics import compare, wilson_interval
 from robotdiffuse.learning.checkpoint import load_completion
-from robotdiffuse.learning.completion import bundled, imagine
+from robotdiffuse.learning.completion import bundled, predict
 from robotdiffuse.learning.completion.network import CompletionNetwork
 from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
-from robotdiffuse.planning import load_planner
-from robotdiffuse.planning import context
-from robotdiffuse.planning.context import Request
 from robotdiffuse.perception.confidence import LEAST_RISK, confidence
-from robotdiffuse.planning.pipeline.unknown_space import plan_beside_unseen
-from robotdiffuse.problems.families import FAMILIES
-from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
-from robotdiffuse.problems.problem import IMAGINED, Problem
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import DepthNoise, ray_cast
+from robotdiffuse.planning import context, load_planner
+from robotdiffuse.planning.context import Request
+from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
+from robotdiffuse.problems.families import FAMILIES
+from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
+from robotdiffuse.problems.problem import PREDICTED, Problem
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
@@ -59,19 +58,19 @@ SEARCH = 1.0
 CAMERAS = CameraPlaces(distance=(1.4, 1.8), height=(0.5, 1.4), target_spread=0.1, roll=0.0)
 SIZE = (640, 480)
 HYBRID = "hybrid"
-"""As imagined, with `robotdiffuse` in place of AORRTC: its network is told of imagined obstacles as of seen
+"""As predicted, with `robotdiffuse` in place of AORRTC: its network is told of predicted obstacles as of seen
 ones."""
 METHODS = {
     "as seen": "optimistic",
     "occupied": "occupied",
     "padded": "padded",
-    "imagined": IMAGINED,
-    HYBRID: IMAGINED,
+    "predicted": PREDICTED,
+    HYBRID: PREDICTED,
 }
 TRUE = "true voxels"
-"""As imagined, with the voxels of 2 cm that obstacles fill in truth."""
-BY = "imagined by "
-"""As imagined, by the weights of the folder of this name."""
+"""As predicted, with the voxels of 2 cm that obstacles fill in truth."""
+BY = "predicted by "
+"""As predicted, by the weights of the folder of this name."""
 CALLS, WARM = 140, 7
 """That the network is timed by, and further ones before."""
 PLANNER, HYBRID_PLANNER = load_planner("aorrtc"), load_planner("robotdiffuse")
@@ -114,24 +113,24 @@ def views(problem: Problem, family: str, number: int, count: int, noisy: bool) -
 
 
 def tried(problem: Problem, partial: Problem, method: str, network: CompletionNetwork | None = None) -> Row:
-    """What a method makes of what was seen, judged in the true scene.
+    """What a method makes of what was seen, validated in the true scene.
 
-    `network`: that imagines in place of the bundled one.
+    `network`: that predicts in place of the bundled one.
     """
     voxels = true_voxels(Scene(problem.scene.shapes[1:])).astype(np.float32) if method == TRUE else None
     began = time.process_time()
     if network is not None:
-        voxels = imagine(observe(partial.views, partial.robot, partial.start), network)
-    asked = replace(partial, unseen=METHODS.get(method, IMAGINED))
+        voxels = predict(observe(partial.views, partial.robot, partial.start), network)
+    asked = replace(partial, unknown=METHODS.get(method, PREDICTED))
     left = LIMIT if network is None else LIMIT - (time.process_time() - began)
     planner = HYBRID_PLANNER if method == HYBRID else PLANNER
-    result = plan_beside_unseen(planner, asked, left, 0, Request(), voxels)
+    result = plan_with_unknown_space(planner, asked, left, 0, Request(), voxels)
     spent = time.process_time() - began
     return {
         "method": method,
         "solved": result.solved,
         "free": is_free(problem, result),
-        "rung": result.rung,
+        "assumption": result.assumption,
         "confidence": result.confidence,
         "risk": result.swept_probability,
         "time": spent,
@@ -169,7 +168,7 @@ def run(arguments: argparse.Namespace) -> None:
             spent = time.process_time() - began
             if warm:
                 HYBRID_PLANNER.warm_up(problem, "short")
-                tried(problem, partial, IMAGINED if IMAGINED in missing else "padded")
+                tried(problem, partial, PREDICTED if PREDICTED in missing else "padded")
                 warm = False
             for method in missing:
                 row = tried(problem, partial, method, networks.get(method))
@@ -177,7 +176,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def table(rows: list[Row], title: str) -> None:
-    """Methods on the same problems: free in truth, plans, the first rung, times; and each family."""
+    """Methods on the same problems: free in truth, plans, the first assumption, times; and each family."""
     families = list(dict.fromkeys(row["family"] for row in rows))
     lines = []
     others = dict.fromkeys(row["method"] for row in rows if row["method"].startswith(BY))
@@ -187,7 +186,7 @@ def table(rows: list[Row], title: str) -> None:
             continue
         free, solved = sum(row["free"] for row in mine), sum(row["solved"] for row in mine)
         low, high = wilson_interval(free, len(mine))
-        first = [row for row in mine if row["rung"] == FIRST_RUNGS.get(method, FIRST_IMAGINED)]
+        first = [row for row in mine if row["assumption"] == FIRST_RUNGS.get(method, FIRST_IMAGINED)]
         shares = [np.mean([row["free"] for row in mine if row["family"] == family]) for family in families]
         lines.append(
             (
@@ -203,12 +202,12 @@ def table(rows: list[Row], title: str) -> None:
             )
         )
     columns = ["%", "problems", "free in truth", "plans", "of them free"]
-    columns += ["first rung", "of it free", "ms", *families]
+    columns += ["first assumption", "of it free", "ms", *families]
     print_table(title, columns, lines)
     base = {name: _free(rows, name) for name in [*METHODS, *others, TRUE]}
-    pairs = [("padded", "as seen"), ("imagined", "as seen"), ("imagined", "padded"), (TRUE, "imagined")]
-    pairs += [(HYBRID, "imagined")]
-    pairs += [(other, of) for other in others for of in ("as seen", "padded", "imagined")]
+    pairs = [("padded", "as seen"), ("predicted", "as seen"), ("predicted", "padded"), (TRUE, "predicted")]
+    pairs += [(HYBRID, "predicted")]
+    pairs += [(other, of) for other in others for of in ("as seen", "padded", "predicted")]
     for a, b in pairs:
         both = base[a].keys() & base[b].keys()
         if both:
@@ -218,9 +217,9 @@ def table(rows: list[Row], title: str) -> None:
     print()
 
 
-FIRST_IMAGINED = "imagined, p > 0.1"
+FIRST_IMAGINED = "predicted, p > 0.1"
 FIRST_RUNGS = {"as seen": None, "occupied": None, "padded": "points padded by 9 cm"}
-"""Of methods that imagine it is FIRST_IMAGINED."""
+"""Of methods that predict it is FIRST_IMAGINED."""
 
 
 def _free(rows: list[Row], method: str) -> dict[tuple[str, int], bool]:
@@ -233,7 +232,7 @@ def calibration(rows: list[Row]) -> None:
         mine = [r for r in rows if r["method"] == method and r["solved"] and r["number"] % 2]
         if not mine:
             continue
-        stated = np.array([confidence(row["rung"], row["risk"]) for row in mine])
+        stated = np.array([confidence(row["assumption"], row["risk"]) for row in mine])
         free = np.array([row["free"] for row in mine], float)
         lines, error = [], 0.0
         for low in np.arange(0, 1, 0.2):
@@ -257,7 +256,7 @@ def calibration(rows: list[Row]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Planning on depth views, judged in the true scene.")
+    parser = argparse.ArgumentParser(description="Planning on depth views, validated in the true scene.")
     parser.add_argument("--problems", type=int, default=300, help="(300)")
     parser.add_argument("--families", nargs="+", default=list(FAMILIES), help="(all)")
     every = [*METHODS, TRUE]
@@ -267,7 +266,7 @@ def main() -> None:
     parser.add_argument(
         "--weights", nargs="*", default=[], metavar="FOLDER", help="of the completing network"
     )
-    parser.add_argument("--records", default="unseen.jsonl", help="(unseen.jsonl)")
+    parser.add_argument("--records", default="unknown.jsonl", help="(unknown.jsonl)")
     parser.add_argument("--report", action="store_true")
     parser.add_argument("--odd", action="store_true", help="report problems with odd numbers alone")
     parser.add_argument("--fit", action="store_true")
@@ -323,16 +322,16 @@ def fit(rows: list[Row]) -> None:
     """Print RATES and BY_RISK of perception/confidence.py."""
     rows = [r for r in rows if r["solved"] and r["number"] % 2 == 0 and r["views"] == 1 and not r["noise"]]
     plain = [row for row in rows if row["risk"] is None]
-    for rung in dict.fromkeys(row["rung"] for row in plain):
-        free = [row["free"] for row in plain if row["rung"] == rung]
-        print(f'RATES "{rung}": {(sum(free) + 1) / (len(free) + 2):.2f} of {len(free)}')
+    for assumption in dict.fromkeys(row["assumption"] for row in plain):
+        free = [row["free"] for row in plain if row["assumption"] == assumption]
+        print(f'RATES "{assumption}": {(sum(free) + 1) / (len(free) + 2):.2f} of {len(free)}')
     for seen in (False, True):
-        some = [r for r in rows if r["method"] == "imagined" and (r["rung"] == "as seen") == seen]
+        some = [r for r in rows if r["method"] == "predicted" and (r["assumption"] == "as seen") == seen]
         if some:
             free, risk = (np.array([row[name] for row in some], float) for name in ("free", "risk"))
             print(
                 "BY_RISK",
-                "as seen" if seen else "imagined",
+                "as seen" if seen else "predicted",
                 _logistic(np.log(np.maximum(risk, LEAST_RISK)), free),
             )
 

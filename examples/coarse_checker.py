@@ -1,4 +1,4 @@
-"""Motions of a planner that checks waypoints and little between them, judged; what passes is certified."""
+"""Motions of a planner that checks waypoints and little between them, validated; what passes is certified."""
 
 import numpy as np
 from ompl import base as ob

@@ -1,14 +1,13 @@
-"""Plan on what depth cameras see of a scene, and judge the motion by the scene itself (needs PyBullet).
+"""Plan on what depth cameras see of a scene, and validator the motion by the scene itself (needs PyBullet).
 
 What no camera sees is not there for the planner: the back of the ball, what the arm hides, what is out of
-view. With one camera the motion is likely to run through the unseen half of the ball; with two it is free.
+view. With one camera the motion is likely to run through the unknown half of the ball; with two it is free.
 """
 
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.simulation import DepthCamera, World, point_cloud
-from robotdiffuse.simulation import replay
+from robotdiffuse.simulation import DepthCamera, World, point_cloud, replay
 
 robot = rd.load_robot("panda")
 scene = rd.Scene([rd.Box([0.55, 0.0, 0.3], [0.2, 0.2, 0.6]), rd.Sphere([0.45, -0.05, 0.95], 0.12)])

@@ -121,7 +121,7 @@ def test_import_loads_nothing_heavy() -> None:
     assert run(code.format(("torch", "numba", "coal", "toppra", "matplotlib"))) == "[]"
 
 
-def test_searches_the_hybrid_the_judge_the_bench_and_the_data_factory_load_no_pytorch() -> None:
+def test_searches_the_hybrid_the_validator_the_bench_and_the_data_factory_load_no_pytorch() -> None:
     """It takes longer to load than all else that their processes need at the start."""
     code = (
         "import sys, robotdiffuse.generation.shard_maker, robotdiffuse.validation.validator\n"

@@ -11,13 +11,19 @@ if TYPE_CHECKING:
     from robotdiffuse.certificates.proof import Certificate as Certificate
     from robotdiffuse.certificates.proof import load_certificate as load_certificate
     from robotdiffuse.certificates.search import certify as certify
-    from robotdiffuse.datasets.loader import RopDataset as RopDataset
     from robotdiffuse.core.errors import InputError as InputError
+    from robotdiffuse.core.results import PlanResult as PlanResult
+    from robotdiffuse.core.results import load_result as load_result
+    from robotdiffuse.core.types import Path as Path
+    from robotdiffuse.core.types import Status as Status
+    from robotdiffuse.core.types import Trajectory as Trajectory
+    from robotdiffuse.datasets.loader import RopDataset as RopDataset
+    from robotdiffuse.perception.depth_view import DepthView as DepthView
     from robotdiffuse.planning import load_planner as load_planner
     from robotdiffuse.planning import plan as plan
-    from robotdiffuse.planning.plan_many import plan_many as plan_many
     from robotdiffuse.planning.next_view import NextView as NextView
     from robotdiffuse.planning.next_view import next_view as next_view
+    from robotdiffuse.planning.plan_many import plan_many as plan_many
     from robotdiffuse.planning.reactive.replanner import Replanner as Replanner
     from robotdiffuse.planning.reactive.replanner import ReplannerSettings as ReplannerSettings
     from robotdiffuse.problems.constraints import AxisCone as AxisCone
@@ -31,11 +37,8 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.goals import PoseGoal as PoseGoal
     from robotdiffuse.problems.goals import PosesGoal as PosesGoal
     from robotdiffuse.problems.problem import Problem as Problem
-    from robotdiffuse.core.results import PlanResult as PlanResult
-    from robotdiffuse.core.results import load_result as load_result
     from robotdiffuse.robots import load_robot as load_robot
     from robotdiffuse.robots.inertias import Payload as Payload
-    from robotdiffuse.perception.depth_view import DepthView as DepthView
     from robotdiffuse.scenes.moving_obstacles import MovingObstacle as MovingObstacle
     from robotdiffuse.scenes.scene import Scene as Scene
     from robotdiffuse.scenes.shapes import Box as Box
@@ -44,9 +47,6 @@ if TYPE_CHECKING:
     from robotdiffuse.scenes.shapes import Mesh as Mesh
     from robotdiffuse.scenes.shapes import PointCloud as PointCloud
     from robotdiffuse.scenes.shapes import Sphere as Sphere
-    from robotdiffuse.core.types import Path as Path
-    from robotdiffuse.core.types import Status as Status
-    from robotdiffuse.core.types import Trajectory as Trajectory
     from robotdiffuse.validation.validator import verify as verify
     from robotdiffuse.visualization.notebook import show as show
 

@@ -1,4 +1,4 @@
-"""The bounds of certificates, before formulas by hand, Coal and the judge's own kinematics."""
+"""The bounds of certificates, before formulas by hand, Coal and the validator's own kinematics."""
 
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
@@ -45,7 +45,7 @@ ROBOTS = {
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_links_are_where_the_judge_has_them(name: str) -> None:
+def test_links_are_where_the_validator_has_them(name: str) -> None:
     robot = ROBOTS[name]()
     rng = np.random.default_rng(0)
     q = rng.uniform(robot.lower, robot.upper, (5, robot.dof))

@@ -16,11 +16,11 @@ from robotdiffuse.certificates.proof import Certificate, Tolerances, load_certif
 from robotdiffuse.certificates.search import NotValidError, certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.core.types import Path
 from robotdiffuse.validation.validator import VerifySettings, verify
 
 SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3], [0.6, 0.9, 0.3]])
@@ -95,7 +95,7 @@ def test_a_certificate_is_checked_from_its_file_alone(file: FilePath) -> None:
 
 
 def test_the_checker_loads_neither_compiled_code_nor_coal() -> None:
-    """It is another path than the judge's, and starts in a fraction of the time."""
+    """It is another path than the validator's, and starts in a fraction of the time."""
     import subprocess
     import sys
 
@@ -257,8 +257,8 @@ def test_rates_are_checked_anew(planned: tuple[Problem, rd.PlanResult]) -> None:
     assert any("exceeds its limit of velocity" in line for line in found)
 
 
-def test_tolerances_are_those_of_the_judge() -> None:
-    """The checker does not import the judge."""
+def test_tolerances_are_those_of_the_validator() -> None:
+    """The checker does not import the validator."""
     settings = VerifySettings()
     for name, value in asdict(Tolerances()).items():
         assert getattr(settings, name) == value

@@ -13,16 +13,16 @@ import pytest
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import Stretches
-from robotdiffuse.certificates.proof import Certificate, load_certificate
 from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.constraints import kept
 from robotdiffuse.certificates.content import request_parts
 from robotdiffuse.certificates.moving_obstacles import MovingProver
+from robotdiffuse.certificates.proof import Certificate, load_certificate
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.types import Trajectory
 
 PANDA, HAND = rd.load_robot("panda"), "panda_hand"
 START, GOAL = [-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2], [0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]
@@ -153,7 +153,7 @@ def test_whoever_forges_the_hashes_too_still_needs_a_proof(case: str) -> None:
 
 
 def test_bounds_of_constraints_are_bounds() -> None:
-    """Against the judge's own values, densely, for arms that slide too."""
+    """Against the validator's own values, densely, for arms that slide too."""
     rng = np.random.default_rng(0)
     for k in range(40):
         robot = PANDA if k % 2 else box_arm()

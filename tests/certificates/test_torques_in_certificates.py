@@ -12,14 +12,14 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
-from robotdiffuse.certificates.proof import Certificate, load_certificate
 from robotdiffuse.certificates.content import request_parts
-from robotdiffuse.certificates.torques import inverse_dynamics, most_torques
+from robotdiffuse.certificates.proof import Certificate, load_certificate
 from robotdiffuse.certificates.search import certify
+from robotdiffuse.certificates.torques import inverse_dynamics, most_torques
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.inertias import Payload
-from robotdiffuse.core.types import Path, Trajectory
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
 LOW, FAR = [-0.6, 0.2, 0, -1.2, 0, 2.2, 0.2], [0.6, 0.6, 0, -1.0, 0, 2.2, 0.2]

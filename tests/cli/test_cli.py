@@ -16,6 +16,8 @@ from helpers.made_arms import chain, row, written
 from helpers.quick_preparation import QUICK
 from robotdiffuse.cli import main
 from robotdiffuse.cli.background_factory import filled_meanwhile
+from robotdiffuse.core.results import PlanResult, load_result
+from robotdiffuse.core.types import Status
 from robotdiffuse.datasets.manifest import read_manifest, write_manifest
 from robotdiffuse.datasets.shards import check_shard, shard_indices
 from robotdiffuse.generation import GenerationSettings
@@ -25,9 +27,7 @@ from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
 from robotdiffuse.planning import PLANNERS, planner_settings
-from robotdiffuse.core.results import PlanResult, load_result
 from robotdiffuse.robots import load_robot
-from robotdiffuse.core.types import Status
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted(ROOT.glob("examples/*.yaml")) + sorted(ROOT.glob("src/robotdiffuse/examples/*.yaml"))

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
+from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.signed_distance import SignedDistance
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_model, save_network
@@ -21,8 +21,8 @@ from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere
 
 PANDA = load_robot("panda")

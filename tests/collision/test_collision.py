@@ -14,8 +14,8 @@ from helpers.box_arm import box_arm
 from helpers.clearances import least_clearance
 from helpers.example_robots import example_robot
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernel_arrays import compile_scene, robot_groups
 from robotdiffuse.collision.exact_meshes import ExactCollision, forward_frames
+from robotdiffuse.collision.kernel_arrays import compile_scene, robot_groups
 from robotdiffuse.collision.kernels.lane_clearance import block_clearances
 from robotdiffuse.collision.kernels.lane_collision import block_hits, free_many, make_workspace
 from robotdiffuse.collision.kernels.motions import motion_free

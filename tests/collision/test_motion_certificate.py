@@ -13,10 +13,9 @@ from numpy import ndarray
 from helpers.box_arm import box_mesh
 from helpers.example_robots import example_robot
 from robotdiffuse.collision.checker import CollisionChecker
-from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.convex_geometry import checks_of, hulls_of, solid_arrays, solids_of
-from robotdiffuse.collision.kernels import convex_bounds
-from robotdiffuse.collision.kernels import motion_certificate
+from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.collision.kernels import convex_bounds, motion_certificate
 from robotdiffuse.collision.kernels.motion_certificate import Motion, Pieces
 from robotdiffuse.collision.kernels.swept_spheres import make_swept_spheres
 from robotdiffuse.collision.motions import ContinuousCollision
@@ -92,24 +91,24 @@ robots = st.sampled_from(list(LINKS))
 def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, cloud: bool) -> None:
     rng, robot = np.random.default_rng(seed), clad_arm(name)
     scene, q = scene_of(rng, cloud), curve(rng, robot, width)
-    judge, checker, exact = (
+    validator, checker, exact = (
         ContinuousCollision(robot, scene, 1e-4, 0.5),
         CollisionChecker(robot, scene),
         ExactCollision(robot, scene),
     )
-    motion = Motion(q, motion_certificate.way_along(q, judge.checks.levers))
+    motion = Motion(q, motion_certificate.way_along(q, validator.checks.levers))
     whole = Pieces(
         np.zeros(1), np.full(1, motion.way[-1]), np.ones((1, len(checks_of(robot))), dtype=np.bool_)
     )
     best = np.ones(2)
     found = motion_certificate.by_spheres(
-        judge.arm,
-        judge.scene_arrays,
+        validator.arm,
+        validator.scene_arrays,
         motion,
-        judge.checks,
+        validator.checks,
         whole,
         best,
-        make_swept_spheres(judge.arm.spheres, judge.scene_arrays),
+        make_swept_spheres(validator.arm.spheres, validator.scene_arrays),
     )
     places = np.linspace(0, motion.way[-1], 41)
     dense = motion_certificate.configurations(motion, places)
@@ -118,9 +117,11 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
     slack = 0.02 if cloud else 1e-6
     assert (found.lower[0] <= apart.min(axis=0) + slack).all()
     assert (found.clearance[0] <= apart[20] + slack).all()
-    posture = convex_bounds.make_posture(judge.arm.hulls, judge.solids, robot.dof)
+    posture = convex_bounds.make_posture(validator.arm.hulls, validator.solids, robot.dof)
     found.clearance[:], found.lower[:] = -np.inf, -np.inf
-    motion_certificate.by_hulls(judge.arm, judge.solids, motion, judge.checks, found, np.ones(2), 0.5, 1e-4, posture)
+    motion_certificate.by_hulls(
+        validator.arm, validator.solids, motion, validator.checks, found, np.ones(2), 0.5, 1e-4, posture
+    )
     rows = [(*exact.link_distances(row), *exact.pair_distances(row)) for row in dense[::4]]
     distances = np.array([[d.distance for d in row] for row in rows])
     assert (found.lower[0] <= distances.min(axis=0) + 1e-6).all()

@@ -9,9 +9,9 @@ import robotdiffuse as rd
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.moving_obstacles import FIRST_CONTACT, MovingCollision
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Trajectory
+from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
 
 PANDA = rd.load_robot("panda")
 START, END = np.array([-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]), np.array([0.6, 0.2, 0, -2.0, 0, 2.2, 0.2])
@@ -84,9 +84,9 @@ def test_what_is_unknown_is_anywhere_that_it_can_be() -> None:
     """At rest beside a ball that may come at 0.1 m/s, the arm is free until that can be there."""
     ball = rd.Sphere([0.3, 0.0, 1.4], 0.1)
     gap = min(d.distance for d in ExactCollision(PANDA, rd.Scene([ball])).link_distances(START))
-    judge = MovingCollision(PANDA, [rd.MovingObstacle(ball, max_speed=0.1)], 1e-4, 0.5)
-    free = judge.sweep(np.array([0.0, 0.99 * gap / 0.1]), np.stack([START, START]))
-    hit = judge.sweep(np.array([0.0, 1.5 * gap / 0.1]), np.stack([START, START]))
+    validator = MovingCollision(PANDA, [rd.MovingObstacle(ball, max_speed=0.1)], 1e-4, 0.5)
+    free = validator.sweep(np.array([0.0, 0.99 * gap / 0.1]), np.stack([START, START]))
+    hit = validator.sweep(np.array([0.0, 1.5 * gap / 0.1]), np.stack([START, START]))
     assert free.contact is None
     assert hit.contact is not None
     assert hit.contact.time == pytest.approx(gap / 0.1, abs=0.01)
@@ -100,7 +100,7 @@ def test_one_that_goes_faster_is_not_missed_between_rows() -> None:
     assert sweep.contact.time == pytest.approx(0.5, abs=0.01)
 
 
-def test_judge_names_link_obstacle_and_time() -> None:
+def test_validator_names_link_obstacle_and_time() -> None:
     from robotdiffuse.validation.validator import verify_trajectory
 
     ball = rd.MovingObstacle(rd.Sphere([0.45, -0.8, 0.5], 0.1, name="ball"), velocity=[0, 0.4, 0])

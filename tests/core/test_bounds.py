@@ -9,12 +9,12 @@ import pytest
 from helpers.box_arm import box_arm
 from robotdiffuse.core.bounds import rigid_transform
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.core.types import Path
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere
 from robotdiffuse.validation.validator import verify
 
 TRIANGLE = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]
@@ -72,8 +72,8 @@ def test_huge_shapes_are_never_called_valid(kind: type[Shape], distance: float) 
         }[kind]
         if max(2 * half, distance) > 1e4 and kind in (Box, Cylinder):
             return
-        judged = verify(replace(problem, scene=Scene([shape()])), Path(robot.joint_names, rows))
-        assert judged.valid == valid, (depth, judged)
+        validated = verify(replace(problem, scene=Scene([shape()])), Path(robot.joint_names, rows))
+        assert validated.valid == valid, (depth, validated)
 
 
 def test_naming_is_not_quadratic() -> None:

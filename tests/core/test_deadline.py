@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.collision import kernel_arrays
-from robotdiffuse.collision import exact_meshes
+from robotdiffuse.collision import exact_meshes, kernel_arrays
 from robotdiffuse.core.deadline import OutOfTimeError, check_time, deadline
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning.planner import one_of_each
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.core.types import Status
 
 PANDA = rd.load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
@@ -61,7 +60,7 @@ def test_meshes_end_with_the_time() -> None:
 
 
 @pytest.mark.parametrize("cloud", [False, True])
-def test_a_tree_of_the_judge_that_takes_too_long_is_refused(
+def test_a_tree_of_the_validator_that_takes_too_long_is_refused(
     cloud: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Here the exact meshes are to say where the start collides."""
@@ -71,7 +70,7 @@ def test_a_tree_of_the_judge_that_takes_too_long_is_refused(
     monkeypatch.setattr(exact_meshes, "TREE_SECONDS", 1e3)
     refused = RRTConnect().plan(asked, time_limit=20.0)
     assert refused.status is Status.TIMEOUT
-    assert "the judge's tree over the" in refused.reason
+    assert "the validator's tree over the" in refused.reason
     monkeypatch.undo()
     assert RRTConnect().plan(asked, time_limit=20.0).status is Status.INVALID_START
 

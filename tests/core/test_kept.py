@@ -14,8 +14,8 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.problems.files import load_problem
 from robotdiffuse.core.input_files import parse_xml, read_arrays
+from robotdiffuse.problems.files import load_problem
 from robotdiffuse.visualization.replay_page import write_replay
 
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"

@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from robotdiffuse.core import registry
+from robotdiffuse.core.processes import LoneWorker, on_this_machine
+from robotdiffuse.core.registry import Entry, Registry, added, take_over
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.rop import Rop
-from robotdiffuse.core.processes import LoneWorker, on_this_machine
-from robotdiffuse.core.registry import Entry, Registry, added, take_over
 
 FAMILY = """from robotdiffuse.problems.families.rop import Rop
 ONE = Rop(obstacles=(1, 1))

@@ -7,8 +7,8 @@ import pytest
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry, Registry
-from robotdiffuse.scenes.surface_points import VisibleRegion
 from robotdiffuse.core.settings import Bound, Count, NotNegative, OneOf, Positive, Settings, SettingsOf, Share
+from robotdiffuse.scenes.surface_points import VisibleRegion
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.datasets.augmentation import turned, turns_about_vertical
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 
 def test_turned_motions_have_the_same_clearances():

@@ -9,16 +9,16 @@ import pytest
 from helpers.box_arm import box_arm
 from helpers.motion_stores import line, record, write_motions
 from helpers.stores import random_arrays, write_store
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets import robot_npz
 from robotdiffuse.datasets.loader import RopDataset
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.datasets.robot_npz import export_npz, import_npz
 from robotdiffuse.datasets.shards import check_shard, problem_of, read_shard, write_shard
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.scene_arrays import SPHERE
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import SPHERE
 from robotdiffuse.scenes.shapes import Box, Sphere
 
 PANDA = load_robot("panda")

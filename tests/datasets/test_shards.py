@@ -16,6 +16,7 @@ from zarr.codecs import ZstdCodec
 
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays, write_store
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets import shards
 from robotdiffuse.datasets.manifest import read_manifest, write_manifest
 from robotdiffuse.datasets.shards import (
@@ -29,7 +30,6 @@ from robotdiffuse.datasets.shards import (
     split_of,
     write_shard,
 )
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.scenes.scene_arrays import PackedScenes

@@ -54,7 +54,7 @@ def names(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Any]]:
                 sys.modules.pop(file.stem, None)
 
 
-def test_a_planner_solves_and_is_judged(names: dict[str, Any]) -> None:
+def test_a_planner_solves_and_is_validated(names: dict[str, Any]) -> None:
     bent = names["bent"]
     assert bent.solved and bent.planner == "one_bend" and len(bent.path.positions) == 3
     assert rd.verify(names["problem"], bent.path).valid

@@ -10,18 +10,15 @@ import pytest
 
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.evaluation.bench import figures
-from robotdiffuse.evaluation.bench import page
-from robotdiffuse.evaluation.bench import plots
-from robotdiffuse.evaluation.bench import report
-from robotdiffuse.evaluation.bench.run_folder import Bench, read_bench
+from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.evaluation.bench import figures, page, plots, report
 from robotdiffuse.evaluation.bench.outcomes import GAVE_UP, LATER, RAN_OUT, counting, outcome
+from robotdiffuse.evaluation.bench.run_folder import Bench, read_bench
 from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
 from robotdiffuse.evaluation.problem_sets import case_file
 from robotdiffuse.evaluation.records import RESTARTED, Record, record_of_row, record_path
 from robotdiffuse.evaluation.tables import Table
 from robotdiffuse.problems.held_out import Case, held_out_problem
-from robotdiffuse.core.types import Path as Motion
 
 RUN = {
     "date": "2026-01-02 03:04",
@@ -159,7 +156,7 @@ def test_an_outcome_is_what_was_found_by_then() -> None:
     assert (after.joint_length, after.link_length) == (3.0, 9.0)
 
 
-def test_the_judge_may_end_after_the_limit_of_the_call_alone() -> None:
+def test_the_validator_may_end_after_the_limit_of_the_call_alone() -> None:
     record = solved("mpd", "a", 1.0, [(1.08, 4.0)])
     assert outcome(record, 1.0).found == 1.0
     assert not outcome(solved("mpd", "a", 1.0, [(1.2, 4.0)]), 1.0).solved

@@ -16,20 +16,20 @@ import pytest
 from helpers import faulty_planner
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.registry import Entry
+from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation.bench import planner_process
 from robotdiffuse.evaluation.bench.entries import Contestant
 from robotdiffuse.evaluation.bench.runner import BenchSettings, open_trials, run_bench
-from robotdiffuse.evaluation.problem_sets import gather_cases, judge
+from robotdiffuse.evaluation.problem_sets import gather_cases, validator
 from robotdiffuse.evaluation.records import Record, RecordFile, read_records
 from robotdiffuse.evaluation.runs import Trial
 from robotdiffuse.planning import PLANNERS
-from robotdiffuse.planning.search.aorrtc import AORRTCSettings
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
+from robotdiffuse.planning.search.aorrtc import AORRTCSettings
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.held_out import held_out_problem, line_length
-from robotdiffuse.core.registry import Entry
-from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.validation.validator import verify
 
 RECORD = Record(
@@ -74,7 +74,7 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
         assert record.memory is not None and record.memory > 50
         assert (record.workers, record.run) == (1, runs[0]["run"])
         assert record.load is not None and record.cpu is not None
-        assert record.trivial == (line_length(problem, judge) is not None)
+        assert record.trivial == (line_length(problem, validator) is not None)
     assert run_bench(replace(asked, count=3, planners=(plain,)), quiet, quiet) == 2
     assert len(runs[0]["versions"]) > 3
 
@@ -260,7 +260,7 @@ def test_damaged_line_is_named(tmp_path: Path) -> None:
 def test_nontrivial_problems_are_not_solved_by_the_line(tmp_path: Path) -> None:
     cases = gather_cases(["rop_nontrivial", "rop"], 2, tmp_path, quiet)
     hard = [case for case in cases if case.problem_set == "rop_nontrivial"]
-    assert len(hard) == 2 and not any(case.trivial or line_length(case.problem, judge) for case in hard)
+    assert len(hard) == 2 and not any(case.trivial or line_length(case.problem, validator) for case in hard)
     again = gather_cases(["rop_nontrivial", "rop"], 2, tmp_path, quiet)
     assert [case.key for case in again] == [case.key for case in cases]
     more = gather_cases(["rop"], 5, tmp_path, quiet)

@@ -1,4 +1,4 @@
-"""The check of a data set: what is wrong is found, by both judges, and named; what is right passes."""
+"""The check of a data set: what is wrong is found, by both validators, and named; what is right passes."""
 
 import sys
 from dataclasses import replace
@@ -9,14 +9,14 @@ import pytest
 
 from helpers.box_arm import box_arm
 from helpers.motion_stores import line, random_motions, record, write_motions
-from robotdiffuse.datasets.shards import motion_of, pick_rows, problem_of, read_shard, shard_path, write_shard
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path as Motion
+from robotdiffuse.core.types import Trajectory
+from robotdiffuse.datasets.shards import motion_of, pick_rows, problem_of, read_shard, shard_path, write_shard
 from robotdiffuse.evaluation.datasets.check import KINDS, check_data
 from robotdiffuse.problems.problem import JointGoal
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.types import Path as Motion
-from robotdiffuse.core.types import Trajectory
 
 ARM = box_arm()
 BALL = Scene([Sphere([0.0, 0.9, 0.0], 0.1)])
@@ -49,7 +49,7 @@ def test_what_is_right_passes(tmp_path, pybullet):
     assert check.least_clearance == min(row["clearance"] for row in right(5))
 
 
-def test_collision_is_found_by_both_judges(tmp_path, pybullet):
+def test_collision_is_found_by_both_validators(tmp_path, pybullet):
     write_motions(tmp_path, ARM, [*right(3), record(ARM, BALL, line(AWAY, BACK))], shard=3)
     check = check_data(tmp_path, ARM)
     assert {kind: n for kind, n in check.counts.items() if n} == {"collision": 1, "pybullet": 1}
@@ -115,7 +115,7 @@ def test_twitching_is_found(tmp_path):
     assert found(tmp_path, pybullet=False) == {"motion": 1}
 
 
-def test_damaged_shard_is_named_and_the_others_are_judged(tmp_path):
+def test_damaged_shard_is_named_and_the_others_are_validated(tmp_path):
     write_motions(tmp_path, ARM, right(4), shard=2)
     chunk = next(file for file in (shard_path(tmp_path, 1) / "cost" / "c").rglob("*") if file.is_file())
     chunk.write_bytes(chunk.read_bytes()[:-1])

@@ -12,6 +12,8 @@ from scipy.integrate import quad
 from helpers.example_robots import planar_arm
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.evaluation.comscore import (
     PAPER_TABLE_1,
     Indicators,
@@ -32,8 +34,6 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.core.transforms import rotation_about, transform
-from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.validation.validator import VerifySettings, verify
 
 PANDA = load_robot("panda")
@@ -219,7 +219,7 @@ def test_figures_do_not_depend_on_the_rows_of_a_trajectory() -> None:
     )
 
 
-# The paper's criteria of success, on the Panda: each alone is what makes the judge refuse
+# The paper's criteria of success, on the Panda: each alone is what makes the validator refuse
 
 
 def panda_verdict(rows: np.ndarray, goal: PoseGoal | None = None, **settings: float) -> str:

@@ -1,4 +1,4 @@
-"""The one loop: methods take turns, what is kept is not made again; planners, networks, searches judged."""
+"""The one loop: methods take turns, what is kept is not made again; planners, networks, searches validated."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,8 +9,8 @@ import pytest
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.evaluation.methods import planned, sampled, searched
 from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, summary
 from robotdiffuse.evaluation.runs import Fields, Trial, tried
+from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, summary
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -72,7 +72,7 @@ def test_a_trial_that_is_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
     assert calls == [("x", "b", 0)]
 
 
-def test_samples_are_judged_as_they_are_and_the_shortest_that_passes_is_measured() -> None:
+def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measured() -> None:
     def draw(trial: Trial, checker: CollisionChecker) -> np.ndarray:
         middle = (START + GOAL) / 2
         bent = [np.stack([START, middle + np.array([0, 0, bend, 0, 0, 0, 0.0]), GOAL]) for bend in (0.4, 0.2)]

@@ -9,16 +9,15 @@ import pytest
 
 from helpers.factory_runs import in_this_process
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.datasets.manifest import write_manifest
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.generation import GenerationSettings, generate
-from robotdiffuse.generation import factory
+from robotdiffuse.core.types import Path
+from robotdiffuse.datasets.manifest import write_manifest
+from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.factory import manifest_of
-from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.generation.shard_maker import draw, solve
+from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.robots import load_robot
-from robotdiffuse.core.types import Path
 from robotdiffuse.validation.validator import verify
 
 SETTINGS = GenerationSettings(
@@ -69,7 +68,7 @@ def test_the_same_number_gives_the_same_row() -> None:
 
 def test_goals_a_turn_away_are_taken_the_short_way() -> None:
     """Of an arm whose joints turn twice, a seventh of the motions went the long way round, to a goal that the
-    judge did not know."""
+    validator did not know."""
     robot, far = load_robot("ur5e"), list[int]()
     settings = GenerationSettings(robot="ur5e", mix={"rop": 1.0}, target="pose", goals=1, waypoints=16)
     turning = robot.upper - robot.lower > 2 * np.pi + 0.1

@@ -17,20 +17,18 @@ from numpy import ndarray
 from helpers.clearances import least_clearance
 from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion
+from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.datasets.shards import check_shard, path_of, problem_of, read_shard
-from robotdiffuse.core.errors import InputError
-from robotdiffuse.generation import GenerationSettings, generate
-from robotdiffuse.generation import factory
+from robotdiffuse.generation import GenerationSettings, factory, generate
 from robotdiffuse.generation.shard_maker import NUMBERS, draw, make_shard
-from robotdiffuse.problems.families import family
-from robotdiffuse.problems.families import rop
+from robotdiffuse.problems.families import family, rop
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion
-from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.validation.validator import verify
 
 MIX = {"rop": 0.5, "rop_dense": 0.5}

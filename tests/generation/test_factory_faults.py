@@ -20,8 +20,7 @@ from helpers.factory_runs import (
     wait_for_shards,
 )
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.generation import GenerationSettings, generate
-from robotdiffuse.generation import factory
+from robotdiffuse.generation import GenerationSettings, factory, generate
 
 TRAJECTORIES, SHARD, WAYPOINTS = 54, 3, 16
 SHARDS = TRAJECTORIES // SHARD

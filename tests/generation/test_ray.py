@@ -14,8 +14,7 @@ from helpers.factory_runs import contents, in_this_process
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
 from robotdiffuse.evaluation.records import read_records
-from robotdiffuse.generation import GenerationSettings, generate
-from robotdiffuse.generation import factory
+from robotdiffuse.generation import GenerationSettings, factory, generate
 
 # read when ray is imported: no telemetry, and no pages of logs when a node is lost
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"

@@ -1,4 +1,4 @@
-"""A planar arm of boxes with known geometry, for the tests of collision and of the judge."""
+"""A planar arm of boxes with known geometry, for the tests of collision and of the validator."""
 
 from dataclasses import replace
 from functools import cache

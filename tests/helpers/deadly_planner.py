@@ -4,10 +4,10 @@ import os
 import signal
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
-from robotdiffuse.planning.search.rrt_connect import RRTConnect, RRTConnectSettings
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.search.rrt_connect import RRTConnect, RRTConnectSettings
+from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
 
 __all__ = ["Deadly", "RRTConnectSettings"]
@@ -18,7 +18,7 @@ class Deadly(RRTConnect):
         if robot.name == "unknown":
             raise InputError("no such robot")
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
-        if any(shape.name == "deadly" for shape in call.problem.scene.shapes):
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        if any(shape.name == "deadly" for shape in context.problem.scene.shapes):
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().solve(call, ends)
+        return super().solve(context, start_goal)

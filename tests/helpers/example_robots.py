@@ -8,9 +8,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 
-from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.core.transforms import transform
+from robotdiffuse.robots.parsing.urdf import read_urdf
+from robotdiffuse.robots.robot import Joint, Robot
 
 TIPS = {
     "panda": "panda_hand",

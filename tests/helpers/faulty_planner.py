@@ -4,11 +4,11 @@ import os
 import signal
 import time
 
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning import Entry
-from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
 
 SOLVES, RAISES, DIES, HANGS, TALKS, SEARCHES = range(6)
 
@@ -24,8 +24,8 @@ class Faulty(RRTConnect):
             os.kill(os.getpid(), signal.SIGKILL)
         while seed == HANGS:
             time.sleep(1.0)
-        call = Call(self.name, problem, time_limit, seed)
-        while seed == SEARCHES and call.remaining > -time_limit:
+        context = PlanningContext(self.name, problem, time_limit, seed)
+        while seed == SEARCHES and context.remaining > -time_limit:
             time.sleep(0.01)
         if seed == TALKS:
             print("this is no answer", flush=True)

@@ -1,4 +1,4 @@
-"""Small data sets of straight motions whose records are true, for tests of what judges and shows data."""
+"""Small data sets of straight motions whose records are true, for tests of what validates and shows data."""
 
 from pathlib import Path
 
@@ -10,8 +10,8 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.datasets.manifest import Manifest, write_manifest
 from robotdiffuse.datasets.shards import write_shard
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
 
 WAYPOINTS = 20

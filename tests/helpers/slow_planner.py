@@ -2,9 +2,9 @@
 
 import threading
 
+from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning.search.aorrtc import AORRTC
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
 
 PATIENCE = 300.0
 """[s]"""

@@ -14,12 +14,12 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from helpers.box_arm import box_arm
+from robotdiffuse.core.processes import leave
 from robotdiffuse.learning.checkpoint import write_tensors
 from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
-from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.loop import TrainingRun, Validation
-from robotdiffuse.core.processes import leave
+from robotdiffuse.learning.training.processes import Processes
 
 STEP_SECONDS = 0.3
 STOP_AFTER = 3

@@ -1,4 +1,4 @@
-"""What is exported is read again and judged the same; what others write is read, or refused in one line."""
+"""What is exported is read again and validated the same; what others write is read, or refused in one line."""
 
 import json
 import threading
@@ -14,12 +14,12 @@ import pytest
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import READERS, WRITERS, read_motion, write_motion
-from robotdiffuse.interop.recorded_motion import fitted, own_problem, recorded
 from robotdiffuse.interop.plain_messages import joint_trajectory, motion_of
+from robotdiffuse.interop.recorded_motion import fitted, own_problem, recorded
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.types import Trajectory
 from robotdiffuse.validation.validator import verify_trajectory
 
 START, GOAL = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
@@ -42,7 +42,7 @@ def planned() -> tuple[Problem, Trajectory]:
 
 
 @pytest.mark.parametrize("ending", [ending for ending in (*WRITERS, ".csv", ".json") if ending in READERS])
-def test_what_is_exported_is_read_again_and_judged_the_same(
+def test_what_is_exported_is_read_again_and_validated_the_same(
     ending: str, planned: tuple[Problem, Trajectory], tmp_path: Path
 ) -> None:
     problem, trajectory = planned
@@ -177,7 +177,7 @@ def test_joints_are_put_into_order_by_name() -> None:
     found = fitted(motion_of(record, "it"), rd.load_robot("panda"))
     assert found.motion.positions[0].tolist() == START
     assert "joints were put into the robot's order by their names" in found.notes
-    assert "no accelerations are given: those of the velocities are judged" in found.notes
+    assert "no accelerations are given: those of the velocities are validated" in found.notes
 
 
 def test_all_forms_of_messages_hold_the_same_motion() -> None:
@@ -209,7 +209,7 @@ def test_times_that_begin_later_and_no_times() -> None:
     assert recorded(["a"], [[0.0], [1.0]]).times is None
 
 
-def test_positions_and_times_alone_are_judged_on_the_smoothest_curve() -> None:
+def test_positions_and_times_alone_are_validated_on_the_smoothest_curve() -> None:
     robot, t = box_arm(), np.linspace(0, 2, 41)
     s = 10 * (t / 2) ** 3 - 15 * (t / 2) ** 4 + 6 * (t / 2) ** 5
     q = np.outer(s, [0.5, -0.4, 0.3])
@@ -272,7 +272,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: motion_of(
             {"joint_trajectory": panda_record(), "multi_dof_joint_trajectory": {"points": [{}]}}, "it"
         ),
-        "multi_dof_joint_trajectory has points; only arms on a fixed base can be judged",
+        "multi_dof_joint_trajectory has points; only arms on a fixed base can be validated",
     ),
     "two parts": (lambda: motion_of({"trajectory": [{}, {}]}, "it"), "trajectory holds 2 parts"),
     "no plan": (

@@ -14,6 +14,8 @@ from torch import Tensor, nn
 from helpers.motion_stores import random_motions, write_motions
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.registry import Entry
+from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning import checkpoint
 from robotdiffuse.learning.checkpoint import load_network
 from robotdiffuse.learning.networks import NETWORKS
@@ -22,13 +24,11 @@ from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.baseline import baseline_training, train_baseline
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.validation import motions_free
-from robotdiffuse.core.registry import Entry
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.settings import Settings
 
 
 @dataclass(frozen=True)

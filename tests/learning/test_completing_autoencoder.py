@@ -11,9 +11,9 @@ import torch
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.manifest import write_manifest
 from robotdiffuse.datasets.shards import write_shard
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import (
     fingerprint,
     load_completion,
@@ -37,10 +37,10 @@ from robotdiffuse.learning.training.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.training.completion import CompletionTraining, train_completion
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.planner import train_planner
-from robotdiffuse.planning.diffusion.diffusion import encode
-from robotdiffuse.robots import load_robot
 from robotdiffuse.perception.observed_volume import LOW, VOXEL, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.planning.diffusion.diffusion import encode
+from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 

@@ -9,8 +9,7 @@ import torch
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import load_completion, save_completion
-from robotdiffuse.learning.completion import imagine
-from robotdiffuse.learning.training.prefetch import SamplesAhead
+from robotdiffuse.learning.completion import predict
 from robotdiffuse.learning.completion.network import (
     CompletionNetwork,
     CompletionSettings,
@@ -36,10 +35,11 @@ from robotdiffuse.learning.training.completion import (
     fitted_temperature,
     train_completion,
 )
-from robotdiffuse.problems.families import FAMILIES, load_family
-from robotdiffuse.robots import load_robot
+from robotdiffuse.learning.training.prefetch import SamplesAhead
 from robotdiffuse.perception.observed_volume import SHAPE, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.problems.families import FAMILIES, load_family
+from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 
@@ -101,7 +101,7 @@ def test_what_the_network_is_told() -> None:
     np.testing.assert_allclose(planes[6], np.hypot(*np.moveaxis(voxel_centers()[..., :2], -1, 0)), atol=1e-6)
 
 
-def test_what_is_imagined_is_where_it_was_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_predicted_is_where_it_was_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
     """A small network learns one sample by heart: the voxels of its answer are those of the truth."""
     settings = replace(TINY, learning_rate=1e-2)
     trainee = training._CompletionTrainee(settings, training.Processes("cpu"))
@@ -123,7 +123,7 @@ def test_what_is_imagined_is_where_it_was_learnt(monkeypatch: pytest.MonkeyPatch
         optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < 0.3 * losses[0]
-    p = imagine(volume, trainee.module)
+    p = predict(volume, trainee.module)
     assert p.shape == tuple(2 * n for n in SHAPE) and p.dtype == np.float32
     free = volume.free.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     assert (p[free] == 0).all()
@@ -182,7 +182,7 @@ def test_temperature_and_calibration() -> None:
     )
 
 
-def test_nothing_is_imagined_where_nothing_was_learned() -> None:
+def test_nothing_is_predicted_where_nothing_was_learned() -> None:
     """Walls of the network's fancy stood a metre around the arm."""
     unknown = np.zeros((1, *SHAPE), np.uint8)
     p = load_completion().probabilities(*(torch.from_numpy(unknown) for _ in range(2))).detach().numpy()

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from helpers.box_arm import box_arm
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.cli import main
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.manifest import write_manifest
 from robotdiffuse.datasets.shards import write_shard
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.checkpoint import fingerprint, load_encoder, load_model, save_encoder
 from robotdiffuse.learning.completion.network import CompletionSettings
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
@@ -35,11 +35,11 @@ from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training.batches import Batches, load_data, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.encoder import linear_readout, train_encoder
-from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.learning.training.loop import TrainingRun
+from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.scenes.scene_arrays import SPHERE
 from robotdiffuse.perception.ray_caster import looking_at
+from robotdiffuse.scenes.scene_arrays import SPHERE
 from robotdiffuse.scenes.surface_clouds import surface_clouds
 
 SMALL_CAE = CompressionAutoencoderSettings(code=8, cloud=40, hidden=(32, 16))

@@ -11,10 +11,10 @@ from numpy import ndarray
 from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.registry import Entry
 from robotdiffuse.learning.costs import COSTS
 from robotdiffuse.learning.costs.cost import Cost
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
-from robotdiffuse.core.registry import Entry
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.motion_model import MotionModelSettings
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.transforms import transform
 
 PANDA = load_robot("panda")
 ROD = Box([0, 0, 0.3], [0.05, 0.05, 0.4], name="rod")

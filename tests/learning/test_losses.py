@@ -12,8 +12,8 @@ from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box
 
 PANDA = load_robot("panda")

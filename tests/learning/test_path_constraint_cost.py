@@ -7,8 +7,8 @@ import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.costs.path_constraints import path_constraints
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
-from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.problems.compiled_constraints import PathConstraints
+from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.robots.kinematics import link_pose
 
 PANDA, HAND = rd.load_robot("panda"), "panda_hand"

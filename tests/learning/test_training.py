@@ -20,10 +20,10 @@ from helpers.box_arm import box_arm
 from helpers.stores import WAYPOINTS as STORED
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.datasets.manifest import write_manifest
-from robotdiffuse.datasets.shards import shard_path, split_of, write_shard
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.datasets.manifest import write_manifest
+from robotdiffuse.datasets.shards import shard_path, split_of, write_shard
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors, save_encoder
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
@@ -33,8 +33,8 @@ from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoder, P
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.objectives import OBJECTIVES
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training import loop as training_run
+from robotdiffuse.learning.training import planner as training
 from robotdiffuse.learning.training import task
 from robotdiffuse.learning.training.batches import (
     Batch,
@@ -45,14 +45,14 @@ from robotdiffuse.learning.training.batches import (
 )
 from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
 from robotdiffuse.learning.training.encoder import train_encoder
+from robotdiffuse.learning.training.loop import TrainingRun, Validation
 from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.learning.training.processes import Processes
-from robotdiffuse.learning.training.loop import TrainingRun, Validation
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
-from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.scenes.surface_points import sample_surface
 
 SMALL_ENCODER = PointAutoencoderSettings(code=8, points=(16, 24), hidden=16, decoded=12)
 SMALL_DENOISER = TransformerSettings(width=32, layers=2, heads=2, hidden=48, patch=8)

@@ -7,11 +7,11 @@ import pytest
 from PIL import Image
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, transform
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.perception.depth_view_files import read_depth, read_views, view_entry
-from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_about, transform
+from robotdiffuse.scenes.surface_points import sample_surface
 
 K = (50.0, 50.0, 31.5, 23.5)
 T = transform(np.array([1.5, 0.2, 0.8]), rotation_about(np.array([0.6, 0.0, 0.8]), 1.1))

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 
 PANDA = load_robot("panda")
 HOME = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.ray_caster import FAR, DepthNoise, looking_at, ray_cast, voxels_within
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
 

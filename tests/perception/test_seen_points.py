@@ -9,15 +9,15 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import transform
+from robotdiffuse.perception.depth_view import DepthView, SeenPoints
+from robotdiffuse.perception.seen_points import ARM, BARE_RADIUS, POINT_RADIUS, VOXEL, seen_points
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.perception.seen_points import ARM, BARE_RADIUS, POINT_RADIUS, VOXEL, seen_points
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.transforms import transform
 
 PANDA = load_robot("panda")
 START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
@@ -90,10 +90,10 @@ def test_clouds_and_several_views_add_up() -> None:
 
 def test_the_scene_is_what_is_known_and_what_was_seen() -> None:
     floor = Box([0.0, 0.0, -0.05], [3.0, 3.0, 0.1], name="floor")
-    problem = Problem(PANDA, Scene([floor]), START, GOAL, views=[view(BALL_ROW)], unseen="padded")
+    problem = Problem(PANDA, Scene([floor]), START, GOAL, views=[view(BALL_ROW)], unknown="padded")
     assert [shape.name for shape in problem.scene.shapes] == ["floor", "seen"]
     assert problem.known_scene.shapes == (floor,)
-    again = replace(problem, unseen="occupied")
+    again = replace(problem, unknown="occupied")
     assert len(again.scene.shapes) == 2 and again.views == problem.views
     known = Problem(PANDA, Scene([BALL]), START, GOAL, views=[view(BALL_ROW)])
     assert known.scene.shapes == (BALL,)
@@ -109,10 +109,10 @@ def test_points_that_an_end_is_near_are_bare() -> None:
 
 
 def test_files_keep_views_and_policy(tmp_path: Path) -> None:
-    problem = Problem(PANDA, Scene(), START, GOAL, views=[view(BALL_ROW, START)], unseen="imagined")
+    problem = Problem(PANDA, Scene(), START, GOAL, views=[view(BALL_ROW, START)], unknown="predicted")
     save_problem(problem, tmp_path / "problem.json")
     for again in (load_problem(tmp_path / "problem.json"), problem_from_record(problem_record(problem))):
-        assert again.unseen == "imagined" and np.array_equal(again.views[0].depth, problem.views[0].depth)
+        assert again.unknown == "predicted" and np.array_equal(again.views[0].depth, problem.views[0].depth)
         assert np.array_equal(again.views[0].configuration, START)  # type: ignore[arg-type]
         [old], [new] = problem.scene.shapes, again.scene.shapes
         assert np.allclose(old.points, new.points)  # type: ignore[attr-defined]
@@ -122,7 +122,7 @@ def test_files_keep_views_and_policy(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"unseen": "hopeful"}, "unknown policy in unseen: 'hopeful'; known: imagined, occupied"),
+        ({"unknown": "hopeful"}, "unknown policy in unknown: 'hopeful'; known: predicted, occupied"),
         ({"views": 3}, "views is 3"),
         ({"views": [view(BALL_ROW, np.zeros(3))]}, r"views\[0\].configuration has 3 values; panda has 7"),
     ],

@@ -1,4 +1,4 @@
-"""What a call of a planner notes on the way: shorter and shorter paths, and what the judge refused."""
+"""What a call of a planner notes on the way: shorter and shorter paths, and what the validator refused."""
 
 import subprocess
 import sys
@@ -7,13 +7,13 @@ import time
 import numpy as np
 from numba import njit
 
-from robotdiffuse.planning.context import Call
+from robotdiffuse.core.types import Status
+from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search.shared_tree.planner import SharedTreeRRTStar, SharedTreeSettings
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.core.types import Status
 
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])
 
@@ -30,15 +30,15 @@ def blocked() -> Problem:
     return problem(Scene([Sphere((0.4, 0.3, 0.6), 0.15)]))
 
 
-def call_on(scene: Scene) -> Call:
-    return Call("test", problem(scene), time_limit=10.0, seed=0)
+def call_on(scene: Scene) -> PlanningContext:
+    return PlanningContext("test", problem(scene), time_limit=10.0, seed=0)
 
 
 def test_progress_falls_and_ends_with_the_returned_path() -> None:
-    call = call_on(Scene([]))
+    context = call_on(Scene([]))
     for length in (5.0, 3.0, 4.0, 0.9):  # 4 is no improvement; 0.9 is shorter than what is returned
-        call.improved(length)
-    result = call.finish(np.stack([START, turned(1.2)]), "test")
+        context.improved(length)
+    result = context.finish(np.stack([START, turned(1.2)]), "test")
     assert result is not None and result.path is not None
     lengths = [length for _, length in result.progress]
     np.testing.assert_allclose(lengths, [5.0, 3.0, 1.2])
@@ -46,26 +46,26 @@ def test_progress_falls_and_ends_with_the_returned_path() -> None:
 
 
 def test_returned_path_keeps_the_time_at_which_it_was_found() -> None:
-    call = call_on(Scene([]))
-    call.improved(1.2)
-    result = call.finish(np.stack([START, turned(1.2)]), "test")
+    context = call_on(Scene([]))
+    context.improved(1.2)
+    result = context.finish(np.stack([START, turned(1.2)]), "test")
     assert result is not None
     assert len(result.progress) == 1 and result.progress[0][0] < result.planning_time
 
 
-def test_failure_tells_what_the_judge_refused() -> None:
-    call = Call("test", blocked(), time_limit=10.0, seed=0)
-    assert call.unsolved().refused == ""
-    assert call.finish(np.stack([START, turned(1.2)]), "test") is None
-    assert call.unsolved().refused == "scene_collision"
-    assert call.finish(np.stack([START, turned(0.1)]), "test") is None
-    assert call.unsolved().refused == "goal"
+def test_failure_tells_what_the_validator_refused() -> None:
+    context = PlanningContext("test", blocked(), time_limit=10.0, seed=0)
+    assert context.unsolved().refused == ""
+    assert context.finish(np.stack([START, turned(1.2)]), "test") is None
+    assert context.unsolved().refused == "scene_collision"
+    assert context.finish(np.stack([START, turned(0.1)]), "test") is None
+    assert context.unsolved().refused == "goal"
 
 
 def test_a_search_that_ended_is_told_from_one_that_ran_out_of_time() -> None:
-    ended = Call("test", blocked(), time_limit=10.0, seed=0).unsolved()
+    ended = PlanningContext("test", blocked(), time_limit=10.0, seed=0).unsolved()
     assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
-    late = Call("test", blocked(), time_limit=1e-9, seed=0).unsolved()
+    late = PlanningContext("test", blocked(), time_limit=1e-9, seed=0).unsolved()
     assert late.status is Status.TIMEOUT and "longer time limit" in late.reason
 
 
@@ -80,12 +80,12 @@ def test_anytime_planner_reports_its_progress() -> None:
 
 def test_compiling_takes_no_time_of_the_call_and_is_noted() -> None:
     began = time.perf_counter()
-    call = call_on(Scene([]))
-    before = call.elapsed
+    context = call_on(Scene([]))
+    before = context.elapsed
     njit(lambda x: x + 1)(1)
-    waited, counted = time.perf_counter() - began, call.elapsed - before
+    waited, counted = time.perf_counter() - began, context.elapsed - before
     assert counted < 0.5 * waited
-    [note] = call.fail(Status.TIMEOUT, "").notes
+    [note] = context.fail(Status.TIMEOUT, "").notes
     assert "compiled for" in note and "does not count" in note
 
 

@@ -8,17 +8,17 @@ import pytest
 
 from helpers.box_arm import box_arm
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.start_goal import images
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import Robot
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.joint_limits import with_limits
 from robotdiffuse.robots.robot import TURNS
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
-from robotdiffuse.core.types import Path
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 
@@ -83,7 +83,7 @@ def test_images_of_a_goal() -> None:
 
 
 def test_limits_of_a_continuous_joint() -> None:
-    """The judge knows none; a file that gives some makes it revolute, and robots keep which it is."""
+    """The validator knows none; a file that gives some makes it revolute, and robots keep which it is."""
     assert Problem(ARM, Scene(), [50.0, 0.0, 0.0], [0.0, 0.0, 0.0]).start[0] == 50.0
     narrow = with_limits(ARM, {"j0": {"lower": -1.0}})
     assert (narrow.planned_joints[0].kind, narrow.lower[0], narrow.upper[0]) == ("revolute", -1.0, np.pi)

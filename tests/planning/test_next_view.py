@@ -7,13 +7,13 @@ import pytest
 
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+from robotdiffuse.perception.visibility_kernel import seen_weights
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.next_view import next_view, poses_around
-from robotdiffuse.perception.visibility_kernel import seen_weights
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots import load_robot
-from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.planning import PLANNERS, SEARCH
-from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.types import Status
+from robotdiffuse.planning import PLANNERS, SEARCH
+from robotdiffuse.planning.search.rrt_connect import RRTConnect
 
 PANDA = rd.load_robot("panda")
 LEFT = np.array([0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])

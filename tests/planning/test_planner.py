@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS, SEARCH, load_planner
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 START = np.array([0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785])

@@ -15,16 +15,16 @@ from helpers.made_arms import chain, row, written
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import rotation_angle, transform
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning.pose_goals import reaching
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
 from robotdiffuse.problems.goals import PoseGoal, PosesGoal
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.parsing.urdf import read_urdf
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.validation.tolerances import goal_error
-from robotdiffuse.core.transforms import rotation_angle, transform
-from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify
 
 HANDS = ("left_gripper", "right_gripper")
@@ -89,7 +89,7 @@ def test_links_that_share_a_joint_are_brought_there_together(tmp_path: Path) -> 
     assert ((found >= robot.lower) & (found <= robot.upper)).all()
 
 
-def test_tolerances_of_each_pose_are_used_and_judged() -> None:
+def test_tolerances_of_each_pose_are_used_and_validated() -> None:
     start, there = free()[:2]
     goal = poses_at(baxter(), there, HANDS, [0.05, 0.05, 0.0], [0.0, 0.0, np.pi])
     problem = rd.Problem(baxter(), rd.Scene([TABLE]), start, goal)
@@ -98,7 +98,7 @@ def test_tolerances_of_each_pose_are_used_and_judged() -> None:
     assert max(off(baxter(), goal, q) for q in found) > 0.1, "not the very poses alone"
 
 
-def test_the_judge_names_the_hand_that_is_elsewhere() -> None:
+def test_the_validator_names_the_hand_that_is_elsewhere() -> None:
     (problem, goal), (start, there) = both_hands(), free()[:2]
     left_only = np.where([name.startswith("left") for name in baxter().joint_names], there, start)
     found = verify(problem, JointPath(baxter().joint_names, np.stack([start, left_only]))).violation

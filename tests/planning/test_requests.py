@@ -12,12 +12,12 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.perception.ray_caster import looking_at, ray_cast
 from robotdiffuse.planning import PLANNERS, load_planner
 from robotdiffuse.planning.planner import ABLE, CLEARANCE, CONSTRAINTS, Planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 PANDA = rd.load_robot("panda")
@@ -62,7 +62,7 @@ def _seen() -> Problem:
         PANDA,
         START,
     )
-    return Problem(PANDA, rd.Scene(), START, GOAL, views=[view], unseen="padded")
+    return Problem(PANDA, rd.Scene(), START, GOAL, views=[view], unknown="padded")
 
 
 ASKED: dict[str, Asked] = {

@@ -12,14 +12,14 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import inverse, rotation_about, rotation_angle, transform
 from robotdiffuse.problems import constraint_kernel as kernel
+from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
-from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.transforms import inverse, rotation_about, rotation_angle, transform
 
 PANDA = rd.load_robot("panda")
 START = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])

@@ -13,14 +13,14 @@ from scipy.spatial.transform import Rotation
 
 import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import inverse, rotation_from_rpy, rpy_from_rotation, transform
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.core.types import Status, Trajectory
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
 from robotdiffuse.problems.goals import AnyGoal, JointGoal, PoseGoal
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.validation.tolerances import goal_error
-from robotdiffuse.core.transforms import inverse, rotation_from_rpy, rpy_from_rotation, transform
-from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.core.types import Status, Trajectory
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 ROBOT = rd.load_robot("panda")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.problems.held_out import (
     Case,
     CaseFile,
@@ -15,19 +16,18 @@ from robotdiffuse.problems.held_out import (
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.types import Path as Motion
 
 
 class Referee:
     """Passes the line of every third problem; its search fails on every fifth."""
 
     def __init__(self) -> None:
-        self.judged: list[Problem] = []
+        self.validated: list[Problem] = []
         self.searched: list[Problem] = []
         self.numbers = {held_out_problem("rop", i).start.tobytes(): i for i in range(12)}
 
-    def judge(self, problem: Problem, path: Motion) -> bool:
-        self.judged.append(problem)
+    def validator(self, problem: Problem, path: Motion) -> bool:
+        self.validated.append(problem)
         assert len(path.positions) == 2
         return self.numbers[problem.start.tobytes()] % 3 == 0
 
@@ -44,15 +44,15 @@ def names(cases: list[Case]) -> list[str]:
 @pytest.mark.parametrize("kept", [True, False])
 def test_one_rule(tmp_path: Path, kept: bool) -> None:
     referee, cases = Referee(), CaseFile(tmp_path / "a" / "rop.jsonl" if kept else None)
-    hard = cases.held_out("rop", 4, referee.judge, referee.search)
+    hard = cases.held_out("rop", 4, referee.validator, referee.search)
     assert names(hard) == ["rop/1", "rop/2", "rop/4", "rop/7"]
     assert [case.reference for case in hard] == [1.0, 2.0, 4.0, 7.0]
     assert all(case.hard and not case.trivial and case.family == "rop" for case in hard)
-    every = cases.held_out("rop", 8, referee.judge)
+    every = cases.held_out("rop", 8, referee.validator)
     assert [case.trivial for case in every] == [i % 3 == 0 for i in range(8)]
     assert [case.hard for case in every] == [i in (1, 2, 4, 7) for i in range(8)]
     assert every[5].reference is None and every[6].reference == pytest.approx(
-        line_length(every[6].problem, referee.judge)
+        line_length(every[6].problem, referee.validator)
     )
     for i, case in enumerate(every):
         assert np.array_equal(case.problem.start, held_out_problem("rop", i).start)
@@ -60,26 +60,26 @@ def test_one_rule(tmp_path: Path, kept: bool) -> None:
 
 def test_goes_on_with_what_is_known(tmp_path: Path) -> None:
     file, first, second = tmp_path / "rop.jsonl", Referee(), Referee()
-    CaseFile(file).held_out("rop", 5, first.judge)
-    assert len(first.judged) == 5 and not first.searched
-    hard = CaseFile(file).held_out("rop", 4, second.judge, second.search)
+    CaseFile(file).held_out("rop", 5, first.validator)
+    assert len(first.validated) == 5 and not first.searched
+    hard = CaseFile(file).held_out("rop", 4, second.validator, second.search)
     assert names(hard) == ["rop/1", "rop/2", "rop/4", "rop/7"]
-    assert len(second.judged) == 3, "numbers 5, 6 and 7"
+    assert len(second.validated) == 3, "numbers 5, 6 and 7"
     assert len(second.searched) == 5, "numbers 1, 2, 4, 5 and 7"
     third = Referee()
-    assert names(CaseFile(file).held_out("rop", 4, third.judge, third.search)) == names(hard)
-    assert not third.judged and not third.searched
+    assert names(CaseFile(file).held_out("rop", 4, third.validator, third.search)) == names(hard)
+    assert not third.validated and not third.searched
     assert names(CaseFile(file).cases(hard=True)) == names(hard)
 
 
 def test_line_that_was_cut_off_is_made_again(tmp_path: Path) -> None:
     file, referee = tmp_path / "rop.jsonl", Referee()
-    whole = CaseFile(file).held_out("rop", 3, referee.judge)
+    whole = CaseFile(file).held_out("rop", 3, referee.validator)
     text = file.read_text()
     file.write_text(text[:-20])
-    again = CaseFile(file).held_out("rop", 3, referee.judge)
+    again = CaseFile(file).held_out("rop", 3, referee.validator)
     assert names(again) == names(whole) and file.read_text() == text
-    assert len(referee.judged) == 4
+    assert len(referee.validated) == 4
 
 
 def test_damaged_lines_are_named(tmp_path: Path) -> None:

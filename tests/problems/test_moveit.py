@@ -11,6 +11,13 @@ import trimesh
 import yaml
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.input_files import read_yaml
+from robotdiffuse.core.transforms import (
+    quaternion_from_rotation,
+    rotation_about,
+    rotation_from_quaternion,
+    transform,
+)
 from robotdiffuse.problems.files import load_motion_bench_maker, load_problems, problem_record
 from robotdiffuse.problems.moveit import (
     MoveItFrames,
@@ -20,18 +27,11 @@ from robotdiffuse.problems.moveit import (
     read_moveit_scene,
 )
 from robotdiffuse.problems.problem import JointGoal, PoseGoal
-from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.robots import Robot, load_robot
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.parsing.urdf import read_urdf
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
-from robotdiffuse.core.transforms import (
-    quaternion_from_rotation,
-    rotation_about,
-    rotation_from_quaternion,
-    transform,
-)
 
 FOLDER = Path(__file__).parents[1] / "files" / "motion_bench_maker"
 Z = np.array([0.0, 0.0, 1.0])

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.problems.files import (
     load_problem,
     load_problems,
@@ -24,7 +25,6 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
-from robotdiffuse.core.transforms import rotation_about, transform
 
 Z = np.array([0.0, 0.0, 1.0])
 READY = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]

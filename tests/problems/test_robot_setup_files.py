@@ -11,11 +11,11 @@ import robotdiffuse as rd
 from robotdiffuse.cli import main
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import inverse, rotation_about, transform
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.shapes import Shape
-from robotdiffuse.core.transforms import inverse, rotation_about, transform
 from robotdiffuse.validation.validator import verify
 
 START, GOAL = [-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2], [0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2]

@@ -8,10 +8,10 @@ import pytest
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families.rop import ROP, Rop
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
-from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
+from robotdiffuse.scenes.surface_points import VisibleRegion, sample_surface
 
 FLOOR = 1
 

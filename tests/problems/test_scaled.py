@@ -11,8 +11,8 @@ from robotdiffuse.problems.files import problem_record
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.scaling import reach, scaled
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 SMALL, EMPTY = load_robot("so101"), Scene([])
 

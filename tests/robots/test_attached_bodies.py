@@ -11,15 +11,15 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm, box_mesh
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.robots.bodies import ConvexMesh
+from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.fitting.convex_parts import convex_hull, planes_of
 from robotdiffuse.robots.fitting.covering_spheres import MOST, cover
-from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Shape
-from robotdiffuse.core.transforms import rotation_about, transform
 
 rng = np.random.default_rng(0)
 CLOUD = rng.normal(size=(40, 3)) * [0.05, 0.03, 0.1]

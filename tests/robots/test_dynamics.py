@@ -10,14 +10,14 @@ import pytest
 import robotdiffuse as rd
 from helpers.example_robots import urdf_file
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
-from robotdiffuse.robots.dynamics import GRAVITY, Dynamics
-from robotdiffuse.robots.inertias import Payload, inertia_of
-from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.core.types import Status
+from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
+from robotdiffuse.robots.dynamics import GRAVITY, Dynamics
+from robotdiffuse.robots.inertias import Payload, inertia_of
+from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 pinocchio: Any = pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
@@ -82,7 +82,7 @@ def test_motions_with_a_payload_are_slower_and_keep_the_limits() -> None:
     assert durations[0] < durations[2]
 
 
-def test_the_judge_names_joint_torque_and_limit() -> None:
+def test_the_validator_names_joint_torque_and_limit() -> None:
     free = rd.Problem(PANDA, rd.Scene(), LOW, FAR)
     result = rd.plan(free, time_limit=10.0)
     assert result.trajectory is not None

@@ -15,26 +15,25 @@ from helpers.example_robots import example_robot
 from helpers.made_arms import chain, row, written
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.certificates.constraints import kept
-from robotdiffuse.cli import main
-from robotdiffuse.cli import plan
+from robotdiffuse.cli import main, plan
 from robotdiffuse.cli.console import Waiting
 from robotdiffuse.cli.plan import solve
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernel_arrays import reach_bound
 from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.collision.kernel_arrays import reach_bound
 from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.context import Call
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
-from robotdiffuse.robots.fitting.covering_spheres import cover
+from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.robots.fingerprint import robot_fingerprint
+from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.inertias import Payload, inertia_of
 from robotdiffuse.robots.inverse_kinematics import inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.scaling import reach
 from robotdiffuse.robots.parsing.srdf import read_srdf
 from robotdiffuse.robots.parsing.urdf import read_urdf
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.scaling import reach
 
 PARTS = chain("base", ["waist"]), chain("waist_link", row("left_", 4)), chain("waist_link", row("right_", 4))
 
@@ -243,7 +242,7 @@ def test_the_first_robot_of_several_arms_compiles_which_is_said_and_takes_no_tim
     problem = rd.Problem(robot=robot, scene=rd.Scene(), start=q, goal=q)
     solve(problem, "rrt_connect", time_limit=20.0)
     assert "the first robot of several arms compiles first" in shown[0]
-    began, call = time.perf_counter(), Call("test", problem, time_limit=20.0, seed=0)
+    began, call = time.perf_counter(), PlanningContext("test", problem, time_limit=20.0, seed=0)
     before = call.elapsed
     njit(lambda parents: parent_of(parents, 3))(robot.branching)
     waited = time.perf_counter() - began

@@ -5,8 +5,8 @@ import pytest
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
 
 FLOOR = Box([0, 0, -0.05], [2, 2, 0.1], name="floor")

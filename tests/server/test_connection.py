@@ -19,11 +19,10 @@ pytest.importorskip("fastapi")
 from uvicorn import Config
 from uvicorn.server import ServerState
 
-from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.server import connection
-from robotdiffuse.server import worker
+from robotdiffuse.server import connection, worker
 from robotdiffuse.server.connection import Connection
 
 
@@ -211,7 +210,7 @@ def test_a_call_is_left_when_it_looks_at_its_clock(monkeypatch: pytest.MonkeyPat
     worker.accept({}, 1.0, shared)
 
     def planning(*_: object) -> worker.Answer:
-        call = Call("aorrtc", Problem(box_arm(), Scene(), np.zeros(3), np.ones(3)), 1.0, 0)
+        call = PlanningContext("aorrtc", Problem(box_arm(), Scene(), np.zeros(3), np.ones(3)), 1.0, 0)
         assert call.remaining > 0
         shared.cancelled = 7
         assert call.remaining > 0

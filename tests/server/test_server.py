@@ -67,7 +67,7 @@ def error(answer: httpx.Response) -> str:
     return line
 
 
-def test_a_plan_is_that_of_the_bare_planner_and_the_judge_agrees(server: httpx.Client) -> None:
+def test_a_plan_is_that_of_the_bare_planner_and_the_validator_agrees(server: httpx.Client) -> None:
     answer = server.post("/plan", json=asked(3))
     assert answer.status_code == 200
     record = answer.json()

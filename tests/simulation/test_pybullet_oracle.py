@@ -1,4 +1,4 @@
-"""PyBullet, which shares no code with ours, must agree with Coal and with the judge."""
+"""PyBullet, which shares no code with ours, must agree with Coal and with the validator."""
 
 import numpy as np
 import pytest
@@ -12,6 +12,7 @@ from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
@@ -19,7 +20,6 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
 from robotdiffuse.simulation import PyBulletOracle
 from robotdiffuse.simulation.world import World
-from robotdiffuse.core.types import Path
 from robotdiffuse.validation.validator import verify
 
 TOLERANCE = 7e-4
@@ -97,7 +97,7 @@ def test_locked_joints_reach_pybullet() -> None:
             assert oracle.distance(row) == pytest.approx(right, abs=TOLERANCE)
 
 
-def test_paths_that_the_judge_accepts_or_refuses() -> None:
+def test_paths_that_the_validator_accepts_or_refuses() -> None:
     robot, rng = box_arm(), np.random.default_rng(5)
     scene = Scene([Sphere(vector(0.7, 0.5, 0), 0.15), Box(vector(-0.5, -0.4, 0), vector(0.1, 0.2, 0.3))])
     verdicts = []

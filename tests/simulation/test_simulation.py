@@ -16,20 +16,30 @@ from helpers.box_arm import box_arm, box_mesh
 from helpers.example_robots import example_robot
 from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.trajectories.timing import time_parameterize
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Status, Trajectory
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import ConvexMesh, Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
-from robotdiffuse.simulation import DepthCamera, FilmSettings, PyBulletOracle, ReplaySettings, World, point_cloud, render, write_gif, write_png
-from robotdiffuse.simulation import replay
+from robotdiffuse.simulation import (
+    DepthCamera,
+    FilmSettings,
+    PyBulletOracle,
+    ReplaySettings,
+    World,
+    point_cloud,
+    render,
+    replay,
+    write_gif,
+    write_png,
+)
 from robotdiffuse.simulation.model import mass_properties
 from robotdiffuse.simulation.replay import sample
-from robotdiffuse.core.types import Path, Status, Trajectory
+from robotdiffuse.trajectories.timing import time_parameterize
 
 EYE = (1.5, -1.2, 1.4)
 CAMERA = DepthCamera(EYE, (0.0, 0.0, 0.4))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.planning.reactive.timed_path import Course, Speeds
+from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 
 PANDA = rd.load_robot("panda")
 

@@ -8,16 +8,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.trajectories.corner_rounding import DEVIATION, BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import TimingSettings
 from robotdiffuse.trajectories.timing import SAME, time_parameterize
 from robotdiffuse.validation.rates import RateTolerances, wrong_rates
-from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.core.types import Path, Trajectory
 
 VELOCITY = (2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61)
 ACCELERATION = (15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0)
-JUDGES = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
+VALIDATOR = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
 
 
 def arm(velocity: tuple[float, ...] = VELOCITY, acceleration: tuple[float, ...] = ACCELERATION) -> Robot:
@@ -172,7 +172,7 @@ def test_rows_of_the_shortest_pieces_agree(size: float) -> None:
     q[1:, 0], q[2:, 2], q[3, 1] = 1.0, size, 1.0
     for accept in (never, always):
         t = time_parameterize(robot, path(robot, q), accept, accept)
-        assert wrong_rates(robot, t, JUDGES) == []
+        assert wrong_rates(robot, t, VALIDATOR) == []
 
 
 def test_only_the_corner_that_fails_is_tightened() -> None:

@@ -5,12 +5,12 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
+from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.validation.torques import Pieces, first_beyond, pieces_held, pieces_of
-from robotdiffuse.core.types import Path as JointPath
-from robotdiffuse.core.types import Trajectory
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
@@ -49,7 +49,7 @@ def test_bounds_of_what_bends_most_are_near() -> None:
 
 @pytest.mark.parametrize(("effort", "valid"), [(9.70, False), (9.73, True)])
 def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
-    """It bears 9.81 N m where it is level, which no row is; the judge allows a hundredth more."""
+    """It bears 9.81 N m where it is level, which no row is; the validator allows a hundredth more."""
     robot = pendulum(effort)
     path = JointPath(("hinge",), np.array([[0.3], [2.84], [2.9]]))
     problem = Problem(robot, rd.Scene(), path.positions[0], path.positions[-1], payload=Payload(0.0))

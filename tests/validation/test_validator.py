@@ -1,4 +1,4 @@
-"""The judge: what it must refuse, what it must accept, and that its certificate holds."""
+"""The validator: what it must refuse, what it must accept, and that its certificate holds."""
 
 from dataclasses import replace
 from typing import Any
@@ -13,14 +13,14 @@ from helpers.box_arm import box_arm
 from robotdiffuse.collision import exact_meshes as exact_collision
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.core.transforms import rotation_about, transform
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.validation.validator import (
     Report,
     VerifySettings,
@@ -38,7 +38,7 @@ def vector(*values: float) -> np.ndarray:
     return np.array(values, float)
 
 
-def judge(rows: np.ndarray, *shapes: Shape, robot: Robot | None = None, **settings: float) -> Report:
+def validator(rows: np.ndarray, *shapes: Shape, robot: Robot | None = None, **settings: float) -> Report:
     """The verdict on a path whose problem asks for its own first and last waypoint."""
     robot = robot or box_arm()
     problem = Problem(robot, Scene(shapes), rows[0], JointGoal(rows[-1:]))
@@ -67,7 +67,7 @@ SWING = np.array([[-0.6, 0.2, 0.3], [0.6, 0.2, 0.3]])
 
 def test_a_free_motion_is_accepted_with_a_certified_clearance() -> None:
     shapes = (Sphere(vector(1.3, 0.3, 0), 0.1), Sphere(vector(0, -1, 0), 0.2))
-    report = judge(SWING, *shapes)
+    report = validator(SWING, *shapes)
     assert report.valid
     assert report.violation is None
     exact = ExactCollision(
@@ -85,14 +85,14 @@ def test_a_free_motion_is_accepted_with_a_certified_clearance() -> None:
 
 
 def test_an_empty_scene_and_a_motion_of_one_waypoint() -> None:
-    report = judge(np.zeros((1, 3)))
+    report = validator(np.zeros((1, 3)))
     assert report.valid
     assert report.min_clearance is not None
     assert 0.2 < report.min_clearance < 0.4
     assert report.scene_clearance == pytest.approx(1.0, abs=1e-4)
     assert report.self_clearance == report.min_clearance
-    refused(judge(vector(1, 2.6, 2.6)[None]), "self_collision")
-    assert judge(np.zeros((3, 3))).valid
+    refused(validator(vector(1, 2.6, 2.6)[None]), "self_collision")
+    assert validator(np.zeros((3, 3))).valid
 
 
 @given(st.floats(0.02, 0.98), st.floats(0.25, 1.1), st.floats(0.0005, 0.01), st.integers(0, 3), st.booleans())
@@ -108,7 +108,7 @@ def test_a_thin_wall_between_two_waypoints_is_found(
     half = np.arctan2(0.03 + thickness / 2, reach - 0.1)
     if np.abs(angle - rows[[0, -1], 0]).min() < half:
         return
-    found = refused(judge(rows, wall, robot=box_arm(spheres)), "scene_collision")
+    found = refused(validator(rows, wall, robot=box_arm(spheres)), "scene_collision")
     assert found.other == "box"
     exact = ExactCollision(box_arm(), Scene([wall]))
     q, at = dense(rows, 1e-3)
@@ -139,7 +139,7 @@ def scenes(draw: st.DrawFn) -> list[Shape]:
 def test_the_certificate_agrees_with_dense_sampling(shapes: list[Shape], seed: int, count: int) -> None:
     rng, robot = np.random.default_rng(seed), box_arm()
     rows = rng.uniform(-2, 2, (1, 3)) + rng.uniform(-0.8, 0.8, (count, 3))
-    report = judge(rows, *shapes)
+    report = validator(rows, *shapes)
     exact = ExactCollision(robot, Scene(shapes))
     q, at = dense(rows, 2e-3)
     hits = exact.collides(q)
@@ -170,7 +170,7 @@ def test_the_first_of_two_collisions_is_reported() -> None:
         Sphere(1.1 * vector(np.cos(a), np.sin(a), 0), 0.05, name) for a, name in ((0.1, "b"), (0.5, "a"))
     )
     rows = np.array([[-0.6, 0, 0], [0.2, 0, 0], [1.0, 0, 0]])
-    forward, backward = judge(rows, early, late), judge(rows[::-1].copy(), early, late)
+    forward, backward = validator(rows, early, late), validator(rows[::-1].copy(), early, late)
     assert refused(forward, "scene_collision").other == "b"
     assert refused(backward, "scene_collision").other == "a"
     found = refused(forward, "scene_collision")
@@ -185,22 +185,22 @@ def test_a_contact_with_two_obstacles_at_once_has_a_depth() -> None:
     """The nearer of two that the arm starts in, whichever the search met first."""
     deep, shallow = Sphere(vector(1.1, 0.02, 0), 0.1, "deep"), Sphere(vector(1.15, 0.12, 0), 0.1, "shallow")
     for shapes in ((deep, shallow), (shallow, deep)):
-        found = refused(judge(np.array([[0, 0, 0], [-0.5, 0, 0]]), *shapes), "scene_collision")
+        found = refused(validator(np.array([[0, 0, 0], [-0.5, 0, 0]]), *shapes), "scene_collision")
         assert (found.time, found.subject, found.other) == (0, "l3", "deep")
         assert found.excess == pytest.approx(0.11, abs=0.003)
 
 
 def test_self_collision_between_waypoints() -> None:
     rows = np.array([[0, 2.7, 1.0], [0, 2.7, 2.7]])
-    found = refused(judge(rows), "self_collision")
+    found = refused(validator(rows), "self_collision")
     assert {found.subject, found.other} == {"l1", "l3"}
     assert 0 < found.time < 1
     allowed = frozenset({*box_arm().allowed_collisions, frozenset(("l1", "l3"))})
-    assert judge(rows, robot=replace(box_arm(), allowed_collisions=allowed)).valid
+    assert validator(rows, robot=replace(box_arm(), allowed_collisions=allowed)).valid
 
 
 def meshes_asked(*shapes: Shape) -> int:
-    """How many distances Coal is asked for to judge the swing among these."""
+    """How many distances Coal is asked for to validate the swing among these."""
     asked: list[int] = []
 
     class Counting(ExactCollision):
@@ -210,7 +210,7 @@ def meshes_asked(*shapes: Shape) -> int:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exact_collision, "ExactCollision", Counting)
-        judge(SWING, *shapes)
+        validator(SWING, *shapes)
     return sum(asked)
 
 
@@ -219,19 +219,19 @@ def test_meshes_decide_where_spheres_are_too_coarse() -> None:
     sides = trimesh.creation.box(shelf.size)
     surface = Mesh(np.asarray(sides.vertices), np.asarray(sides.faces), shelf.center)
     for shape, by_coal in ((shelf, False), (surface, True)):
-        report = judge(SWING, shape)
+        report = validator(SWING, shape)
         assert report.valid
         assert bool(meshes_asked(shape)) == by_coal
         assert report.min_clearance is not None
         assert 0.001 <= report.min_clearance <= 0.002
     touching = Box(vector(0.6, 0, -0.03005 - 0.05), vector(1.5, 1.5, 0.1))
-    assert refused(judge(SWING, touching), "scene_collision").time == 0
-    assert judge(SWING[:1], touching, contact=1e-5).valid
+    assert refused(validator(SWING, touching), "scene_collision").time == 0
+    assert validator(SWING[:1], touching, contact=1e-5).valid
 
 
 def test_a_clear_motion_needs_no_meshes() -> None:
     far = Sphere(vector(-1, 0, 0), 0.2)
-    assert judge(SWING, far).valid
+    assert validator(SWING, far).valid
     assert meshes_asked(far) == 0
 
 
@@ -309,9 +309,9 @@ def test_twitching(spacing: float) -> None:
     there = np.linspace(0, 0.3, round(0.3 / spacing), endpoint=False)
     along = np.concatenate([there, 0.3 - there, there, 0.3 - there, there, [0.3]])
     rows = np.column_stack([along, np.zeros((len(along), 2))])
-    assert "4 sharp reversals" in refused(judge(rows), "twitch").message
-    assert judge(rows, reversals=4).valid
-    assert judge(rows * 0.1).valid
+    assert "4 sharp reversals" in refused(validator(rows), "twitch").message
+    assert validator(rows, reversals=4).valid
+    assert validator(rows * 0.1).valid
 
 
 def trajectory(duration: float) -> Trajectory:
@@ -432,7 +432,7 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     assert not wrong
 
 
-def test_rows_far_apart_are_judged_as_controllers_move_between_them() -> None:
+def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None:
     """Out and back within one step: the rows stand in one place, the arm does not."""
     robot = box_arm()
     rows = np.zeros((4, 3))

@@ -12,16 +12,16 @@ from PIL import Image
 from helpers.visual_bundles import visual_meshes, write_visual
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.transforms import transform
+from robotdiffuse.core.types import Path, Status, Trajectory
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 from robotdiffuse.robots.visual_meshes import VisualMesh, load_visual
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Sphere
-from robotdiffuse.core.transforms import transform
-from robotdiffuse.core.types import Path, Status, Trajectory
 from robotdiffuse.visualization import PictureSettings, write_picture, write_replay
-from robotdiffuse.visualization.style import creased, decimated, dense, robot_surfaces, tool_point, trace
 from robotdiffuse.visualization.picture import render
+from robotdiffuse.visualization.style import creased, decimated, dense, robot_surfaces, tool_point, trace
 
 SMALL = PictureSettings(width=320, height=200, ghosts=2)
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)])

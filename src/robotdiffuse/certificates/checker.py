@@ -1,4 +1,4 @@
-"""The checker: is what a certificate says so? It searches for nothing, and shares no code with the judge.
+"""The checker: is what a certificate says so? It searches for nothing, and shares no code with the validator.
 
 Every claim that the robot gives rise to must be there, its stretches must cover the motion without a gap, and
 of each the clearance and the displacement are worked out anew: they must be what the certificate says, and
@@ -12,7 +12,6 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import CAP, SCENE, Claim, Prover
-from robotdiffuse.certificates.proof import AGREEMENT, Certificate, Proof, Tolerances
 from robotdiffuse.certificates.content import (
     differences,
     motion_hash,
@@ -21,12 +20,13 @@ from robotdiffuse.certificates.content import (
     scene_parts,
 )
 from robotdiffuse.certificates.moving_obstacles import MovingProver
+from robotdiffuse.certificates.proof import AGREEMENT, Certificate, Proof, Tolerances
 from robotdiffuse.certificates.requests import configurations, wrong
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.problems.problem import Problem
 
-JUDGE = Tolerances()
+VALIDATOR = Tolerances()
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,15 @@ class Findings:
         return not self.differences
 
 
-def check(certificate: Certificate, problem: Problem | None = None, at_most: Tolerances = JUDGE) -> Findings:
+def check(
+    certificate: Certificate, problem: Problem | None = None, at_most: Tolerances = VALIDATOR
+) -> Findings:
     """Re-check a certificate for a problem, by default the one that it holds, made with tolerances of at most
     these.
 
     Robot, scene and motion must be those that were certified, by content; the motion must keep the limits,
     begin at the start and end at the goal; and every stretch must be proved. Stops at waypoints, twitching,
-    and whether rates agree with positions beyond their limits are left to the judge. Raises InputError for a
+    and whether rates agree with positions beyond their limits are left to the validator. Raises InputError for a
     certificate without a problem where none is given, and for shapes that certificates do not know.
     """
     if problem is None:

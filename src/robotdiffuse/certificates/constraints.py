@@ -15,10 +15,10 @@ from numpy import ndarray
 
 from robotdiffuse.certificates.kinematics import Linkage, Postures, cross_matrix
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.problems.constraints import AxisCone, CartesianLine, Constraint, OnPlane, PositionBox
 from robotdiffuse.problems.goals import JointGoal, poses_of
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.types import Trajectory
 
 
 class Kept(NamedTuple):

@@ -1,6 +1,6 @@
 """Where links are, and how far they can go from there: the checker's own kinematics, in NumPy.
 
-It reads a robot's joints and nothing that searches or the judge make of them.
+It reads a robot's joints and nothing that searches or the validator make of them.
 """
 
 from functools import cached_property

@@ -8,9 +8,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
-from robotdiffuse.core.transforms import rotation_from_quaternion
 
 CAP = 1.0
 """Clearances are not told apart beyond this [m]."""

@@ -13,8 +13,8 @@ from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import SCENE, Claim, Part, Plane, Prover, Stretches, gaps, placed
 from robotdiffuse.certificates.obstacles import Rounded, Surface
-from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.core.transforms import transform
+from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 
 MOST_PLANES = 64
 """Of a part and a surface: concave ones need several."""

@@ -13,8 +13,8 @@ from numpy import ndarray
 from robotdiffuse.certificates.bounds import Claim, Plane, Stretches
 from robotdiffuse.core.bounds import FASTEST, numbers, within
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.input_files import read_json
+from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.types import Path, Trajectory
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ FIELDS = ("claims", "start", "stop", "by_planes", "clearance", "displacement", "
 
 @dataclass(frozen=True)
 class Tolerances:
-    """How exactly a motion was judged, as of `VerifySettings`, whose defaults these are."""
+    """How exactly a motion was validated, as of `VerifySettings`, whose defaults these are."""
 
     limit_slack: float = 1e-6
     """[rad] or [m]"""
@@ -101,7 +101,7 @@ class Certificate:
 
     def check(self, problem: "Problem | None" = None, at_most: Tolerances | None = None) -> "Findings":
         """Re-check everything for a problem, by default the one that is in here, with tolerances of at most
-        these, by default the judge's. See `checker.check`."""
+        these, by default the validator's. See `checker.check`."""
         from robotdiffuse.certificates.checker import check
 
         return check(self, problem, at_most or Tolerances())

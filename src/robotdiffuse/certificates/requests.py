@@ -6,15 +6,15 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.certificates.proof import AGREEMENT, Certificate, Tolerances
 from robotdiffuse.certificates.constraints import kept, too_fast
 from robotdiffuse.certificates.kinematics import Linkage
+from robotdiffuse.certificates.proof import AGREEMENT, Certificate, Tolerances
 from robotdiffuse.certificates.torques import most_torques
 from robotdiffuse.core.errors import joined
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.types import Path, Trajectory
 
 
 def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> Float[ndarray, "n dof"]:

@@ -1,6 +1,6 @@
 """Writing certificates: the search for a proof that the checker can re-check without one.
 
-A motion that the judge calls valid is cut, for each claim apart, until every stretch is proved by the bounds
+A motion that the validator calls valid is cut, for each claim apart, until every stretch is proved by the bounds
 that the checker uses. Where spheres are too coarse, planes are laid through the middle between the nearest
 points of convex bodies, which Coal finds.
 """
@@ -13,21 +13,21 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import CAP, SCENE, Plane, Prover, Stretches
-from robotdiffuse.certificates.proof import DECIMALS, Certificate, Proof, Tolerances
 from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.constraints import kept
 from robotdiffuse.certificates.content import request_parts, robot_parts, scene_parts
 from robotdiffuse.certificates.moving_obstacles import MovingProver
 from robotdiffuse.certificates.planes import PlaneFinder
+from robotdiffuse.certificates.proof import DECIMALS, Certificate, Proof, Tolerances
 from robotdiffuse.certificates.requests import configurations, not_covered
 from robotdiffuse.certificates.torques import most_torques
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.validation.validator import DEFAULT, VerifySettings, verify, verify_trajectory
 
 SHARE = 0.5
-"""Of the clearances that the judge certifies: what the certificate proves. More takes more stretches."""
+"""Of the clearances that the validator certifies: what the certificate proves. More takes more stretches."""
 MOST_PARTS = 8
 """A stretch is cut into at most this many at a time."""
 PLANES_BELOW = 0.02
@@ -47,9 +47,9 @@ class NotValidError(InputError):
 
 
 def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT) -> Certificate:
-    """A certificate for a motion that the judge calls valid.
+    """A certificate for a motion that the validator calls valid.
 
-    Raises `NotValidError`, an InputError, with what the judge found if it does not; and InputError for
+    Raises `NotValidError`, an InputError, with what the validator found if it does not; and InputError for
     obstacles and requests that certificates do not know, and where no proof is found in reasonable size.
     """
     beside = not_covered(problem, motion)
@@ -57,8 +57,8 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         raise InputError(
             f"the problem has {', '.join(beside)}, which certificates do not prove anything about"
         )
-    judge = verify_trajectory if isinstance(motion, Trajectory) else verify
-    report = judge(problem, motion, settings)  # type: ignore[arg-type]
+    validator = verify_trajectory if isinstance(motion, Trajectory) else verify
+    report = validator(problem, motion, settings)  # type: ignore[arg-type]
     if report.violation is not None:
         raise NotValidError(
             f"the motion is not valid: {report.violation.message} (at {report.violation.time:.3f})"

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.certificates.kinematics import Linkage
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.inertias import Inertia
-from robotdiffuse.core.types import Path, Trajectory
 
 GRAVITY = 9.81
 """Along -z of the world [m/s²]."""

@@ -10,18 +10,20 @@ from contextlib import suppress
 from typing import NoReturn
 
 from robotdiffuse import __version__
-from robotdiffuse.cli import bench
-from robotdiffuse.cli import data
-from robotdiffuse.cli import interop
-from robotdiffuse.cli import live
-from robotdiffuse.cli import plan
-from robotdiffuse.cli import planners
-from robotdiffuse.cli import robot
-from robotdiffuse.cli import serve
-from robotdiffuse.cli import simulate
-from robotdiffuse.cli import train
-from robotdiffuse.cli import verify
-from robotdiffuse.cli import view
+from robotdiffuse.cli import (
+    bench,
+    data,
+    interop,
+    live,
+    plan,
+    planners,
+    robot,
+    serve,
+    simulate,
+    train,
+    verify,
+    view,
+)
 from robotdiffuse.core.errors import InputError
 
 SOLVED, NO_PLAN, BAD_INPUT, UNWRITTEN, STOPPED = 0, 1, 2, 3, 130

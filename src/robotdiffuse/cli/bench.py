@@ -68,7 +68,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     report.set_defaults(run=run_report)
     confirm = actions.add_parser(
         "confirm",
-        help="the returned motions before a second judge, PyBullet",
+        help="the returned motions before a second validator, PyBullet",
         description="Look at every motion that `bench run` kept as solved by PyBullet, on the meshes. The "
         "exit status is 1 if it finds one in collision.",
     )
@@ -135,11 +135,11 @@ def run_run(arguments: argparse.Namespace) -> int:
 def run_report(arguments: argparse.Namespace) -> int:
     from pathlib import Path
 
+    from robotdiffuse.core.output_files import write_atomically
     from robotdiffuse.evaluation.bench import report
     from robotdiffuse.evaluation.bench.figures import sections
-    from robotdiffuse.evaluation.bench.run_folder import read_bench
     from robotdiffuse.evaluation.bench.page import write_page, write_plots
-    from robotdiffuse.core.output_files import write_atomically
+    from robotdiffuse.evaluation.bench.run_folder import read_bench
 
     planners = None if arguments.planners is None else arguments.planners.split(",")
     limits = None if arguments.limits is None else _limits(arguments.limits)
@@ -159,8 +159,8 @@ def run_report(arguments: argparse.Namespace) -> int:
 
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
     """The name of the file; None if there is nothing to replay."""
-    from robotdiffuse.evaluation.bench.page import worth_showing
     from robotdiffuse.core.types import Path as Waypoints
+    from robotdiffuse.evaluation.bench.page import worth_showing
     from robotdiffuse.visualization.gallery import Exhibit, write_gallery
 
     shown = worth_showing(bench, parts)

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.status import Status
 
-    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.core.results import PlanResult
+    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.validation.validator import Report
 
 
 PATIENCE = 2.0
 """After which a person is told what they wait for [s]."""
-KEEPS_CLEAR = {"as seen": "what was seen", "unseen is occupied": "all that was not seen free"}
-"""Of some rungs."""
+KEEPS_CLEAR = {"as seen": "what was seen", "unknown is occupied": "all that was not seen free"}
+"""Of some assumptions."""
 
 
 class Waiting:
@@ -69,13 +69,15 @@ def print_result(result: "PlanResult") -> None:
     if result.path is not None:
         rows.append(("path", f"{len(result.path.positions)} waypoints, length {result.path.length:.3f} rad"))
         rows.append(("verified", "yes"))
-    if result.rung:
-        rows.append(("keeps clear of", KEEPS_CLEAR.get(result.rung, f"what was seen, and {result.rung}")))
+    if result.assumption:
+        rows.append(
+            ("keeps clear of", KEEPS_CLEAR.get(result.assumption, f"what was seen, and {result.assumption}"))
+        )
     if result.confidence is not None:
         rows.append(("confidence", f"{100 * result.confidence:.0f} % that it is free of what was not seen"))
-    if result.unseen_region is not None:
-        low, high = (", ".join(f"{at:.2f}" for at in corner) for corner in result.unseen_region)
-        rows.append(("crosses unseen", f"from ({low}) to ({high}) m"))
+    if result.unknown_region is not None:
+        low, high = (", ".join(f"{at:.2f}" for at in corner) for corner in result.unknown_region)
+        rows.append(("crosses unknown", f"from ({low}) to ({high}) m"))
     if result.min_clearance is not None:
         rows.append(("least clearance", clearances(result)))
     if result.trajectory is not None:
@@ -87,8 +89,8 @@ def print_result(result: "PlanResult") -> None:
 
 def print_next_view(problem: "Problem", result: "PlanResult") -> None:
     """Where a camera is to look next, as problem files say it."""
-    from robotdiffuse.planning.next_view import next_view
     from robotdiffuse.core.transforms import pose_entry
+    from robotdiffuse.planning.next_view import next_view
 
     proposed = next_view(problem, result)
     camera = ", ".join(

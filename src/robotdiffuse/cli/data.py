@@ -2,8 +2,7 @@
 
 import argparse
 
-from robotdiffuse.cli import data_generate
-from robotdiffuse.cli import data_inspect
+from robotdiffuse.cli import data_generate, data_inspect
 
 
 def add(commands: argparse._SubParsersAction) -> None:

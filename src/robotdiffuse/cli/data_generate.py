@@ -23,7 +23,7 @@ def add_generate(actions: argparse._SubParsersAction) -> None:
         "generate",
         help="plan many random problems",
         description="Solve many random problems by Shared-Tree Informed RRT*, or another planner, and keep "
-        "what the judge passes in shards. Ctrl-C or a crash loses at most the shards in hand; the same "
+        "what the validator passes in shards. Ctrl-C or a crash loses at most the shards in hand; the same "
         "command goes on.",
     )
     parser.add_argument("--out", required=True, metavar="FOLDER", help="folder for the data")

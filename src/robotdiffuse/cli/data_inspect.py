@@ -36,12 +36,12 @@ def add_info(actions: argparse._SubParsersAction) -> None:
 def add_check(actions: argparse._SubParsersAction) -> None:
     parser = actions.add_parser(
         "check",
-        help="check every shard, and judge motions anew",
-        description="Check the structure of every shard and judge motions anew, by our judge and by PyBullet "
+        help="check every shard, and validate motions anew",
+        description="Check the structure of every shard and validate motions anew, by our validator and by PyBullet "
         "on meshes. Exit status: 0 clean, 1 violations found, 2 bad input.",
     )
     parser.add_argument("folder", metavar="FOLDER", help=FOLDER_HELP)
-    parser.add_argument("--count", type=count, metavar="N", help="judge N random motions (default: all)")
+    parser.add_argument("--count", type=count, metavar="N", help="validator N random motions (default: all)")
     parser.add_argument("--seed", type=natural, default=0, metavar="N", help="random seed (default: 0)")
     parser.add_argument(
         "--workers",
@@ -149,8 +149,8 @@ def run_check(arguments: argparse.Namespace) -> int:
 
 def run_view(arguments: argparse.Namespace) -> int:
     from robotdiffuse.cli.drawing import show
-    from robotdiffuse.datasets.manifest import read_manifest
     from robotdiffuse.core.output_files import check_output
+    from robotdiffuse.datasets.manifest import read_manifest
     from robotdiffuse.robots import load_robot
     from robotdiffuse.visualization.gallery import write_gallery
 
@@ -211,5 +211,5 @@ def run_import(arguments: argparse.Namespace) -> int:
             arguments.radius,
             lambda done, total: bar.update(task, completed=done, total=total),
         )
-    print(f"{made:,} motions in {arguments.out}; judge them with: robotdiffuse data check {arguments.out}")
+    print(f"{made:,} motions in {arguments.out}; validate them with: robotdiffuse data check {arguments.out}")
     return 0

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.core.results import PlanResult
+    from robotdiffuse.problems.problem import Problem
 
 ENDINGS = (".html", ".png")
 
 
 def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
-    """Draw the motion of a solved result in its scene, by the ending of the file; with it what was imagined
+    """Draw the motion of a solved result in its scene, by the ending of the file; with it what was predicted
     beside what cameras saw, if it was."""
     motion = result.trajectory or result.path
     assert motion is not None, "only a solved result has a motion"
@@ -22,11 +22,11 @@ def draw(problem: "Problem", result: "PlanResult", file: Path) -> None:
         from robotdiffuse.visualization.replay_page import write_replay as write
     else:
         from robotdiffuse.visualization.picture import write_picture as write
-    if problem.views and problem.unseen == "imagined":
-        from robotdiffuse.planning.pipeline.unknown_space import imagined_obstacles
+    if problem.views and problem.unknown == "predicted":
+        from robotdiffuse.planning.pipeline.unknown_space import predicted_obstacles
         from robotdiffuse.scenes.scene import Scene
 
-        seen = Scene([*problem.scene.shapes, imagined_obstacles(problem)])
+        seen = Scene([*problem.scene.shapes, predicted_obstacles(problem)])
         problem = replace(problem, scene=seen, views=())
     robot, scene = problem.standing()
     write(robot, scene, motion, file, result=result)

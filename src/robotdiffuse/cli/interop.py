@@ -7,8 +7,8 @@ from robotdiffuse.cli.arguments import positive
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
-    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.core.types import Trajectory
+    from robotdiffuse.problems.problem import Problem
 
 PORT = 9090
 
@@ -17,7 +17,7 @@ def add_export(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "export",
         help="write a result for ROS 2, Foxglove or Rerun",
-        description="Judge the motion of a result file anew, and write it for other programs: .mcap (a scene "
+        description="Validate the motion of a result file anew, and write it for other programs: .mcap (a scene "
         "that Foxglove opens, with ROS 2 messages), .rosbag2 (a ROS 2 bag, a folder), .rrd (Rerun), .yaml (a "
         "ROS 2 JointTrajectory), .csv and .json.",
     )
@@ -30,7 +30,7 @@ def add_publish(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "publish",
         help="send a result to ROS by a rosbridge",
-        description="Judge the motion of a result file anew, and publish it as a JointTrajectory.",
+        description="Validate the motion of a result file anew, and publish it as a JointTrajectory.",
     )
     parser.add_argument("result", metavar="RESULT", help="result file (.json) of `robotdiffuse plan --out`")
     parser.add_argument(
@@ -53,9 +53,9 @@ def address(text: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def judged(file: str) -> "tuple[Problem, Trajectory]":
+def validated(file: str) -> "tuple[Problem, Trajectory]":
     """The problem and the motion of a result file. Raises InputError where there is none, and for one that
-    the judge does not call valid: what leaves here may be executed."""
+    the validator does not call valid: what leaves here may be executed."""
     from robotdiffuse.cli.view import read
     from robotdiffuse.validation.validator import verify_trajectory
 
@@ -72,7 +72,7 @@ def run_export(arguments: argparse.Namespace) -> int:
     from robotdiffuse.interop import check_export, write_motion
 
     outputs = [check_export(file) for file in arguments.out]
-    problem, trajectory = judged(arguments.result)
+    problem, trajectory = validated(arguments.result)
     for file in outputs:
         write_motion(problem, trajectory, file)
         print(f"wrote {file}")
@@ -83,7 +83,7 @@ def run_publish(arguments: argparse.Namespace) -> int:
     from robotdiffuse.interop.rosbridge import publish
 
     host, port = arguments.to
-    _, trajectory = judged(arguments.result)
+    _, trajectory = validated(arguments.result)
     publish(trajectory, host, port, arguments.topic, arguments.timeout)
     print(f"published {len(trajectory.times)} rows on {arguments.topic} at {host}:{port}")
     return 0

@@ -64,10 +64,10 @@ def run(arguments: argparse.Namespace) -> NoReturn:
     from rich.console import Console
 
     from robotdiffuse.cli import STOPPED
+    from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
     from robotdiffuse.visualization.live.access import bound, is_loopback, new_token
     from robotdiffuse.visualization.live.files import first_problem
     from robotdiffuse.visualization.live.session import Choice, Session
-    from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
 
     planner = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(planner)

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 from robotdiffuse.cli.arguments import natural, not_negative, positive, share
 from robotdiffuse.cli.console import Waiting, print_next_view, print_result
 from robotdiffuse.cli.drawing import ENDINGS, draw, show
-from robotdiffuse.interop import WRITERS
 from robotdiffuse.core.types import SHORT, UNTIL
+from robotdiffuse.interop import WRITERS
 
 if TYPE_CHECKING:
-    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.core.results import PlanResult
     from robotdiffuse.core.settings import Settings
+    from robotdiffuse.problems.problem import Problem
 
 RESULT_ENDINGS = (".json", ".csv", *ENDINGS, *WRITERS)
 DEMO, DEMO_FAMILY = "shelf.yaml", "shelf"
@@ -67,15 +67,15 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         help="distance to keep to obstacles where it can be kept (default: the problem's, or 0.01 m)",
     )
     parser.add_argument(
-        "--unseen",
+        "--unknown",
         metavar="POLICY",
         help="what space that the problem's views do not show is taken for: optimistic (free), padded, "
-        "imagined or occupied (default: what the problem says, or optimistic)",
+        "predicted or occupied (default: what the problem says, or optimistic)",
     )
     parser.add_argument(
         "--next-view",
         action="store_true",
-        help="say where a camera sees most of the unseen space that the motion crosses",
+        help="say where a camera sees most of the unknown space that the motion crosses",
     )
     for what in ("velocity", "acceleration"):
         parser.add_argument(
@@ -143,8 +143,8 @@ def run_plan(arguments: argparse.Namespace) -> int:
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
     problem = load_problem(arguments.problem, arguments.index)
-    if arguments.unseen is not None:
-        problem = with_policy(problem, arguments.unseen)
+    if arguments.unknown is not None:
+        problem = with_policy(problem, arguments.unknown)
     if arguments.blend is not None:
         problem = replace(problem, blend=arguments.blend)
     if arguments.next_view:
@@ -182,13 +182,13 @@ def run_plan(arguments: argparse.Namespace) -> int:
     return 0 if result.solved else 1
 
 
-def with_policy(problem: "Problem", unseen: str) -> "Problem":
-    """The problem with this policy for unseen space; InputError for an unknown one, and without views."""
-    from robotdiffuse.problems.problem import check_unseen
+def with_policy(problem: "Problem", unknown: str) -> "Problem":
+    """The problem with this policy for unknown space; InputError for an unknown one, and without views."""
+    from robotdiffuse.problems.problem import check_unknown
 
-    check_unseen("--unseen", unseen)
-    check_seen(f"--unseen {unseen}", problem)
-    return replace(problem, unseen=unseen)
+    check_unknown("--unknown", unknown)
+    check_seen(f"--unknown {unknown}", problem)
+    return replace(problem, unknown=unknown)
 
 
 def check_seen(option: str, problem: "Problem") -> None:
@@ -245,9 +245,9 @@ def through_camera(problem: "Problem") -> "Problem":
     the floor, which is known."""
     import numpy as np
 
-    from robotdiffuse.problems.families.furniture import FLOOR
-    from robotdiffuse.problems.problem import IMAGINED
     from robotdiffuse.perception.ray_caster import looking_at, ray_cast
+    from robotdiffuse.problems.families.furniture import FLOOR
+    from robotdiffuse.problems.problem import PREDICTED
     from robotdiffuse.scenes.scene import Scene
 
     T_base_camera = looking_at(np.array(DEMO_CAMERA), np.array(DEMO_TARGET))
@@ -255,7 +255,7 @@ def through_camera(problem: "Problem") -> "Problem":
     intrinsics = (460.0, 460.0, (width - 1) / 2, (height - 1) / 2)
     stands = Scene([FLOOR, *problem.scene.shapes])
     view = ray_cast(stands, T_base_camera, intrinsics, (width, height), problem.robot, problem.start)
-    return replace(problem, scene=Scene([FLOOR]), views=(view,), unseen=IMAGINED)
+    return replace(problem, scene=Scene([FLOOR]), views=(view,), unknown=PREDICTED)
 
 
 def solve(
@@ -270,9 +270,9 @@ def solve(
 
     The compiled code is loaded before, or compiled on a new machine, which would otherwise use up the limit.
     """
+    from robotdiffuse.core.processes import interrupts_at_once
     from robotdiffuse.planning import load_planner
     from robotdiffuse.planning.planner import compiles_first
-    from robotdiffuse.core.processes import interrupts_at_once
 
     loading = Waiting(f"loading compiled code ({compiles_first(problem.robot)})")
     with interrupts_at_once(loading.stop), loading:

@@ -179,8 +179,8 @@ def _print_pairs(report: "AddReport") -> None:
 
 
 def print_robot(robot: "Robot") -> None:
-    from robotdiffuse.evaluation.tables import Column, Table, show
     from robotdiffuse.core.transforms import inverse
+    from robotdiffuse.evaluation.tables import Column, Table, show
 
     columns = ("joint", Column("kind", left=True), "lower", "upper", "velocity", "accel.", "jerk")
     joints = [(j.name, j.kind, *_range(j), j.velocity, j.acceleration, j.jerk) for j in robot.planned_joints]

@@ -36,8 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     from robotdiffuse.core.output_files import check_output
 
     try:
-        from robotdiffuse.simulation import write_gif, write_png
-        from robotdiffuse.simulation import replay
+        from robotdiffuse.simulation import replay, write_gif, write_png
     except ModuleNotFoundError as error:
         if error.name != "pybullet":
             raise

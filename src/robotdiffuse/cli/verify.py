@@ -18,8 +18,8 @@ HELD, NOT_HELD = 0, 1
 def add_verify(commands: argparse._SubParsersAction) -> None:
     parser = commands.add_parser(
         "verify",
-        help="judge anybody's motion, and certify it",
-        description="Judge a motion, whoever planned it: a result of ours, CSV, JSON, YAML of a ROS "
+        help="validate anybody's motion, and certify it",
+        description="Validate a motion, whoever planned it: a result of ours, CSV, JSON, YAML of a ROS "
         "JointTrajectory or MoveIt RobotTrajectory, a ROS 2 bag or MCAP. Exit status: 0 valid, 1 not valid, "
         "2 bad input.",
     )
@@ -63,7 +63,7 @@ def add_certificate(commands: argparse._SubParsersAction) -> None:
     check = actions.add_parser(
         "check",
         help="re-check a certificate, without search",
-        description="Re-check a certificate by code that shares nothing with the judge. Exit status: 0 it "
+        description="Re-check a certificate by code that shares nothing with the validator. Exit status: 0 it "
         "holds, 1 it does not, 2 bad input.",
     )
     check.add_argument("file", metavar="FILE", help="certificate of `robotdiffuse verify --certificate`")
@@ -80,7 +80,7 @@ def run_verify(arguments: argparse.Namespace) -> int:
     problem, motions, notes = _asked(arguments)
     for note in notes:
         print(f"note: {note}")
-    valid = all([_judged(problem, what, motion, arguments.all) for what, motion in motions.items()])
+    valid = all([_validated(problem, what, motion, arguments.all) for what, motion in motions.items()])
     if out is not None and valid:
         from robotdiffuse.certificates.search import certify
 
@@ -106,7 +106,9 @@ def run_check(arguments: argparse.Namespace) -> int:
     return NOT_HELD if found else HELD
 
 
-def _judged(problem: "Problem", what: str, motion: "types.Path | types.Trajectory", everything: bool) -> bool:
+def _validated(
+    problem: "Problem", what: str, motion: "types.Path | types.Trajectory", everything: bool
+) -> bool:
     from robotdiffuse.core.types import Trajectory
     from robotdiffuse.validation.validator import verify, verify_trajectory
 
@@ -140,11 +142,11 @@ def _along(file: str) -> "Problem":
 def _asked(
     arguments: argparse.Namespace,
 ) -> "tuple[Problem, dict[str, types.Path | types.Trajectory], tuple[str, ...]]":
-    """The problem, the motions to judge, and what was changed to read them."""
+    """The problem, the motions to validate, and what was changed to read them."""
+    from robotdiffuse.core.types import Trajectory
     from robotdiffuse.interop import read_motion
     from robotdiffuse.interop.recorded_motion import fitted, own_problem
     from robotdiffuse.problems.files import load_problem
-    from robotdiffuse.core.types import Trajectory
 
     if (arguments.scene is None) != (arguments.robot is None):
         raise InputError("--scene and --robot belong together: a planning scene does not say which robot")

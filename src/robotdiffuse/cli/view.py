@@ -8,8 +8,8 @@ from robotdiffuse.cli.drawing import ENDINGS, draw, show
 from robotdiffuse.core.errors import InputError
 
 if TYPE_CHECKING:
-    from robotdiffuse.problems.problem import Problem
     from robotdiffuse.core.results import PlanResult
+    from robotdiffuse.problems.problem import Problem
 
 
 def add_view(commands: argparse._SubParsersAction) -> None:
@@ -30,8 +30,8 @@ def add_view(commands: argparse._SubParsersAction) -> None:
 
 def read(file: str) -> "tuple[PlanResult, Problem]":
     """A solved result and its problem. Raises InputError where the file holds no motion or no problem."""
-    from robotdiffuse.problems.files import problem_from_record
     from robotdiffuse.core.results import load_result
+    from robotdiffuse.problems.files import problem_from_record
 
     saved = load_result(file)
     if not saved.result.solved:

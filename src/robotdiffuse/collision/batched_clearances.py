@@ -13,8 +13,8 @@ from robotdiffuse.collision.kernels.clearance_gradients import clearances_and_gr
 from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_clearance import clearances_into, make_clearance_workspace
 from robotdiffuse.collision.kernels.simd import W
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box
 
 _ZERO, _ONE, _FAR = np.float32(0.0), np.float32(1.0), np.float32(NO_BOX[0, 0])

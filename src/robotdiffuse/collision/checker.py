@@ -5,10 +5,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
-from robotdiffuse.collision.kernels import clearance_gradients
-from robotdiffuse.collision.kernels import distance
-from robotdiffuse.collision.kernels import lane_clearance
-from robotdiffuse.collision.kernels import lane_collision
+from robotdiffuse.collision.kernels import clearance_gradients, distance, lane_clearance, lane_collision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene

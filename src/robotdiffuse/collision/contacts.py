@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.exact_meshes import Distance, ExactCollision
 from robotdiffuse.collision.convex_geometry import checks_of
+from robotdiffuse.collision.exact_meshes import Distance, ExactCollision
 from robotdiffuse.collision.kernels import motion_certificate as kernel
 from robotdiffuse.collision.kernels.motion_certificate import Motion
 from robotdiffuse.collision.motions import EPISODE_TRAVEL, Contact, ContinuousCollision
@@ -23,14 +23,14 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
     Where nothing touches the certificate says so; while something does, all else is looked at every 1 cm of
     motion.
     """
-    judge, exact = ContinuousCollision(robot, scene, contact, 0.5), ExactCollision(robot, scene)
-    motion = Motion(np.ascontiguousarray(q), kernel.way_along(q, judge.checks.levers))
+    validator, exact = ContinuousCollision(robot, scene, contact, 0.5), ExactCollision(robot, scene)
+    motion = Motion(np.ascontiguousarray(q), kernel.way_along(q, validator.checks.levers))
     end, at, found = float(motion.way[-1]), 0.0, list[Contact]()
     for _ in range(MOST_LOOKS):
         low = kernel.segment_at(motion.way, at)[0]
         here = kernel.configurations(motion, np.array([at]))
         rest = np.concatenate([here, q[low + 1 :]])
-        first = judge.sweep(rest).contact
+        first = validator.sweep(rest).contact
         if first is None:
             break
         # places in the rest, as rows and shares, to places on the way

@@ -12,10 +12,10 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
-from robotdiffuse.core.transforms import transform
 
 
 class Check(NamedTuple):

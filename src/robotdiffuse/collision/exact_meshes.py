@@ -1,4 +1,4 @@
-"""Exact collision of the robot's convex meshes with the scene, by Coal: the geometry of the judge.
+"""Exact collision of the robot's convex meshes with the scene, by Coal: the geometry of the validator.
 
 Covering spheres play no part here, so that they can be tested against it. A link with spheres but without
 meshes is taken as its spheres. Distances are signed [m]: negative inside, by penetration depth.
@@ -28,11 +28,11 @@ from robotdiffuse.collision.convex_geometry import (
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
 from robotdiffuse.core.deadline import check_time
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_surface
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
-from robotdiffuse.core.transforms import transform
 
 CHUNK = 8192
 """Configurations that `collides` treats at once; bounds its memory."""
@@ -134,7 +134,7 @@ def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
         count, what = _surfaces(solid.shape)
         if count:
             check_time(
-                f"the judge's tree over the {count:,} {what} of {solid.shape.name}", TREE_SECONDS * count
+                f"the validator's tree over the {count:,} {what} of {solid.shape.name}", TREE_SECONDS * count
             )
         obstacles.append(_obstacle(solid))
     return tuple(obstacles)

@@ -12,8 +12,8 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.simd import W, by_sixteen
-from robotdiffuse.collision.sphere_pair_tables import no_tables, tabulate
 from robotdiffuse.collision.point_cloud_grid import EMPTY, PointGrid, build_grid, cover, thin
+from robotdiffuse.collision.sphere_pair_tables import no_tables, tabulate
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.robots.joint_tables import JointTable
 from robotdiffuse.robots.motion_bounds import motion_radii
@@ -218,7 +218,7 @@ GRID_SECONDS = 7e-7
 @lru_cache(maxsize=8)
 def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
     """The arrays of a scene as far as the robot can get near it; those of the last few scenes are kept, since
-    a search and the judge ask for the same."""
+    a search and the validator ask for the same."""
     largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
     return compile_scene(scene, reach_bound(robot), largest)
 

@@ -1,4 +1,4 @@
-"""Collision of motions: the space that searches check them in, and the judge's certificate.
+"""Collision of motions: the space that searches check them in, and the validator's certificate.
 
 The certificate says that a motion is free between its waypoints too, or where it first is not. A piece of
 the motion is free for a link if a lower bound of its clearance along the piece is positive; otherwise the
@@ -18,12 +18,21 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.checker import CollisionChecker
 from robotdiffuse.collision.convex_geometry import Check, checks_of, hulls_of, solid_arrays, solids_of
+from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import motion_certificate as kernel
+from robotdiffuse.collision.kernels.motion_certificate import (
+    CAP,
+    PAIR,
+    SCENE,
+    Arm,
+    Checks,
+    Motion,
+    Pieces,
+    Round,
+)
 from robotdiffuse.collision.kernels.motions import Space
-from robotdiffuse.collision.kernels.motion_certificate import CAP, PAIR, SCENE, Arm, Checks, Motion, Pieces, Round
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
@@ -64,7 +73,7 @@ def search_space(
 
 
 def finer(resolution: float) -> float:
-    """For after a path that the judge refused: it found contact between two checks, so look twice as closely
+    """For after a path that the validator refused: it found contact between two checks, so look twice as closely
     [m]."""
     return max(resolution / 2, FINEST)
 
@@ -97,7 +106,7 @@ class Sweep(NamedTuple):
 
 
 class ContinuousCollision:
-    """Judges whole motions of a robot in a scene. Not safe for use by several threads at once."""
+    """Validates whole motions of a robot in a scene. Not safe for use by several threads at once."""
 
     def __init__(self, robot: Robot, scene: Scene, contact: float, tightness: float) -> None:
         """Meshes nearer than `contact` [m] touch. Pieces are split until each certified clearance is at least
@@ -109,7 +118,7 @@ class ContinuousCollision:
         self.solids = solid_arrays(solids_of(scene))
 
     def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
-        """Judge the motion along straight joint-space lines through the waypoints (at least one)."""
+        """Validate the motion along straight joint-space lines through the waypoints (at least one)."""
         q = np.ascontiguousarray(q, dtype=np.float64)
         motion = Motion(q, kernel.way_along(q, self.checks.levers))
         todo = kernel.first_pieces(motion, self.checks, FIRST_TRAVEL)
@@ -169,7 +178,9 @@ class ContinuousCollision:
 
     @cached_property
     def _exact(self) -> "ExactCollision":
-        from robotdiffuse.collision.exact_meshes import ExactCollision  # and Coal, which most motions do not need
+        from robotdiffuse.collision.exact_meshes import (
+            ExactCollision,  # and Coal, which most motions do not need
+        )
 
         return ExactCollision(self.robot, self.scene)
 

@@ -16,17 +16,17 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.collision.kernel_arrays import robot_groups
 from robotdiffuse.collision.convex_geometry import Solid, solids_of
+from robotdiffuse.collision.kernel_arrays import robot_groups
 from robotdiffuse.collision.kernels import moving_obstacles as kernel
 from robotdiffuse.collision.kernels.moving_obstacles import CAP, Links, Tasks, Tracks
 from robotdiffuse.collision.motions import covered
+from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
 from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle, track_speeds
-from robotdiffuse.scenes.shape_transforms import placed
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
+from robotdiffuse.scenes.shape_transforms import placed
 
 if TYPE_CHECKING:
     from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -59,7 +59,7 @@ class TimedSweep(NamedTuple):
 
 
 class MovingCollision:
-    """Judges timed motions of a robot among obstacles that move. Not safe for several threads at once."""
+    """Validates timed motions of a robot among obstacles that move. Not safe for several threads at once."""
 
     def __init__(
         self, robot: Robot, moving: Sequence[MovingObstacle], contact: float, tightness: float
@@ -71,7 +71,7 @@ class MovingCollision:
         self.tracks = tracks_of(self.moving)
 
     def sweep(self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> TimedSweep:
-        """Judge the motion on straight lines between rows at increasing times."""
+        """Validate the motion on straight lines between rows at increasing times."""
         times, q = np.ascontiguousarray(times, np.float64), np.ascontiguousarray(q, np.float64)
         best, certified = np.array([CAP]), CAP
         every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
@@ -146,7 +146,9 @@ class MovingCollision:
 
     @cached_property
     def _exact(self) -> "tuple[ExactCollision, ...]":
-        from robotdiffuse.collision.exact_meshes import ExactCollision  # and Coal, which most motions do not need
+        from robotdiffuse.collision.exact_meshes import (
+            ExactCollision,  # and Coal, which most motions do not need
+        )
 
         return tuple(ExactCollision(self.robot, Scene([obstacle.shape])) for obstacle in self.moving)
 

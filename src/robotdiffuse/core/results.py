@@ -10,8 +10,8 @@ import numpy as np
 
 from robotdiffuse.core.bounds import FASTEST, within
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.input_files import read_json
+from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.types import ROWS, Path, Status, Trajectory, Tree
 
 REQUIRED = ("status", "reason", "planner", "robot", "joint_names", "planning_time", "verified", "seed")
@@ -45,18 +45,18 @@ class PlanResult:
     """When each shorter path was found [s since the call], and its joint-space length [rad]; the last pair is
     the returned path's."""
     refused: str = ""
-    """What was wrong with the last path that the judge refused, a `verify.Violation.kind`; "" if none was."""
-    rung: str = ""
-    """For a scene that cameras saw: which obstacles in unseen space the motion keeps clear of, e.g. "points
+    """What was wrong with the last path that the validator refused, a `verify.Violation.kind`; "" if none was."""
+    assumption: str = ""
+    """For a scene that cameras saw: which obstacles in unknown space the motion keeps clear of, e.g. "points
     padded by 9 cm"; "as seen": of none. "" where no view was given."""
     confidence: float | None = None
     """For a scene that cameras saw: how likely the motion is free of what they did not see. `verified` says
     that it is free of what they saw."""
     swept_probability: float | None = None
-    """That the voxels it passes through are occupied, summed, where an imagination of unseen space was asked
+    """That the voxels it passes through are occupied, summed, where an prediction of unknown space was asked
     for: what `confidence` is told from."""
-    unseen_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
-    """Least and greatest corner of a box, in the base frame, around the unseen space that the motion crosses
+    unknown_region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    """Least and greatest corner of a box, in the base frame, around the unknown space that the motion crosses
     where that is likeliest to be occupied [m]; None where it crosses none."""
     trees: tuple[Tree, ...] = field(default=(), repr=False)
     """Of the search: from the start and from the goals, as they found the shortest path of the search, or
@@ -133,10 +133,12 @@ def _record(result: PlanResult, problem: dict[str, Any] | None) -> dict[str, Any
         "notes": list(result.notes),
         "progress": [list(found) for found in result.progress],
         "refused": result.refused,
-        "rung": result.rung,
+        "assumption": result.assumption,
         "confidence": result.confidence,
         "swept_probability": result.swept_probability,
-        "unseen_region": None if result.unseen_region is None else [list(at) for at in result.unseen_region],
+        "unknown_region": None
+        if result.unknown_region is None
+        else [list(at) for at in result.unknown_region],
         "joint_names": [],
         "waypoints": None if result.path is None else result.path.positions.tolist(),
         "times": [],
@@ -178,10 +180,10 @@ def _result(record: dict[str, Any]) -> PlanResult:
         notes=_names(record, "notes") if "notes" in record else (),
         progress=_progress(record),
         refused=_text(record, "refused") if "refused" in record else "",
-        rung=_text(record, "rung") if "rung" in record else "",
+        assumption=_text(record, "assumption") if "assumption" in record else "",
         confidence=_number_or_none(record, "confidence"),
         swept_probability=_number_or_none(record, "swept_probability"),
-        unseen_region=_box(record, "unseen_region"),
+        unknown_region=_box(record, "unknown_region"),
     )
 
 

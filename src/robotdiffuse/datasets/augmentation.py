@@ -11,8 +11,8 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 
 def turns_about_vertical(robot: Robot) -> bool:

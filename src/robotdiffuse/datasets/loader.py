@@ -15,17 +15,17 @@ from numpy import ndarray
 from torch import Tensor
 from torch.utils.data import Dataset, get_worker_info
 
+from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.datasets.rows import read_rows
 from robotdiffuse.datasets.shards import (
     SPLITS,
 )
-from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.surface_points import VisibleRegion
 from robotdiffuse.scenes.surface_clouds import surface_clouds
+from robotdiffuse.scenes.surface_points import VisibleRegion
 
 VIEWS = ("full", "partial")
 BLOCK = 16

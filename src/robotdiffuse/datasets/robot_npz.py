@@ -17,17 +17,17 @@ from robotdiffuse import __version__
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
-from robotdiffuse.datasets.shards import Row, check_shapes, read_shard, row_of, shard_indices, write_shard
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
+from robotdiffuse.datasets.shards import Row, check_shapes, read_shard, row_of, shard_indices, write_shard
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Sphere
 
 WAYPOINTS, DOF, NUMBERS = 254, 7, 23
@@ -88,7 +88,7 @@ def import_npz(
 ) -> int:
     """Make a data set of a robot.npz in an empty folder; returns the number of its motions.
 
-    The scenes are two spheres of this radius [m] on ROP's floor. Nothing is judged: that is for
+    The scenes are two spheres of this radius [m] on ROP's floor. Nothing is validated: that is for
     `robotdiffuse data check`. What the file does not say is measured (clearances, lengths, whether the
     straight line is free) or follows from the motion: the target is where the last waypoint has the robot's
     tip, for the target in the file is that of the authors' arm, which has no hand. The safety distance is

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int8
 from numpy import ndarray
 
+from robotdiffuse.datasets.augmentation import turned
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.datasets.shards import (
     SPLITS,
@@ -19,7 +20,6 @@ from robotdiffuse.datasets.shards import (
     scenes_of,
     split_of,
 )
-from robotdiffuse.datasets.augmentation import turned
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 

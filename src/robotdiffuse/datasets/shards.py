@@ -23,13 +23,13 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int8
 from numpy import ndarray
 
-from robotdiffuse.datasets.manifest import FORMAT, MANIFEST, Manifest, check_format
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.datasets.manifest import FORMAT, MANIFEST, Manifest, check_format
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes, floor_row
-from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Path, Trajectory
 
 COMPRESSION = 3
 """Zstandard's level."""

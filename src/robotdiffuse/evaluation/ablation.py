@@ -15,16 +15,17 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.processes import Workers
+from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, without_network
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.runs import tried
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.tables import Column, Table
-from robotdiffuse.evaluation.runs import tried
-from robotdiffuse.core.output_files import alone_in
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.training.config import EncoderTraining
 from robotdiffuse.learning.training.configs import CONFIGS, planner_training
@@ -33,7 +34,6 @@ from robotdiffuse.learning.training.planner import train_planner
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.held_out import Case
-from robotdiffuse.core.processes import Workers
 from robotdiffuse.robots import load_robot
 
 ENCODER = "compression_autoencoder"
@@ -98,7 +98,7 @@ class Tried:
     """Figures of a network, one value for each problem."""
 
     single: Float[ndarray, "n"]
-    """Share of the sampled trajectories that passed the judge."""
+    """Share of the sampled trajectories that passed the validator."""
     best: Float[ndarray, "n"]
     """1 where any of them did."""
     collided: Float[ndarray, "n"]
@@ -235,7 +235,7 @@ def _planner_settings(settings: AblationSettings, config: str | None, guided: bo
 
 
 NOTES = (
-    "single: share of samples that pass the judge; best: of problems with at least one such sample.",
+    "single: share of samples that pass the validator; best: of problems with at least one such sample.",
     "length: of the shortest such sample, over the problems that have one; to first: the mean ratio to that "
     "of the first row, over the problems that both solve. Intervals are over problems, of one training each: "
     "another seed may move a row by more.",

@@ -1,5 +1,5 @@
 """What can be tried: planners, networks that sample, and searches that go on. Each gives its trials'
-records, with the verdict of the judge, whose time is not counted unless it is part of a planner's call."""
+records, with the verdict of the validator, whose time is not counted unless it is part of a planner's call."""
 
 import time
 import traceback
@@ -15,17 +15,17 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Status
 from robotdiffuse.evaluation.metrics import Measure
 from robotdiffuse.evaluation.records import ENDED, RAISED, RESTARTABLE, SOLVED
 from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial
 from robotdiffuse.learning.guidance import CollisionGuidance
-from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.diffusion.diffusion import ModelSampler, encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuseSettings, unlearned_starts
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.held_out import goal_of
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.types import Path, Status
 from robotdiffuse.validation.validator import Report, VerifySettings, verifier
 
 if TYPE_CHECKING:
@@ -136,8 +136,8 @@ Draw = Callable[[Trial, CollisionChecker], ndarray]
 """A batch of trajectories [count, waypoints, dof] for a trial."""
 
 
-class Judged(NamedTuple):
-    """The judge's opinion of a batch."""
+class Validated(NamedTuple):
+    """The validator's opinion of a batch."""
 
     passed: Bool[ndarray, "n"]
     hit: Bool[ndarray, "n"]
@@ -145,15 +145,15 @@ class Judged(NamedTuple):
     reports: list[Report]
 
 
-def judged(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Judged:
+def validated(problem: Problem, q: Float[ndarray, "n waypoints dof"]) -> Validated:
     """Of trajectories as they are, but for their ends, which are made exact."""
-    judge, reports = verifier(problem, VerifySettings()), []
+    validator, reports = verifier(problem, VerifySettings()), []
     for waypoints in q.astype(np.float64):
         waypoints[0], waypoints[-1] = problem.start, goal_of(problem)
-        reports.append(judge.path(Path(problem.robot.joint_names, waypoints)))
+        reports.append(validator.path(Path(problem.robot.joint_names, waypoints)))
     kinds = ["" if report.violation is None else report.violation.kind for report in reports]
     passed, hit = [not kind for kind in kinds], [kind.endswith("collision") for kind in kinds]
-    return Judged(np.array(passed), np.array(hit), reports)
+    return Validated(np.array(passed), np.array(hit), reports)
 
 
 def path_lengths(q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
@@ -162,14 +162,14 @@ def path_lengths(q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
 
 
 def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) -> Method:
-    """A batch of trajectories, all judged as they are; measured is the shortest of those that passed."""
+    """A batch of trajectories, all validated as they are; measured is the shortest of those that passed."""
 
     def call(trial: Trial) -> Iterator[Fields]:
         problem = trial.problem
         checker = CollisionChecker(problem.robot, problem.scene)
         with Clock() as clock:
             q = draw(trial, checker)
-        verdict, found = judged(problem, q), {}
+        verdict, found = validated(problem, q), {}
         if verdict.passed.any():
             best = int(np.where(verdict.passed, lengths(q), np.inf).argmin())
             path = Path(problem.robot.joint_names, q[best].astype(np.float64))
@@ -251,7 +251,7 @@ def searched(
     search: Search, marks: Sequence[float], whole: Callable[[Trial], Problem] = lambda trial: trial.problem
 ) -> Method:
     """A record for each mark, a CPU time [s]: of what a search has by then, the shortest path that passes the
-    judge is its answer, and that is solved if it passes for the whole problem too.
+    validator is its answer, and that is solved if it passes for the whole problem too.
 
     whole: what is true, where the trial's problem is what a planner sees of it. `passed` is 1 with an answer.
     """

@@ -11,9 +11,9 @@ from numpy import ndarray
 
 from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.validation.validator import Report
 
 STEP = 0.02

@@ -1,16 +1,16 @@
-"""Problems by name: held-out ones of the families, and those of files and folders; judged once and kept."""
+"""Problems by name: held-out ones of the families, and those of files and folders; validated once and kept."""
 
 import itertools
 from dataclasses import replace
 from pathlib import Path as FilePath
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path
 from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.files import load_problems
 from robotdiffuse.problems.held_out import Case, CaseFile, Report, line_length
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.types import Path
 from robotdiffuse.validation.validator import VerifySettings, verifier
 
 NONTRIVIAL = "_nontrivial"
@@ -21,8 +21,8 @@ PATIENCE = 20_000
 """Iterations that the search for the reference length takes at least."""
 
 
-def judge(problem: Problem, path: Path) -> bool:
-    """Whether a path passes the judge."""
+def validator(problem: Problem, path: Path) -> bool:
+    """Whether a path passes the validator."""
     return verifier(problem, VerifySettings()).path(path).valid
 
 
@@ -41,7 +41,7 @@ def hard_cases(
     family: str, count: int, folder: FilePath | None = None, report: Report = lambda text: None
 ) -> list[Case]:
     """The first held-out problems of a family that are hard; the folder keeps what is known of them."""
-    return case_file(folder, family).held_out(family, count, judge, search, report)
+    return case_file(folder, family).held_out(family, count, validator, search, report)
 
 
 def problem_set_name(text: str) -> str:
@@ -84,7 +84,7 @@ def _set(text: str, count: int | None, folder: FilePath, report: Report) -> list
     if family in FAMILIES:
         finder = search if text.endswith(NONTRIVIAL) else None
         wanted = 100 if count is None else count
-        return _of_set(case_file(folder, family).held_out(family, wanted, judge, finder, report), name)
+        return _of_set(case_file(folder, family).held_out(family, wanted, validator, finder, report), name)
     kept = case_file(folder, name)
     if not len(kept):
         kept.fill(_from_place(FilePath(text), name, report))
@@ -104,7 +104,7 @@ def _from_place(place: FilePath, name: str, report: Report) -> list[Case]:
             if entry.problem is None:
                 report(f"left out: {entry.error}")
                 continue
-            line = line_length(entry.problem, judge)
+            line = line_length(entry.problem, validator)
             cases.append(Case(entry.name, family, entry.problem, line is not None, line))
         report(f"problems: {len(cases)} of {name}")
     if not cases:

@@ -42,18 +42,18 @@ class Record:
     """Of `types.Status`, or crashed, overran, exception."""
     reason: str
     time: float
-    """Planning time, with the judge and without timing the trajectory [s]."""
+    """Planning time, with the validator and without timing the trajectory [s]."""
     cpu: float | None = None
     """CPU time [s], where it was measured."""
     restarts: int | None = None
     """How often the planner was called again; None: it was not to be."""
     refused: str = ""
-    """What was wrong with the last path that the judge refused, see PlanResult."""
+    """What was wrong with the last path that the validator refused, see PlanResult."""
     stage: str = ""
     progress: tuple[tuple[float, float], ...] = ()
     """When each shorter path was found [s], and its joint-space length [rad]."""
     passed: float | None = None
-    """Share of the samples of a batch that passed the judge."""
+    """Share of the samples of a batch that passed the validator."""
     collided: float | None = None
     """Share of them in collision."""
     reference: float | None = None
@@ -104,7 +104,7 @@ class Record:
 
     @property
     def in_collision(self) -> bool:
-        """Whether the planner's last answer was one that collides: the judge refused it."""
+        """Whether the planner's last answer was one that collides: the validator refused it."""
         return not self.solved and self.refused.endswith("collision")
 
     @property

@@ -1,6 +1,6 @@
-"""The one loop of all that is measured: every case by every method with every seed, judged, and kept.
+"""The one loop of all that is measured: every case by every method with every seed, validated, and kept.
 
-A method is called with a trial and gives the fields of a record, with the judge's verdict; `methods` has
+A method is called with a trial and gives the fields of a record, with the validator's verdict; `methods` has
 those for planners, networks and searches. An executor calls them: in this process, one after the other
 (`in_turn`), or in the processes of a bench. What is kept is not made again.
 """

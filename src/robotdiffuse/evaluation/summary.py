@@ -50,7 +50,7 @@ def _cpu(records: Sequence[Record]) -> Cell:
 
 
 SINGLE = Summary(Column("single", better="more"), _single)
-"""Share of samples that pass the judge."""
+"""Share of samples that pass the validator."""
 BEST = Summary(Column("best", better="more"), _solved)
 """Share of problems with a sample that does."""
 SOLVED = Summary(Column("solved", better="more"), _solved)

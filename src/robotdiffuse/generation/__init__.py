@@ -1,4 +1,4 @@
-"""The data factory: random problems, solved by Shared-Tree Informed RRT*, judged, and kept in shards."""
+"""The data factory: random problems, solved by Shared-Tree Informed RRT*, validated, and kept in shards."""
 
 from robotdiffuse.generation.factory import generate
 from robotdiffuse.generation.settings import GenerationSettings

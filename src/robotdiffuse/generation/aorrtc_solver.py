@@ -14,12 +14,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
+from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import END_MARGIN, Ends
+from robotdiffuse.planning.start_goal import END_MARGIN, StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.robot import TURN
-from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
 
 STEP = 500
 """Iterations between two questions whether to go on."""
@@ -60,16 +60,16 @@ class AORRTCSearch:
         """Start and goals must be free of collision. `state` is that of `random_state`."""
         self.settings, self.goals = settings, goals.astype(np.float32)
         self._robot = checker.robot
-        self._ends = Ends(checker, start.astype(np.float64), goals.astype(np.float64))
+        self._ends = StartGoal(checker, start.astype(np.float64), goals.astype(np.float64))
         problem = Problem(
             checker.robot, checker.scene, start.astype(np.float64), JointGoal(goals.astype(np.float64))
         )
-        call = Call("aorrtc", problem, NO_LIMIT, int(state[0] >> np.uint64(32)))
+        context = PlanningContext("aorrtc", problem, NO_LIMIT, int(state[0] >> np.uint64(32)))
         has = checker.link_clearances(np.stack([start, *goals]).astype(np.float32)).min(axis=1, initial=1.0)
         self._distances = _falling(settings, (float(has[0]), float(has[1:].max())))
         search = SearchSettings(range=settings.range, resolution=settings.resolution)
         self._search = AnytimeSearch(
-            call, self._ends, search, "aorrtc", clearances=self._distances, tries=settings.tries
+            context, self._ends, search, "aorrtc", clearances=self._distances, tries=settings.tries
         )
         self.best_goal = -1
         """The goal that the path leads to; -1 if there is none."""
@@ -120,8 +120,8 @@ class AORRTCSearch:
         return None if best is None else self._ends.complete(best).astype(np.float32)
 
 
-def _falling(settings: AORRTCSearchSettings, ends: tuple[float, float]) -> list[float]:
+def _falling(settings: AORRTCSearchSettings, start_goal: tuple[float, float]) -> list[float]:
     """The safety distances that are tried [m]; `ends` are what the start has, and the goal that has most."""
     most, steps = settings.safety_distance, max(settings.steps, 1)
-    between = {max(has - END_MARGIN, 0.0) for has in ends if has < most}
+    between = {max(has - END_MARGIN, 0.0) for has in start_goal if has < most}
     return sorted({most * step / steps for step in range(steps + 1)} | between, reverse=True)

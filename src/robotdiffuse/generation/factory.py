@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from robotdiffuse import __version__
-from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
-from robotdiffuse.datasets.shards import remove_leftovers, shard_indices, write_shard
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.processes import CLUSTERS, interrupts_afterwards, on_this_machine
+from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
+from robotdiffuse.datasets.shards import remove_leftovers, shard_indices, write_shard
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.shard_maker import Arrays, Counts, make_shard
-from robotdiffuse.core.processes import CLUSTERS, interrupts_afterwards, on_this_machine
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSettings
@@ -11,7 +12,6 @@ from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.families.family import POSE, POSITION, Family
 from robotdiffuse.problems.families.scaled import family_for
 from robotdiffuse.robots import load_robot
-from robotdiffuse.core.settings import Bound, Count, Natural, OneOf, Settings, SettingsOf, Share
 
 TARGETS = (POSITION, POSE)
 TIMINGS = ("arc", "time")

@@ -10,19 +10,19 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path
 from robotdiffuse.datasets.rows import resample
 from robotdiffuse.datasets.shards import Row, row_of
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearch
-from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.generation.settings import GenerationSettings
-from robotdiffuse.trajectories.timing import time_parameterize
+from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSearch
 from robotdiffuse.problems.families.family import Drawn
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.core.types import Path
+from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import Verifier, VerifySettings
 
 TRIES = 50
@@ -39,7 +39,7 @@ def make_shard(settings: GenerationSettings, index: int) -> tuple[Arrays, Counts
     """Arrays and counts of a shard, as `datasets.shards` keeps them.
 
     Counts: `tried` problems; of those `solved` ones are in the shard, `thinned` ones are trivial and left
-    out, of `unsolved` ones the search found no path, and `refused` ones did not pass the judge. Raises
+    out, of `unsolved` ones the search found no path, and `refused` ones did not pass the validator. Raises
     InputError if hardly any problem can be solved.
     """
     robot, rows = load_robot(settings.robot), settings.rows(index)
@@ -82,13 +82,13 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     goal, line_free = search.goals[search.best_goal], lines_free[search.best_goal]
     if thinned and line_free:
         return "thinned"
-    judge = Verifier(drawn.problem(robot), VerifySettings())
-    motion = _frames(settings, robot, path, judge)
+    validator = Verifier(drawn.problem(robot), VerifySettings())
+    motion = _frames(settings, robot, path, validator)
     if motion is None:
         return "refused"
     times, q = motion
     q[0], q[-1] = drawn.start, goal
-    if not judge.path(Path(robot.joint_names, q.astype(np.float64))).valid:
+    if not validator.path(Path(robot.joint_names, q.astype(np.float64))).valid:
         return "refused"
     floor = list(settings.families.values())[family].floor
     return row_of(
@@ -130,18 +130,18 @@ def _line_is_free(
 
 
 def _frames(
-    settings: GenerationSettings, robot: Robot, path: Float32[ndarray, "n dof"], judge: Verifier
+    settings: GenerationSettings, robot: Robot, path: Float32[ndarray, "n dof"], validator: Verifier
 ) -> tuple[ndarray, Float32[ndarray, "waypoints dof"]] | None:
-    """Times and joint values of the waypoints; None if the timed motion does not pass the judge."""
+    """Times and joint values of the waypoints; None if the timed motion does not pass the validator."""
     if settings.timing == "arc":
         return np.zeros(0), resample(path[None], settings.waypoints, exact=True)[0]
     waypoints = Path(robot.joint_names, path.astype(np.float64))
-    if not judge.path(waypoints).valid:
+    if not validator.path(waypoints).valid:
         return None
     timed = time_parameterize(
-        robot, waypoints, lambda motion: judge.trajectory(motion).valid, judge.collision_free
+        robot, waypoints, lambda motion: validator.trajectory(motion).valid, validator.collision_free
     )
-    if not judge.trajectory(timed).valid:
+    if not validator.trajectory(timed).valid:
         return None
     times = np.linspace(0.0, timed.duration, settings.waypoints)
     rows = [np.interp(times, timed.times, timed.positions[:, j]) for j in range(robot.dof)]

@@ -9,17 +9,15 @@ from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.registry import Entry, Registry
 
 if TYPE_CHECKING:
+    from robotdiffuse.core.types import Trajectory
     from robotdiffuse.interop.recorded_motion import Recorded
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.core.types import Trajectory
 
 BAG = ".rosbag2"
 WRITERS = Registry(
     "motion format to write",
     {
-        ".mcap": Entry(
-            "robotdiffuse.interop.mcap_file:write", "a scene that Foxglove shows, and the motion"
-        ),
+        ".mcap": Entry("robotdiffuse.interop.mcap_file:write", "a scene that Foxglove shows, and the motion"),
         ".rosbag2": Entry("robotdiffuse.interop.rosbag:write", "a ROS 2 bag (a folder)"),
         ".rrd": Entry("robotdiffuse.interop.rerun_file:write", "a recording that Rerun shows"),
         ".yaml": Entry("robotdiffuse.interop.ros_yaml:write", "a ROS 2 JointTrajectory"),
@@ -29,7 +27,9 @@ WRITERS = Registry(
 READERS = Registry(
     "motion format",
     {
-        ".json": Entry("robotdiffuse.interop.plain_messages:read_json_file", "results, trajectories, ROS messages"),
+        ".json": Entry(
+            "robotdiffuse.interop.plain_messages:read_json_file", "results, trajectories, ROS messages"
+        ),
         ".csv": Entry("robotdiffuse.interop.csv_file:read", "a column for each joint, and time"),
         ".yaml": Entry("robotdiffuse.interop.ros_yaml:read", "ROS JointTrajectory, MoveIt RobotTrajectory"),
         ".yml": Entry("robotdiffuse.interop.ros_yaml:read", "the same"),

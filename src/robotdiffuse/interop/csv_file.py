@@ -4,8 +4,8 @@ import csv
 from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.interop.recorded_motion import Recorded, recorded
 from robotdiffuse.core.input_files import read_text
+from robotdiffuse.interop.recorded_motion import Recorded, recorded
 
 TIMES = ("time", "t", "time_from_start", "timestamp")
 KINDS = {"position": "positions", "velocity": "velocities", "acceleration": "accelerations"}

@@ -15,11 +15,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.input_files import input_file, parse_json
 from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import missing
-from robotdiffuse.interop.ros_messages import motion_in
-from robotdiffuse.interop.recorded_motion import Recorded
 from robotdiffuse.interop.plain_messages import joint_trajectory
+from robotdiffuse.interop.recorded_motion import Recorded
+from robotdiffuse.interop.ros_messages import motion_in
 from robotdiffuse.interop.ros_types import (
     DISPLAY_TRAJECTORY,
     JOINT_STATE,
@@ -43,10 +46,7 @@ from robotdiffuse.interop.scene_primitives import (
 )
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.input_files import input_file, parse_json
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Trajectory
 
 try:
     from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms

@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.interop.recorded_motion import Recorded, recorded
 from robotdiffuse.core.input_files import read_json
+from robotdiffuse.interop.recorded_motion import Recorded, recorded
 
 HOLDS = "it must hold a result or trajectory of ours, a JointTrajectory, RobotTrajectory or DisplayTrajectory"
 
@@ -34,7 +34,9 @@ def _motion(record: Any) -> Recorded:
     if "joint_trajectory" in record:
         other = record.get("multi_dof_joint_trajectory") or {}
         if isinstance(other, Mapping) and other.get("points"):
-            raise InputError("multi_dof_joint_trajectory has points; only arms on a fixed base can be judged")
+            raise InputError(
+                "multi_dof_joint_trajectory has points; only arms on a fixed base can be validated"
+            )
         return _motion(record["joint_trajectory"])
     if "points" in record:
         return _joint_trajectory(record)
@@ -53,7 +55,7 @@ def _only(trajectories: Any) -> Recorded:
         return _motion(trajectories)
     if not isinstance(trajectories, list) or len(trajectories) != 1:
         count = len(trajectories) if isinstance(trajectories, list) else shown(trajectories)
-        raise InputError(f"trajectory holds {count} parts; one is judged at a time")
+        raise InputError(f"trajectory holds {count} parts; one is validated at a time")
     return _motion(trajectories[0])
 
 

@@ -8,11 +8,11 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import FASTEST, LARGEST, numbers, within
 from robotdiffuse.core.errors import InputError, joined, shown
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.goals import JointGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.types import Path, Trajectory
 
 STANDS_STILL = 1e-6
 """A joint that moves less than this does not move [rad] or [m]."""
@@ -102,7 +102,7 @@ def _times(value: object, count: int) -> tuple[Float[ndarray, "n"] | None, tuple
         row = int(np.flatnonzero(~np.isfinite(times))[0])
         raise InputError(f"times[{row}] is {times[row]}; it must be a finite number")
     if count > 1 and not times.any():
-        return None, ("all times are 0: the motion is judged as a path",)
+        return None, ("all times are 0: the motion is validated as a path",)
     backwards = np.flatnonzero(np.diff(times) <= 0)
     if len(backwards):
         i = int(backwards[0])
@@ -155,10 +155,10 @@ def fitted(motion: Recorded, robot: Robot) -> Fitted:
     a = None if motion.accelerations is None else motion.accelerations[:, order]
     if v is None:
         v = _smoothest(motion.times, q)
-        notes.append("no velocities are given: those of the smoothest curve from rest to rest are judged")
+        notes.append("no velocities are given: those of the smoothest curve from rest to rest are validated")
     if a is None:
         a = _changes(motion.times, v)
-        notes.append("no accelerations are given: those of the velocities are judged")
+        notes.append("no accelerations are given: those of the velocities are validated")
     return Fitted(Trajectory(robot.joint_names, motion.times, q, v, a), tuple(notes))
 
 

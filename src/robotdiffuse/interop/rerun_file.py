@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import missing
 from robotdiffuse.interop.scene_primitives import Ball, Brick, Can, Drawn, Points, Triangles, arm, obstacles
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Trajectory
 
 try:
     import rerun as rr

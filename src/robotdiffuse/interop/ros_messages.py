@@ -3,8 +3,8 @@
 from typing import Any
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.interop.recorded_motion import Recorded, recorded
 from robotdiffuse.interop.plain_messages import motion_of
+from robotdiffuse.interop.recorded_motion import Recorded, recorded
 from robotdiffuse.interop.ros_types import JOINT_STATE, header_seconds, plain
 
 
@@ -14,7 +14,7 @@ def motion_in(kind: str, messages: list[tuple[int, Any]], where: str) -> Recorde
         raise InputError(f"{where} holds no messages")
     if kind != JOINT_STATE:
         if len(messages) > 1:
-            raise InputError(f"{where} holds {len(messages)} motions; one is judged at a time")
+            raise InputError(f"{where} holds {len(messages)} motions; one is validated at a time")
         return motion_of(plain(messages[0][1]), where)
     states = [plain(message) for _, message in messages]
     names, logged = states[0]["name"], messages[0][0]

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import missing
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.types import Trajectory
 
 try:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import yaml
 
-from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.interop.recorded_motion import Recorded
-from robotdiffuse.interop.plain_messages import joint_trajectory, motion_of
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.core.input_files import LARGEST_YAML, parse_yaml, read_text
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import Trajectory
+from robotdiffuse.interop.plain_messages import joint_trajectory, motion_of
+from robotdiffuse.interop.recorded_motion import Recorded
+from robotdiffuse.problems.problem import Problem
 
 
 def read(file: Path, topic: str | None = None) -> Recorded:

@@ -4,9 +4,10 @@ import shutil
 from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, shortened
-from robotdiffuse.interop.ros_messages import motion_in
-from robotdiffuse.interop.recorded_motion import Recorded
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop.plain_messages import joint_trajectory
+from robotdiffuse.interop.recorded_motion import Recorded
+from robotdiffuse.interop.ros_messages import motion_in
 from robotdiffuse.interop.ros_types import (
     DISPLAY_TRAJECTORY,
     JOINT_TRAJECTORY,
@@ -16,7 +17,6 @@ from robotdiffuse.interop.ros_types import (
     typestore,
 )
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.types import Trajectory
 
 try:
     from rosbags.highlevel import AnyReader

@@ -3,9 +3,9 @@
 from typing import Any
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import missing
 from robotdiffuse.interop.plain_messages import joint_trajectory
-from robotdiffuse.core.types import Trajectory
 
 try:
     import roslibpy
@@ -23,7 +23,7 @@ def publish(
     topic: str = "/joint_trajectory",
     timeout: float = 5.0,
 ) -> None:
-    """Send a trajectory once, as a JointTrajectory. The caller has judged it.
+    """Send a trajectory once, as a JointTrajectory. The caller has validated it.
 
     Raises InputError where no rosbridge answers within `timeout` [s].
     """

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
 from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
-from robotdiffuse.core.transforms import transform
 
 Color = tuple[int, int, int]
 OBSTACLE: Color = (0xD9, 0x7B, 0x5C)

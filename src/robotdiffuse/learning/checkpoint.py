@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError, shortened
 from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning.completion.network import CompletionNetwork, CompletionSettings
 from robotdiffuse.learning.encoders import COMPLETES, ENCODERS, encoder_name, make_encoder
 from robotdiffuse.learning.encoders.base import Encoder
@@ -34,7 +35,6 @@ from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.weights_registry import BUNDLED, check_weights, untrained, weights_for
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.settings import Settings
 
 FORMAT = 2
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.collision.batched_clearances import packed_clearances_and_gradients, packed_link_clearances
+from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.learning.motion_model import ClearanceFn, MotionModelSettings
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes

@@ -32,10 +32,10 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import NotNegative, Positive, Settings, Share
 from robotdiffuse.learning.costs import COSTS
 from robotdiffuse.learning.costs.cost import Cost
 from robotdiffuse.learning.guidance_kernel import OFF, Steps, descend
-from robotdiffuse.core.settings import NotNegative, Positive, Settings, Share
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Bound, Count, OneOf, Positive, Settings, SettingsOf
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.base import Denoiser, DenoiserSettings
 from robotdiffuse.learning.denoisers.layers import Linear
@@ -28,7 +29,6 @@ from robotdiffuse.learning.representation import TARGETS, Between, TrajectoryRow
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.samplers.sampler import Predict, Sampler
-from robotdiffuse.core.settings import Bound, Count, OneOf, Positive, Settings, SettingsOf
 
 MAX_POINTS = 2048
 """Larger clouds are thinned to this many points by chance before they are encoded; to as many as an encoder

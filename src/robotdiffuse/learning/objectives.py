@@ -14,8 +14,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.diffusion import NoiseSchedule
 from robotdiffuse.core.registry import Entry, Registry
+from robotdiffuse.learning.diffusion import NoiseSchedule
 
 Array = TypeVar("Array", ndarray, Tensor)
 """Clean, noise, noisy trajectories and network outputs are all of one kind and shape, [..., waypoints,

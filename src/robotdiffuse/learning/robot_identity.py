@@ -7,8 +7,8 @@ import numpy as np
 
 from robotdiffuse.collision.kernel_arrays import robot_groups
 from robotdiffuse.core.errors import InputError, joined, shortened
-from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.core.settings import Settings
+from robotdiffuse.robots.robot import Robot, once_per_robot
 
 if TYPE_CHECKING:
     from robotdiffuse.robots.normalizer import JointNormalizer
@@ -26,7 +26,7 @@ class RobotIdentity(Settings):
     joint_names: tuple[str, ...]
     lower: tuple[float, ...]
     """Limits that joint values are normalised by [rad], [m] for prismatic joints. A robot with others will
-    do: the judge knows its own."""
+    do: the validator knows its own."""
     upper: tuple[float, ...]
     frame_offsets: tuple[tuple[tuple[float, ...], ...], ...]
     """`Robot.frame_offsets`, to tell robots of the same joints but other measures."""

@@ -7,8 +7,8 @@ from pathlib import Path as FilePath
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
-from robotdiffuse.robots.user_data_dir import user_robots
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.user_data_dir import user_robots
 
 BUNDLED = FilePath(__file__).parent / "weights"
 """Weights that come with the package, one folder per robot."""

@@ -1,4 +1,4 @@
-"""Rungs of the policies for unseen space: obstacles beside what was seen, with the ends carved free."""
+"""Assumptions of the policies for unknown space: obstacles beside what was seen, with the ends carved free."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
-from robotdiffuse.perception.swept_voxels_kernel import mark, surface
-from robotdiffuse.problems.problem import IMAGINED, OCCUPIED, PADDED, Problem
-from robotdiffuse.perception.seen_points_kernel import near_scene, sphere_distances
-from robotdiffuse.perception.depth_view import SeenPoints, UnseenPoints
+from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume
+from robotdiffuse.perception.seen_points_kernel import near_scene, sphere_distances
+from robotdiffuse.perception.swept_voxels_kernel import mark, surface
+from robotdiffuse.problems.problem import OCCUPIED, PADDED, PREDICTED, Problem
 from robotdiffuse.scenes.point_cloud import voxel_thin
 
 PADDINGS = (0.09, 0.06, 0.04)
@@ -28,11 +28,11 @@ THRESHOLDS = (0.1, 0.2, 0.35, 0.5)
 CARVED = 0.02
 """Voxels nearer to an end's covering spheres than this are none [m]."""
 FINE = VOXEL / 2
-"""Edge of an imagined voxel [m]."""
+"""Edge of an predicted voxel [m]."""
 FINE_SHAPE = (2 * SHAPE[0], 2 * SHAPE[1], 2 * SHAPE[2])
 
 
-class Rung(ABC):
+class Assumption(ABC):
     """Obstacles beside what was seen."""
 
     name: str
@@ -46,12 +46,12 @@ class Rung(ABC):
         return int(self._touched(spheres).sum())
 
     @abstractmethod
-    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
         """What is left of them then."""
 
 
 @dataclass(frozen=True, eq=False)
-class Padded(Rung):
+class Padded(Assumption):
     """Points that are larger than they were seen."""
 
     points: Float[ndarray, "points 3"]
@@ -65,12 +65,12 @@ class Padded(Rung):
     def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "points"]:
         return sphere_distances(self.points, spheres) < PADDED_SHARE * self.padding + PADDED_MORE
 
-    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
-        return UnseenPoints(self.points[~self._touched(spheres)], self.padding, name="padded")
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
+        return AssumedPoints(self.points[~self._touched(spheres)], self.padding, name="padded")
 
 
 @dataclass(frozen=True, eq=False)
-class Voxels(Rung):
+class Voxels(Assumption):
     """Voxels of the observed volume, or their eighths."""
 
     name: str
@@ -84,7 +84,7 @@ class Voxels(Rung):
     def _touched(self, spheres: Float32[ndarray, "n 4"]) -> Bool[ndarray, "nx ny nz"]:
         return self.occupied & voxels_in(spheres, CARVED + self.edge / 2, self.edge)
 
-    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> UnseenPoints:
+    def obstacles(self, spheres: Float32[ndarray, "n 4"]) -> AssumedPoints:
         """Those at the surface, for the arm, which starts outside, cannot get within; without those that it
         cannot reach and those in shapes that are known."""
         points = (surface(self.occupied & ~self._touched(spheres)) + 0.5) * self.edge + LOW
@@ -93,7 +93,7 @@ class Voxels(Rung):
         if known.shapes:
             inside = np.float32(self.edge / 2 - 1e-3)
             points = points[~near_scene(compile_scene_for(robot, known), points.astype(np.float32), inside)]
-        return UnseenPoints(points, self.edge / 2, name="unseen")
+        return AssumedPoints(points, self.edge / 2, name="unknown")
 
 
 def fine(voxels: Bool[ndarray, "mx my mz"]) -> Bool[ndarray, "nx ny nz"]:
@@ -111,21 +111,21 @@ def voxels_in(
     return out
 
 
-def rungs(
-    problem: Problem, volume: ObservedVolume, imagined: Float32[ndarray, "nx ny nz"] | None
-) -> Iterator[Rung]:
+def assumptions(
+    problem: Problem, volume: ObservedVolume, predicted: Float32[ndarray, "nx ny nz"] | None
+) -> Iterator[Assumption]:
     """Those of the problem's policy, the most careful first.
 
-    `imagined`: the probability that each fine voxel is occupied, for the policy of that name.
+    `predicted`: the probability that each fine voxel is occupied, for the policy of that name.
     """
-    if problem.unseen == PADDED:
+    if problem.unknown == PADDED:
         seen = [shape.points for shape in problem.scene.shapes if isinstance(shape, SeenPoints)]
         points = np.concatenate([np.zeros((0, 3)), *seen])
         for padding in PADDINGS:
             yield Padded(voxel_thin(points, padding * THIRD), padding)
-    elif problem.unseen == IMAGINED:
-        assert imagined is not None
+    elif problem.unknown == PREDICTED:
+        assert predicted is not None
         for threshold in THRESHOLDS:
-            yield Voxels(f"imagined, p > {threshold:g}", imagined > threshold, problem)
-    elif problem.unseen == OCCUPIED:
-        yield Voxels("unseen is occupied", volume.unknown, problem)
+            yield Voxels(f"predicted, p > {threshold:g}", predicted > threshold, problem)
+    elif problem.unknown == OCCUPIED:
+        yield Voxels("unknown is occupied", volume.unknown, problem)

@@ -136,5 +136,5 @@ class SeenPoints(PointCloud):
     """What a problem has of its views, beside the shapes that it was given."""
 
 
-class UnseenPoints(PointCloud):
+class AssumedPoints(PointCloud):
     """What is taken for occupied beside what was seen."""

@@ -14,10 +14,10 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import numbers, positive, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 from robotdiffuse.core.input_files import input_file, read_arrays
+from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
-from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 
 DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
 MILLIMETRE = 0.001

@@ -9,10 +9,10 @@ from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.free_space_kernel import BEHIND, FREE, OUT, SHADOW, carve
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.perception.free_space_kernel import BEHIND, FREE, OUT, SHADOW, carve
-from robotdiffuse.perception.depth_view import DepthView
 
 VOXEL = 0.04
 """Edge of a voxel [m]."""

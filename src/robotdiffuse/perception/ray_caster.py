@@ -9,15 +9,15 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.ray_kernel import BOX, CAPSULE, CYLINDER, SPHERE, draw
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
-from robotdiffuse.perception.voxel_kernel import fill
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import transform
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.ray_kernel import BOX, CAPSULE, CYLINDER, SPHERE, draw
+from robotdiffuse.perception.voxel_kernel import fill
+from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
 
 FAR = 4.0
 """Nothing farther than this is seen [m]."""

@@ -7,6 +7,7 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_scene_for, reach_bound
+from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.perception.seen_points_kernel import (
     gather_cloud,
     gather_image,
@@ -16,7 +17,6 @@ from robotdiffuse.perception.seen_points_kernel import (
 )
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.scene import Scene
 
 VOXEL = 0.015

@@ -8,30 +8,30 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot
+from robotdiffuse.core.types import Path
 from robotdiffuse.perception.assumptions import CARVED, FINE, FINE_SHAPE, fine, voxels_in
+from robotdiffuse.perception.observed_volume import LOW, ObservedVolume
 from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, sweep
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
-from robotdiffuse.perception.observed_volume import LOW, ObservedVolume
-from robotdiffuse.core.types import Path
 
 Box = tuple[tuple[float, ...], tuple[float, ...]]
 """Low and high corner [m]."""
 
 
-class UnseenSpace:
-    """What no view of a problem saw, less what the arm fills at its ends, and what is imagined there."""
+class UnknownSpace:
+    """What no view of a problem saw, less what the arm fills at its ends, and what is predicted there."""
 
     def __init__(
-        self, problem: Problem, volume: ObservedVolume, imagined: Float32[ndarray, "nx ny nz"] | None
+        self, problem: Problem, volume: ObservedVolume, predicted: Float32[ndarray, "nx ny nz"] | None
     ) -> None:
-        """`imagined`: the probability that each fine voxel is occupied; None where nothing says so."""
+        """`predicted`: the probability that each fine voxel is occupied; None where nothing says so."""
         self._robot = compile_robot(problem.robot)
         goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
         ends = [placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals)]
         self.unknown = fine(volume.unknown)
         self.unknown &= ~voxels_in(np.concatenate(ends), CARVED)
-        self.probability = None if imagined is None else np.where(self.unknown, imagined, np.float32(0))
+        self.probability = None if predicted is None else np.where(self.unknown, predicted, np.float32(0))
 
     def crossed(self, path: Path) -> "Crossed":
         """The unknown voxels that the arm passes through."""
@@ -43,20 +43,20 @@ class UnseenSpace:
 
 @dataclass(frozen=True, eq=False)
 class Crossed:
-    """What a motion crosses of unseen space."""
+    """What a motion crosses of unknown space."""
 
     voxels: Bool[ndarray, "nx ny nz"]
     probability: Float32[ndarray, "nx ny nz"] | None
 
     @cached_property
     def risk(self) -> float | None:
-        """The voxels' summed probability; None where none is imagined."""
+        """The voxels' summed probability; None where none is predicted."""
         return None if self.probability is None else float(summed(self.probability, self.voxels))
 
     @property
     def region(self) -> Box | None:
         """The corners of a box around that connected part of them which is likeliest to be occupied; around
-        the largest where nothing is imagined."""
+        the largest where nothing is predicted."""
         if not self.voxels.any():
             return None
         weights = np.ones(FINE_SHAPE, np.float32) if self.probability is None else self.probability

@@ -10,9 +10,9 @@ from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import SHORT
 
 if TYPE_CHECKING:
+    from robotdiffuse.core.results import PlanResult
     from robotdiffuse.planning.planner import Planner
     from robotdiffuse.problems.problem import Problem
-    from robotdiffuse.core.results import PlanResult
 
 
 SEARCH, LEARNED, HYBRID = "search", "learned", "hybrid"
@@ -79,9 +79,14 @@ PLANNERS = Registry(
             "MPD: an unconditional diffusion prior, guided by costs while it samples",
         ),
         "edmp": _entry(
-            "baselines.edmp:EDMP", "EDMPSettings", LEARNED, "EDMP: such a prior, guided by an ensemble of costs"
+            "baselines.edmp:EDMP",
+            "EDMPSettings",
+            LEARNED,
+            "EDMP: such a prior, guided by an ensemble of costs",
         ),
-        "a_star": _entry("baselines.lattice.planner:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"),
+        "a_star": _entry(
+            "baselines.lattice.planner:AStar", "AStarSettings", SEARCH, "A* on a lattice of joint values"
+        ),
         "d_star_lite": _entry(
             "baselines.lattice.planner:DStarLite",
             "DStarLiteSettings",

@@ -10,16 +10,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import LARGEST
 from robotdiffuse.collision.kernels.compiled import compile_seconds
+from robotdiffuse.core.bounds import LARGEST
 from robotdiffuse.core.deadline import OutOfTimeError, check_left
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.trajectories.speed_limits import DEFAULT, NOTHING, Beside, Pace, TimingSettings
-from robotdiffuse.trajectories.timing import time_parameterize
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Positive, Settings
 from robotdiffuse.core.types import SHORT, UNTIL, Path, Status, Trajectory
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.trajectories.speed_limits import DEFAULT, NOTHING, Beside, Pace, TimingSettings
+from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import Report, Verifier, Violation, verifier
 
 CLEARANCE = 0.01
@@ -29,11 +29,11 @@ CLOSE_ROWS = 0.002
 """Time between the rows of motions under path constraints, whose corners are many and near to each other
 [s]."""
 AMPLE = 5.0
-"""Times that a path could be judged and timed in the time left, where the first one found is at once."""
+"""Times that a path could be validated and timed in the time left, where the first one found is at once."""
 MOST_RESERVED = 0.5
-"""Share of the time limit that is kept back at most before a path is judged."""
+"""Share of the time limit that is kept back at most before a path is validated."""
 _finishing: dict[str, float] = {}
-"""What judging and timing took of late, by robot [s]: so much of a call's time is kept back for it."""
+"""What validating and timing took of late, by robot [s]: so much of a call's time is kept back for it."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def _timing(request: Request, constrained: bool) -> TimingSettings:
     )
 
 
-class Call:
+class PlanningContext:
     """One call of plan(); see the head of this file."""
 
     def __init__(
@@ -82,7 +82,7 @@ class Call:
         """Distance to obstacles that is to be kept where it can be [m]."""
         self.timing = _timing(request, constrained=bool(problem.constraints))
         self._reserved = min(_finishing.get(problem.robot.name, 0.0), MOST_RESERVED * time_limit)
-        self.judge = verifier(problem)
+        self.validator = verifier(problem)
         self.notes = list(problem.notes)
         """What the result will say was changed or ignored; planners may add to it."""
         self._progress: list[tuple[float, float]] = []
@@ -123,12 +123,12 @@ class Call:
 
     @property
     def ample(self) -> bool:
-        """Whether judging a first path takes a small part of the time that is left."""
+        """Whether validating a first path takes a small part of the time that is left."""
         return self._reserved > 0 and self.remaining > AMPLE * self._reserved
 
     @property
     def remaining(self) -> float:
-        """Wall time left for searching [s]; negative when it has run out, or is too short for the judge."""
+        """Wall time left for searching [s]; negative when it has run out, or is too short for the validator."""
         return -1.0 if self._no_time_for else self.search_until - self.elapsed
 
     def fail(self, status: Status, reason: str) -> PlanResult:
@@ -170,7 +170,7 @@ class Call:
         keeps: Callable[[ndarray], bool] = lambda _: True,
         deviations: Float[ndarray, "n"] | None = None,
     ) -> PlanResult | None:
-        """Judge the path through the waypoints and time it; None if it or its motion does not pass.
+        """Validate the path through the waypoints and time it; None if it or its motion does not pass.
 
         `stage` is the part of the planner that the waypoints come from; `notes` are on this path alone;
         `keeps` and `deviations` as in `time_parameterize`.
@@ -198,16 +198,16 @@ class Call:
     ) -> PlanResult | None:
         problem = self.problem
         path = Path(problem.robot.joint_names, np.asarray(waypoints, dtype=np.float64))
-        report = self.judge.path(path)
+        report = self.validator.path(path)
         if report.violation is not None:
             return self._refuse(report.violation)
         planning_time = self.elapsed
-        motion = _TimedMotion(self.judge)
+        motion = _TimedMotion(self.validator)
         trajectory = time_parameterize(
             problem.robot,
             path,
             motion.valid,
-            self.judge.collision_free,
+            self.validator.collision_free,
             self.timing,
             keeps,
             0.0 if problem.start_velocity is None else float(np.linalg.norm(problem.start_velocity)),
@@ -245,12 +245,12 @@ class Call:
     @property
     def beside(self) -> Beside:
         """The speeds that constraints bound, and the torques of a payload."""
-        constraints, pace = self.judge.constraints, None
+        constraints, pace = self.validator.constraints, None
         if constraints is not None and len(constraints.paced):
             pace = Pace(constraints.speeds, constraints.most_speeds)
-        if pace is None and self.judge.dynamics is None:
+        if pace is None and self.validator.dynamics is None:
             return NOTHING
-        return Beside(pace, self.judge.dynamics)
+        return Beside(pace, self.validator.dynamics)
 
     def _refuse(self, violation: Violation) -> None:
         self._refused = violation.kind
@@ -261,15 +261,15 @@ def _least(*clearances: float | None) -> float:
 
 
 class _TimedMotion:
-    """Judges trajectories and remembers the last verdict: the one that is kept was mostly just judged."""
+    """Validates trajectories and remembers the last verdict: the one that is kept was mostly just validated."""
 
-    def __init__(self, judge: Verifier) -> None:
-        self.judge = judge
+    def __init__(self, validator: Verifier) -> None:
+        self.validator = validator
         self.last: tuple[Trajectory, Report] | None = None
 
     def report(self, trajectory: Trajectory) -> Report:
         if self.last is None or self.last[0] is not trajectory:
-            self.last = trajectory, self.judge.trajectory(trajectory)
+            self.last = trajectory, self.validator.trajectory(trajectory)
         return self.last[1]
 
     def valid(self, trajectory: Trajectory) -> bool:

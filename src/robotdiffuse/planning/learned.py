@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.settings import Settings
 from robotdiffuse.learning.weights_registry import check_weights
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.settings import Settings
 
 SAMPLES_PER_GOAL = 4
 """So many samples are drawn at least for each goal that has a share of a batch."""

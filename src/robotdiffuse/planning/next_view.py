@@ -9,14 +9,14 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import rigid_transform
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.perception.assumptions import FINE, fine, voxels_in
-from robotdiffuse.perception.visibility_kernel import seen_weights
-from robotdiffuse.perception.unknown_space import UnseenSpace
-from robotdiffuse.problems.problem import IMAGINED, Problem
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.robots.kinematics import placed_spheres
+from robotdiffuse.perception.assumptions import FINE, fine, voxels_in
 from robotdiffuse.perception.observed_volume import LOW, observe
 from robotdiffuse.perception.ray_caster import looking_at
+from robotdiffuse.perception.unknown_space import UnknownSpace
+from robotdiffuse.perception.visibility_kernel import seen_weights
+from robotdiffuse.problems.problem import PREDICTED, Problem
+from robotdiffuse.robots.kinematics import placed_spheres
 
 RING = 1.6
 """Distance of the camera poses that are tried by themselves from the base's axis [m] ..."""
@@ -53,8 +53,8 @@ def next_view(
     of a result sweeps.
 
     `poses`: those that can be reached, T_base_camera each; None: `poses_around`. A voxel counts as seen as
-    far as nothing is likely to be in the way: neither what was seen, nor what is imagined, nor the arm at
-    the problem's start. With another policy than `imagined`, each unseen voxel that is swept counts the same.
+    far as nothing is likely to be in the way: neither what was seen, nor what is predicted, nor the arm at
+    the problem's start. With another policy than `predicted`, each unknown voxel that is swept counts the same.
     Raises InputError without views, without a motion and without poses.
     """
     if not problem.views:
@@ -67,12 +67,12 @@ def next_view(
     if not candidates:
         raise InputError("next_view: poses is empty; at least one camera pose is needed")
     volume = observe(problem.views, problem.robot, problem.start)
-    imagined = None
-    if problem.unseen == IMAGINED:
-        from robotdiffuse.learning.completion import imagine
+    predicted = None
+    if problem.unknown == PREDICTED:
+        from robotdiffuse.learning.completion import predict
 
-        imagined = imagine(volume)
-    crossed = UnseenSpace(problem, volume, imagined).crossed(result.path)
+        predicted = predict(volume)
+    crossed = UnknownSpace(problem, volume, predicted).crossed(result.path)
     likely = crossed.voxels.astype(np.float32)
     if crossed.probability is not None:
         likely *= crossed.probability
@@ -81,8 +81,8 @@ def next_view(
     if not len(at):
         return NextView(candidates[0], 1.0)
     filled = fine(volume.occupied).astype(np.float32)
-    if imagined is not None:
-        np.maximum(filled, imagined, out=filled)
+    if predicted is not None:
+        np.maximum(filled, predicted, out=filled)
     filled[voxels_in(placed_spheres(problem.robot, problem.start).astype(np.float32))] = 1.0
     image = problem.views[0]
     seen = seen_weights(

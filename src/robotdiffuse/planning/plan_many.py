@@ -9,15 +9,15 @@ from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
-from robotdiffuse.planning.planner import Planner
-from robotdiffuse.planning.context import Call, Request
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.core.processes import LoneWorker
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Status
+from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
+from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.robot import Robot
 
 
 def plan_many(
@@ -49,7 +49,9 @@ def plan_many(
     load_planner(planner, settings, weights)
     asked = dict(request)
     if problems:
-        Call(planner, problems[0], asked.pop("time_limit", 1.0), asked.pop("seed", 0), Request(**asked))
+        PlanningContext(
+            planner, problems[0], asked.pop("time_limit", 1.0), asked.pop("seed", 0), Request(**asked)
+        )
     count = min(workers or os.cpu_count() or 1, len(problems))
     return _planned(problems, (planner, settings, weights), count, request)
 

@@ -8,16 +8,16 @@ from typing import ClassVar, Generic, TypeVar
 from robotdiffuse.collision.motions import finer
 from robotdiffuse.core.deadline import OutOfTimeError, deadline
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.context import Call, Request
-from robotdiffuse.planning.start_goal import Ends, usable_ends
-from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Settings
+from robotdiffuse.core.types import FIRST, SHORT
+from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
+from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import FIRST, SHORT
 
 Own = TypeVar("Own", bound=Settings)
 WARM_UP, SLIGHT = 1.0, 0.02
@@ -73,7 +73,7 @@ class Planner(ABC, Generic[Own]):
         Where the problem has waypoints, the motion stops at each or passes within its blend:
         `planning/pipeline/waypoints.py`. Where obstacles move, it waits, goes slower or draws back on its path:
         `planning/pipeline/moving_obstacles.py`. Where the problem has a start velocity, it begins moving:
-        `planning/pipeline/start_velocity.py`. Where cameras saw the scene, `problem.unseen` says what the rest is taken
+        `planning/pipeline/start_velocity.py`. Where cameras saw the scene, `problem.unknown` says what the rest is taken
         for: `planning/pipeline/unknown_space.py`. Path constraints are for aorrtc, rrt_connect
         and robotdiffuse, `planners/constrained`, and for diffusion.
 
@@ -99,9 +99,9 @@ class Planner(ABC, Generic[Own]):
 
             return plan_in_motion(self, problem, time_limit, seed, request)
         if problem.views:
-            from robotdiffuse.planning.pipeline.unknown_space import plan_beside_unseen
+            from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 
-            return plan_beside_unseen(self, problem, time_limit, seed, request)
+            return plan_with_unknown_space(self, problem, time_limit, seed, request)
         return self.attempt(problem, time_limit, seed, request)
 
     def _check_keeps(self, problem: Problem, request: Request) -> None:
@@ -113,13 +113,13 @@ class Planner(ABC, Generic[Own]):
 
     def attempt(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
         """`plan` in the problem's scene as it is."""
-        call = Call(self.name, problem, time_limit, seed, request)
-        with deadline(lambda: call.time_limit - call.elapsed):
+        context = PlanningContext(self.name, problem, time_limit, seed, request)
+        with deadline(lambda: context.time_limit - context.elapsed):
             try:
-                ends = usable_ends(call)
-                return ends if isinstance(ends, PlanResult) else self.solve(call, ends)
+                start_goal = usable_start_goal(context)
+                return start_goal if isinstance(start_goal, PlanResult) else self.solve(context, start_goal)
             except OutOfTimeError as error:
-                return call.out_of_time(str(error))
+                return context.out_of_time(str(error))
 
     def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
         """Load the compiled code that calls on such a problem need, or compile it on a new machine, which
@@ -160,15 +160,15 @@ class Planner(ABC, Generic[Own]):
         self.load_wanted(robot)
 
     @abstractmethod
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """Search from the ends until `call.finish` accepts a path, or there is none: `call.unsolved`."""
 
 
-def ever_finer(call: Call, settings: Own) -> Iterator[tuple[Own, int]]:
+def ever_finer(context: PlanningContext, settings: Own) -> Iterator[tuple[Own, int]]:
     """The settings and number of each attempt, until time runs out. From one to the next the resolution is
-    halved: for planners whose path the judge refused."""
+    halved: for planners whose path the validator refused."""
     attempt = 0
-    while attempt == 0 or call.remaining > 0:
+    while attempt == 0 or context.remaining > 0:
         yield settings, attempt
         settings = replace(settings, resolution=finer(settings.resolution))  # type: ignore
         attempt += 1

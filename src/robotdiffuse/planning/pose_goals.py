@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.constraints import PositionBox
 from robotdiffuse.problems.goals import PoseGoal, PosesGoal
-from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, beside, inverse_kinematics
 from robotdiffuse.validation.tolerances import DEFAULT, goal_error

@@ -11,12 +11,12 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.planning.context import Call
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Status
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.types import Status
 
 if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
@@ -32,7 +32,7 @@ BEYOND_ENDS = np.pi / 2
 """How far a continuous joint may turn beyond start and goals in a search [rad]."""
 
 
-class Ends:
+class StartGoal:
     """Start and goals that the spheres call free, with the ends near contact that they stand for.
 
     A continuous joint begins within half a turn here; `complete` adds the whole turns that it really has. A
@@ -78,19 +78,19 @@ class Ends:
         (`collision.kernels.motions.padding_near`).
         """
         start, goals = self.rows()
-        ends = np.concatenate([start[None], goals])
+        start_goal = np.concatenate([start[None], goals])
         if clearance <= 0:
-            return self._within(search_space(self.checker, resolution), ends)
-        has = self.checker.link_clearances(ends).min(axis=1, initial=1.0)
+            return self._within(search_space(self.checker, resolution), start_goal)
+        has = self.checker.link_clearances(start_goal).min(axis=1, initial=1.0)
         close = has < clearance + END_MARGIN
-        near = np.column_stack([ends[close], np.maximum(has[close] - END_MARGIN, 0.0)])
-        return self._within(search_space(self.checker, resolution, clearance, near), ends)
+        near = np.column_stack([start_goal[close], np.maximum(has[close] - END_MARGIN, 0.0)])
+        return self._within(search_space(self.checker, resolution, clearance, near), start_goal)
 
-    def _within(self, space: Space, ends: Float[ndarray, "k dof"]) -> Space:
+    def _within(self, space: Space, start_goal: Float[ndarray, "k dof"]) -> Space:
         """The space with continuous joints kept within BEYOND_ENDS of what the ends take up."""
         turning = self._robot.continuous
-        lower = np.where(turning, np.maximum(space.lower, ends.min(axis=0) - BEYOND_ENDS), space.lower)
-        upper = np.where(turning, np.minimum(space.upper, ends.max(axis=0) + BEYOND_ENDS), space.upper)
+        lower = np.where(turning, np.maximum(space.lower, start_goal.min(axis=0) - BEYOND_ENDS), space.lower)
+        upper = np.where(turning, np.minimum(space.upper, start_goal.max(axis=0) + BEYOND_ENDS), space.upper)
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
     def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
@@ -124,25 +124,25 @@ def images(
     return found
 
 
-def usable_ends(call: Call) -> Ends | PlanResult:
+def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
     """The ends that a search of this call can begin and end at, or the result that says why it cannot.
 
     For poses, up to `poses.GOAL_COUNT` configurations by inverse kinematics. Configurations that the covering
     spheres call free come alone; where there are none, those that the exact meshes call free.
     """
-    checker = CollisionChecker(call.problem.robot, call.problem.scene)
-    goals = _usable_goals(call, checker)
+    checker = CollisionChecker(context.problem.robot, context.problem.scene)
+    goals = _usable_goals(context, checker)
     if isinstance(goals, PlanResult):
         return goals
-    ends = Ends(checker, call.problem.start, goals, call.judge.constraints)
-    if ends.start_lead is None:
-        why = closeness(checker, call.problem.start)
-        return call.fail(Status.INVALID_START, f"the start is too close to contact to plan from: {why}")
-    if not ends.goals:
+    start_goal = StartGoal(checker, context.problem.start, goals, context.validator.constraints)
+    if start_goal.start_lead is None:
+        why = closeness(checker, context.problem.start)
+        return context.fail(Status.INVALID_START, f"the start is too close to contact to plan from: {why}")
+    if not start_goal.goals:
         what = "the goal is" if len(goals) == 1 else f"all {len(goals)} goal configurations are"
         why = closeness(checker, goals[0])
-        return call.fail(Status.INVALID_GOAL, f"{what} too close to contact to plan to: {why}")
-    return ends
+        return context.fail(Status.INVALID_GOAL, f"{what} too close to contact to plan to: {why}")
+    return start_goal
 
 
 def retreat(
@@ -151,7 +151,7 @@ def retreat(
     """A configuration nearby that the covering spheres call free, down the gradient of the collision cost.
 
     For a start or goal that the exact meshes call free while the spheres, which stick out, do not. None if no
-    free configuration was found within 1 rad, or it does not keep the constraints. The judge decides on the
+    free configuration was found within 1 rad, or it does not keep the constraints. The validator decides on the
     motion there.
     """
     robot, at = checker.robot, q.copy()
@@ -183,52 +183,56 @@ def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
     )
 
 
-def _usable_goals(call: Call, checker: CollisionChecker) -> Float[ndarray, "k dof"] | PlanResult:
-    robot, scene, start = call.problem.robot, call.problem.scene, call.problem.start
+def _usable_goals(
+    context: PlanningContext, checker: CollisionChecker
+) -> Float[ndarray, "k dof"] | PlanResult:
+    robot, scene, start = context.problem.robot, context.problem.scene, context.problem.start
     if not checker.free(start[None])[0]:
         collision = _explained(robot, scene, start)
         if collision is not None:
-            return call.fail(Status.INVALID_START, f"the start is in collision: {collision}")
-    constraints = call.judge.constraints
+            return context.fail(Status.INVALID_START, f"the start is in collision: {collision}")
+    constraints = context.validator.constraints
     wrong = None if constraints is None else constraints.worst(start)
     if wrong is not None:
-        return call.fail(Status.INVALID_START, f"the start does not keep the constraints: {wrong.message}")
-    heavy = _too_heavy(call, start)
+        return context.fail(Status.INVALID_START, f"the start does not keep the constraints: {wrong.message}")
+    heavy = _too_heavy(context, start)
     if heavy is not None:
-        return call.fail(Status.INVALID_START, f"the payload cannot be held at the start: {heavy}")
-    goals = _goals(call, call.problem.goal, checker)
+        return context.fail(Status.INVALID_START, f"the payload cannot be held at the start: {heavy}")
+    goals = _goals(context, context.problem.goal, checker)
     if isinstance(goals, PlanResult):
         return goals
-    held = [q for q in goals if _too_heavy(call, q) is None]
+    held = [q for q in goals if _too_heavy(context, q) is None]
     if not held:
         reason = f"the payload cannot be held at the goal: {_too_heavy(call, goals[0])}"
-        return call.fail(Status.INVALID_GOAL, reason)
+        return context.fail(Status.INVALID_GOAL, reason)
     return goals if len(held) == len(goals) else np.stack(held)
 
 
-def _too_heavy(call: Call, q: Float[ndarray, "dof"]) -> str | None:
+def _too_heavy(context: PlanningContext, q: Float[ndarray, "dof"]) -> str | None:
     """Which joint cannot hold the problem's payload there."""
-    return None if call.judge.dynamics is None else call.judge.dynamics.too_much(q)
+    return None if context.validator.dynamics is None else context.validator.dynamics.too_much(q)
 
 
-def _goals(call: Call, goal: Goal, checker: CollisionChecker) -> Float[ndarray, "k dof"] | PlanResult:
+def _goals(
+    context: PlanningContext, goal: Goal, checker: CollisionChecker
+) -> Float[ndarray, "k dof"] | PlanResult:
     """Configurations of a goal that are free, of any of several goals; or why there are none."""
     if isinstance(goal, AnyGoal):
-        each = [_goals(call, one, checker) for one in goal.goals]
+        each = [_goals(context, one, checker) for one in goal.goals]
         found = [goals for goals in each if not isinstance(goals, PlanResult)]
         if found:
             return np.concatenate(found)
         none = next(result for result in each if isinstance(result, PlanResult))
         return replace(none, reason=f"none of {len(each)} goals can be reached, the first: {none.reason}")
     if isinstance(goal, JointGoal):
-        return _free_goals(call, goal, checker)
-    return _pose_goals(call, goal, checker)
+        return _free_goals(context, goal, checker)
+    return _pose_goals(context, goal, checker)
 
 
 def _free_goals(
-    call: Call, goal: JointGoal, checker: CollisionChecker
+    context: PlanningContext, goal: JointGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    positions, constraints = goal.positions, call.judge.constraints
+    positions, constraints = goal.positions, context.validator.constraints
     if constraints is not None:
         kept = constraints.kept(positions)
         if not kept.any():
@@ -236,38 +240,40 @@ def _free_goals(
             wrong = constraints.worst(positions[0])
             assert wrong is not None
             reason = f"{what} not keep the constraints: {wrong.message}"
-            return call.fail(Status.INVALID_GOAL, reason)
+            return context.fail(Status.INVALID_GOAL, reason)
         positions = positions[kept]
     free = checker.free(positions)
     if free.any():
         return positions[free]
-    collisions = [_explained(call.problem.robot, call.problem.scene, q) for q in positions]
+    collisions = [_explained(context.problem.robot, context.problem.scene, q) for q in positions]
     kept = [q for q, collision in zip(positions, collisions, strict=True) if collision is None]
     if kept:
         return np.stack(kept)
     what = "the goal is" if len(collisions) == 1 else f"all {len(collisions)} goal configurations are"
-    return call.fail(Status.INVALID_GOAL, f"{what} in collision: {collisions[0]}")
+    return context.fail(Status.INVALID_GOAL, f"{what} in collision: {collisions[0]}")
 
 
 def _pose_goals(
-    call: Call, goal: PoseGoal | PosesGoal, checker: CollisionChecker
+    context: PlanningContext, goal: PoseGoal | PosesGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    from robotdiffuse.planning.pose_goals import reaching  # and inverse kinematics, which most calls do not need
+    from robotdiffuse.planning.pose_goals import (
+        reaching,  # and inverse kinematics, which most calls do not need
+    )
 
-    problem, robot, scene = call.problem, call.problem.robot, call.problem.scene
-    constraints, rng = call.judge.constraints, call.rng
+    problem, robot, scene = context.problem, context.problem.robot, context.problem.scene
+    constraints, rng = context.validator.constraints, context.rng
     found = reaching(problem, goal, constraints, rng, checker.free)
     if len(found):
-        return _by_turns(call, found)
-    until, collisions = call.elapsed + LOOKING * call.remaining, list[str | None]()
+        return _by_turns(context, found)
+    until, collisions = context.elapsed + LOOKING * context.remaining, list[str | None]()
     for _ in range(ROUNDS):
         reached = reaching(problem, goal, constraints, rng)
         found = [_explained(robot, scene, q) for q in reached]
         kept = [q for q, collision in zip(reached, found, strict=True) if collision is None]
         if kept:
-            return _by_turns(call, kept)
+            return _by_turns(context, kept)
         collisions += found
-        if not goal.tolerant or call.elapsed > until:
+        if not goal.tolerant or context.elapsed > until:
             break
     places = [", ".join(f"{value:.3f}" for value in pose.T_base_frame[:3, 3]) for pose in poses_of(goal)]
     named = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
@@ -277,23 +283,23 @@ def _pose_goals(
         wrong = constraints.worst(any_of_it[0]) if len(any_of_it) else None
         if wrong is not None:
             what = f"no configuration was found for {of_poses} that keeps the"
-            return call.fail(Status.INVALID_GOAL, f"{what} constraints, e.g. {wrong.message}")
+            return context.fail(Status.INVALID_GOAL, f"{what} constraints, e.g. {wrong.message}")
     if not collisions:
         several = poses_of(goal) if len(named) > 1 else ()
         alone = [pose.frame for pose in several if not len(reaching(problem, pose, None, rng))]
         brought = " and ".join(f"{frame} to the pose at {named[frame]}" for frame in alone or named)
-        return call.fail(
+        return context.fail(
             Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {brought}"
         )
-    return call.fail(
+    return context.fail(
         Status.INVALID_GOAL,
         f"all {len(collisions)} configurations found for {of_poses} are in collision, e.g. {collisions[0]}",
     )
 
 
-def _by_turns(call: Call, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:
+def _by_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:
     """Goals of a pose, which does not say how often a joint turns."""
-    robot, start = call.problem.robot, call.problem.start
+    robot, start = context.problem.robot, context.problem.start
     return np.concatenate([robot.same_stance(q, start) for q in goals])
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import inverse, rotation_angle, rotation_z_to, transform
 from robotdiffuse.problems import constraint_kernel as kernel
 from robotdiffuse.problems.constraint_kernel import CONE, DISTANCE, TURN, Rows
 from robotdiffuse.problems.constraints import (
@@ -24,7 +25,6 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.inverse_kinematics import KINDS
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.transforms import inverse, rotation_angle, rotation_z_to, transform
 
 FINEST = 1e-7
 """Share of a segment down to which a proof splits it."""

@@ -10,15 +10,11 @@ import yaml
 
 from robotdiffuse.core.bounds import numbers
 from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.input_files import no_files, parse_json, parse_yaml, read_text, read_yaml
+from robotdiffuse.core.transforms import pose_entry
+from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.perception.depth_view_files import read_views, view_entry
 from robotdiffuse.problems.constraint_files import constraint_entry, read_constraints
-from robotdiffuse.problems.robot_setup_files import (
-    equipment_entries,
-    equipped,
-    payload_entry,
-    read_payload,
-    read_pose,
-    rounded,
-)
 from robotdiffuse.problems.goal_files import goal_entry, read_goal, read_waypoints
 from robotdiffuse.problems.moveit import (
     MoveItRequest,
@@ -36,18 +32,22 @@ from robotdiffuse.problems.problem import (
     check_clearance,
     moved_goal,
 )
-from robotdiffuse.core.input_files import no_files, parse_json, parse_yaml, read_text, read_yaml
+from robotdiffuse.problems.robot_setup_files import (
+    equipment_entries,
+    equipped,
+    payload_entry,
+    read_payload,
+    read_pose,
+    rounded,
+)
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import MOVING_KINDS, Robot
-from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.depth_view_files import read_views, view_entry
 from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.transforms import pose_entry
 
 FIELDS = ("robot", "scene", "start", "goal")
 OPTIONAL = (
-    *("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unseen"),
+    *("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unknown"),
     *("moving", "start_velocity", "blend", "payload"),
 )
 
@@ -162,8 +162,8 @@ def problem_record(
         record["clearance"] = problem.clearance
     if views:
         record["views"] = as_given([view_entry(view, folder) for view in views])
-    if problem.unseen != OPTIMISTIC:
-        record["unseen"] = problem.unseen
+    if problem.unknown != OPTIMISTIC:
+        record["unknown"] = problem.unknown
     return record
 
 
@@ -261,7 +261,7 @@ def _requested(
     request: MoveItRequest,
     clearance: float | None = None,
     views: tuple[DepthView, ...] = (),
-    unseen: str = OPTIMISTIC,
+    unknown: str = OPTIMISTIC,
 ) -> Problem:
     held = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
     held -= {*robot.joint_names}
@@ -279,9 +279,9 @@ def _requested(
         robot = holding_at(robot, held, start)
     if request.pose_goal is not None:
         goal = PoseGoal(*request.pose_goal)
-        return Problem(robot, scene, start, goal, request.notes, clearance, views, unseen)
+        return Problem(robot, scene, start, goal, request.notes, clearance, views, unknown)
     goals = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
-    return Problem(robot, scene, start, JointGoal(goals), request.notes, clearance, views, unseen)
+    return Problem(robot, scene, start, JointGoal(goals), request.notes, clearance, views, unknown)
 
 
 def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot] | None = None) -> Problem:
@@ -308,7 +308,7 @@ def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot]
             scene, more = read_scene(values["scene"], folder)
             notes += more
         views, more = read_views(values.get("views", []), folder)
-        unseen = values.get("unseen", OPTIMISTIC)
+        unknown = values.get("unknown", OPTIMISTIC)
         for name in ("waypoints", "blend", "moving", "start_velocity"):
             if requested and name in values:
                 raise InputError(f"{name} is for problems with start and goal in the file, not a request")
@@ -316,10 +316,10 @@ def _problem(where: str, data: object, folder: Path, robots: Mapping[str, Robot]
         payload = read_payload(values["payload"]) if "payload" in values else None
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
-            asked = _requested(robot, scene, request, clearance, views, unseen)
+            asked = _requested(robot, scene, request, clearance, views, unknown)
             return replace(asked, constraints=kept, payload=payload) if kept or payload else asked
         goal, notes = read_goal("goal", values["goal"], scene), (*notes, *more)
-        asked = robot, scene, values["start"], goal, notes, clearance, views, unseen
+        asked = robot, scene, values["start"], goal, notes, clearance, views, unknown
         more = {
             "waypoints": read_waypoints(values.get("waypoints", []), scene),
             "constraints": kept,

@@ -15,12 +15,12 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import numbers
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.problems.robot_setup_files import pose_of
-from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
-from robotdiffuse.scenes.files import check_fields
-from robotdiffuse.scenes.shape_transforms import placed
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.core.transforms import pose_entry
+from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
+from robotdiffuse.problems.robot_setup_files import pose_of
+from robotdiffuse.scenes.files import check_fields
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shape_transforms import placed
 
 GOALS = ("joints", "joint_set", "pose", "poses", "any")
 TOLERANCES = ("xyz_tolerance", "rpy_tolerance")

@@ -55,9 +55,9 @@ class PoseGoal:
     """Name of the link."""
     T_base_frame: Float[ndarray, "4 4"]
     xyz_tolerance: Float[ndarray, "3"] | None = None
-    """Along the axes of the goal [m]; None: the very position, judged to 1 cm."""
+    """Along the axes of the goal [m]; None: the very position, validated to 1 cm."""
     rpy_tolerance: Float[ndarray, "3"] | None = None
-    """About them [rad], pi for any angle; None: the very orientation, judged to 15 degrees."""
+    """About them [rad], pi for any angle; None: the very orientation, validated to 15 degrees."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):

@@ -1,7 +1,7 @@
-"""Problems to be judged by: those of the families by number, none of them in any data set; kept in files.
+"""Problems to be validated by: those of the families by number, none of them in any data set; kept in files.
 
 One rule says what a problem is worth: it is trivial if the straight line from the start to a goal
-configuration passes the judge, and hard if it is not and a search finds a path. One form of file keeps
+configuration passes the validator, and hard if it is not and a search finds a path. One form of file keeps
 problems with what is known of them: JSON lines, which every benchmark reads.
 """
 
@@ -17,16 +17,16 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import JsonLines
+from robotdiffuse.core.types import Path
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.core.types import Path
 
 SEED = 20261121
 """Of the held-out problems; data are drawn from other seed sequences."""
 
-Judge = Callable[[Problem, Path], bool]
+Validator = Callable[[Problem, Path], bool]
 """Whether a path solves a problem."""
 Search = Callable[[Problem], float | None]
 """The length of the shortest path that a search finds [rad]; None if it finds none."""
@@ -42,7 +42,7 @@ def goal_of(problem: Problem) -> Float[ndarray, "dof"]:
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A problem to be judged by, and what is known of it."""
+    """A problem to be validated by, and what is known of it."""
 
     name: str
     """Its own in the set: rop/17 is number 17 of a family."""
@@ -50,7 +50,7 @@ class Case:
     """What bars and tables group by: the random family, or the folder or file it comes from."""
     problem: Problem
     trivial: bool
-    """The straight line to a goal configuration passes the judge."""
+    """The straight line to a goal configuration passes the validator."""
     reference: float | None = None
     """Length of the shortest path that is known [rad]; None if none was looked for, or none was found."""
     problem_set: str = ""
@@ -76,12 +76,12 @@ def held_out_problem(family: str, number: int) -> Problem:
     return load_family(family).draw(robot, rng).problem(robot)
 
 
-def line_length(problem: Problem, judge: Judge) -> float | None:
-    """Of the shortest straight line from the start to a goal configuration that passes the judge [rad]; None
+def line_length(problem: Problem, validator: Validator) -> float | None:
+    """Of the shortest straight line from the start to a goal configuration that passes the validator [rad]; None
     if none of them does."""
     goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
     lines = [Path(problem.robot.joint_names, np.stack([problem.start, goal])) for goal in goals]
-    return min((line.length for line in lines if judge(problem, line)), default=None)
+    return min((line.length for line in lines if validator(problem, line)), default=None)
 
 
 FIELDS = {"name", "family", "trivial", "searched", "reference", "problem"}
@@ -123,13 +123,13 @@ class CaseFile:
         self,
         family: str,
         count: int,
-        judge: Judge,
+        validator: Validator,
         search: Search | None = None,
         report: Report = lambda text: None,
     ) -> list[Case]:
         """The first `count` held-out problems of a family; with a search, of those that are hard.
 
-        What is not known yet is drawn, judged, searched and added.
+        What is not known yet is drawn, validated, searched and added.
         """
         found: list[dict[str, Any]] = []
         numbers = itertools.count()
@@ -138,7 +138,7 @@ class CaseFile:
             row = self._rows.get(f"{family}/{number}")
             if row is None:
                 problem = held_out_problem(family, number)
-                line = line_length(problem, judge)
+                line = line_length(problem, validator)
                 row = self._add(_row(Case(f"{family}/{number}", family, problem, line is not None, line)))
             if search is not None and not (row["trivial"] or row["searched"]):
                 row = self._add(row | {"searched": True, "reference": search(_case(row).problem)})

@@ -16,12 +16,17 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import read_triangles, read_yaml
+from robotdiffuse.core.transforms import (
+    inverse,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    transform,
+)
 from robotdiffuse.robots.bodies import Attached
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Shape, Sphere
-from robotdiffuse.core.transforms import inverse, quaternion_from_rotation, rotation_from_quaternion, transform
 
 PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shape]]] = {
     "box": (3, lambda size, xyz, wxyz, name: Box(xyz, size, wxyz, name)),

@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import LARGEST, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.transforms import inverse
+from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
 from robotdiffuse.problems.goals import AnyGoal as AnyGoal
 from robotdiffuse.problems.goals import Goal, OneGoal, moved_goal
@@ -24,19 +26,17 @@ from robotdiffuse.problems.goals import PosesGoal as PosesGoal
 from robotdiffuse.robots.dynamics import check_dynamics
 from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.transforms import inverse
 
 LIMIT_SLACK = 1e-5
 """Configurations that exceed a joint limit by no more than this are clamped, with a note [rad]."""
 LEAST_BLEND, MOST_BLEND = 1e-3, 10.0
 """Of `Problem.blend`, but for 0 [rad] or [m]."""
-OPTIMISTIC, PADDED, IMAGINED, OCCUPIED = "optimistic", "padded", "imagined", "occupied"
-UNSEEN = (OPTIMISTIC, PADDED, IMAGINED, OCCUPIED)
+OPTIMISTIC, PADDED, PREDICTED, OCCUPIED = "optimistic", "padded", "predicted", "occupied"
+UNSEEN = (OPTIMISTIC, PADDED, PREDICTED, OCCUPIED)
 """What space that no view saw is taken for: free; free but near what was seen; as the completing network
-imagines it; occupied. See `planning/pipeline/unknown_space.py`."""
+predicts it; occupied. See `planning/pipeline/unknown_space.py`."""
 
 
 @no_type_check
@@ -64,7 +64,7 @@ class Problem:
     call of the planner says."""
     views: tuple[DepthView, ...] = ()
     """Pictures that depth cameras took of the scene."""
-    unseen: str = OPTIMISTIC
+    unknown: str = OPTIMISTIC
     """What space that no view saw is taken for, one of UNSEEN; of no account without views."""
     T_world_base: Float[ndarray, "4 4"] | None = None
     """Where the base stands in the world, for files and pictures: scene, goal and views are in the base's
@@ -124,13 +124,15 @@ class Problem:
             raise InputError("moving cannot be had beside views")
         if moving and any(blend):
             raise InputError("moving cannot be had beside blend: the motion stops at waypoints")
-        check_unseen("unseen", self.unseen)
+        check_unknown("unknown", self.unknown)
         T_world_base = self.T_world_base
         if T_world_base is not None:
             T_world_base = rigid_transform("T_world_base", T_world_base)
         scene = self.scene
         if views:
-            from robotdiffuse.perception.seen_points import seen_shapes  # compiled code, which only views need
+            from robotdiffuse.perception.seen_points import (
+                seen_shapes,  # compiled code, which only views need
+            )
 
             scene = self.known_scene
             ends = goal.positions if isinstance(goal, JointGoal) else start[None]
@@ -161,7 +163,7 @@ class Problem:
             notes: tuple[str, ...] = (),
             clearance: float | None = None,
             views: Sequence[DepthView] = (),
-            unseen: str = OPTIMISTIC,
+            unknown: str = OPTIMISTIC,
             T_world_base: ArrayLike | None = None,
             waypoints: Sequence[ArrayLike | Goal | Sequence[OneGoal]] = (),
             constraints: Sequence[Constraint] = (),
@@ -182,7 +184,7 @@ class Problem:
         notes: tuple[str, ...] = (),
         clearance: float | None = None,
         views: "Sequence[DepthView]" = (),
-        unseen: str = OPTIMISTIC,
+        unknown: str = OPTIMISTIC,
         waypoints: "Sequence[ArrayLike | Goal | Sequence[OneGoal]]" = (),
         constraints: "Sequence[Constraint]" = (),
         moving: "Sequence[MovingObstacle]" = (),
@@ -205,7 +207,7 @@ class Problem:
         kinds = tuple(CONSTRAINTS.values())
         constraints = [one.moved(T_base_world) if isinstance(one, kinds) else one for one in constraints]
         moving = [one.moved(T_base_world) if isinstance(one, MovingObstacle) else one for one in moving]
-        asked = robot, scene, start, goal, notes, clearance, views, unseen, T, waypoints
+        asked = robot, scene, start, goal, notes, clearance, views, unknown, T, waypoints
         return cls(*asked, constraints, moving, start_velocity, blend, payload)
 
     def standing(self) -> tuple[Robot, Scene]:
@@ -232,7 +234,7 @@ def check_clearance(field: str, value: object) -> float:
     return float(clearance)
 
 
-def check_unseen(field: str, value: object) -> str:
+def check_unknown(field: str, value: object) -> str:
     """The value as one of UNSEEN; InputError for anything else."""
     if not isinstance(value, str) or value not in UNSEEN:
         raise unknown_name(f"policy in {field}:", str(value), UNSEEN)

@@ -15,13 +15,13 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import TOOL
 from robotdiffuse.robots.inertias import Payload
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import IDENTITY, Shape
-from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 
 ORIGIN = (0.0, 0.0, 0.0)
 DIGITS = 12

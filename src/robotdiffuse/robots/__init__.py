@@ -6,9 +6,9 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.input_files import is_file
+from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 from robotdiffuse.robots.robot_folder import MESH_FILE, ROBOT_FILE, read_bundle, read_source
 from robotdiffuse.robots.user_data_dir import user_robots
-from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 
 __all__ = ["ROBOTS", "ConvexMesh", "Joint", "Robot", "load_robot"]
 

@@ -1,6 +1,6 @@
 """Tools, and objects that a robot holds: bodies fixed to its links, as links of a robot of their own.
 
-A robot that holds something is another robot: it has one more link, with convex meshes for the judge, spheres
+A robot that holds something is another robot: it has one more link, with convex meshes for the validator, spheres
 that cover them for the search, and pairs that are checked. Its joints are the same, so weights for the bare
 arm are weights for it. The same content gives the same object, whose arrays are made once.
 """
@@ -15,10 +15,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.robot import Joint, Robot
-from robotdiffuse.core.transforms import inverse
 
 VARIANTS = 64
 """Robots with attached bodies that are kept, the last ones used."""

@@ -5,8 +5,8 @@ import json
 
 import numpy as np
 
-from robotdiffuse.robots.robot_folder import LIMITS
 from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot_folder import LIMITS
 
 DIGITS = 9
 """Numbers count up to this decimal: rotations from quaternions differ in the last bits by machine."""

@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.robots.robot import Robot, once_per_robot
 
 Z = np.array([0.0, 0.0, 1.0])
 

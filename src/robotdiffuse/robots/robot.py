@@ -12,10 +12,10 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import LARGEST
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
 from robotdiffuse.robots.inertias import Inertia
 from robotdiffuse.robots.joint_tables import TURN, JointTable
-from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
 
 MOVING_KINDS = ("revolute", "continuous", "prismatic")
 TURNS = 3 * np.pi
@@ -90,7 +90,7 @@ class Robot:
     spheres: dict[str, Float[ndarray, "n 4"]] = field(default_factory=dict)
     """Collision spheres by link, x y z radius in the link frame [m]; they cover `meshes`."""
     meshes: dict[str, tuple[ConvexMesh, ...]] = field(default_factory=dict)
-    """Convex collision meshes by link: the exact geometry of the judge."""
+    """Convex collision meshes by link: the exact geometry of the validator."""
     allowed_collisions: frozenset[frozenset[str]] = frozenset()
     """Pairs of links that are not checked against each other."""
     locked: dict[str, float] = field(default_factory=dict)

@@ -13,10 +13,10 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import LARGEST, unit_quaternion, within
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import read_arrays, read_json
+from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 from robotdiffuse.robots.inertias import inertia_of
 from robotdiffuse.robots.joint_tables import JointTable
 from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot
-from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
 
 FORMAT = 2
 """2: where the base stands in the URDF's root frame is kept; 1 had dropped it."""

@@ -1,4 +1,4 @@
-"""Visual meshes: what the viewer draws. Planning and judging never use them."""
+"""Visual meshes: what the viewer draws. Planning and validating never use them."""
 
 from dataclasses import dataclass
 from importlib.resources import as_file, files

@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import form, numbers, vector, within
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.scenes.shape_transforms import placed
-from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.core.transforms import (
     inverse,
     quaternion_from_rotation,
@@ -24,11 +22,13 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
+from robotdiffuse.scenes.shape_transforms import placed
+from robotdiffuse.scenes.shapes import Shape
 
 FASTEST = 100.0
 """Of any point of an obstacle [m/s]; what is faster between two of its poses is a jump."""
 FOREVER = 1e5
-"""How long a velocity lasts [s], about a day: the longest motion that is judged."""
+"""How long a velocity lasts [s], about a day: the longest motion that is validated."""
 SAME = 1e-6
 """A pose and where its shape stands may be apart by this [m] or [rad]."""
 

@@ -10,10 +10,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
+from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Shape
-from robotdiffuse.core.transforms import inverse
 
 
 @no_type_check

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float, Float32, Int, Int8
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
-from robotdiffuse.core.transforms import rotation_from_quaternion
 
 NONE, SPHERE, BOX = 0, 1, 2
 """Kinds of packed shapes: none, for an empty row; a sphere; a box."""

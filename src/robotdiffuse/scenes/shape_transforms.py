@@ -7,8 +7,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, pose
 from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, pose
 
 Any = TypeVar("Any", bound=Shape)
 

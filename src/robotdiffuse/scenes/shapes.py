@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import SMALLEST, form, numbers, points, positive, unit_quaternion, vector
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.point_cloud import voxel_thin
-from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
@@ -56,7 +56,7 @@ class Shape(ABC):
 
 
 class Triangulated(Shape):
-    """A shape that is planned around, judged, sampled and drawn as its triangles: a mesh, or a new shape."""
+    """A shape that is planned around, validated, sampled and drawn as its triangles: a mesh, or a new shape."""
 
     @property
     @abstractmethod

@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float32, Int8
 from torch import Generator, Tensor
 
 from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
-from robotdiffuse.scenes.surface_points import VisibleRegion
 from robotdiffuse.scenes.surface_clouds_kernel import fill_clouds
+from robotdiffuse.scenes.surface_points import VisibleRegion
 
 PART = 1 << 15
 """Points that are done at once on the CPU: their arrays fit the second-level cache."""

@@ -10,9 +10,9 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Positive, Settings
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, Triangulated
-from robotdiffuse.core.settings import Positive, Settings
 
 ROUNDS = 6
 """How often `sample_surface` draws before it repeats points that it has."""

@@ -20,9 +20,9 @@ from robotdiffuse.core.errors import shown
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server import openapi
-from robotdiffuse.server.worker_pool import Pool, QueueFullError
 from robotdiffuse.server.settings import SENDING, ServeSettings
 from robotdiffuse.server.worker import PLAN, VERIFY, Answer, failed
+from robotdiffuse.server.worker_pool import Pool, QueueFullError
 
 JSON, LINES = "application/json", "application/x-ndjson"
 REQUEST_ID = "X-Request-ID"
@@ -108,7 +108,7 @@ def _add_requests(app: FastAPI, pool: Pool, settings: ServeSettings) -> None:
 
     @app.post("/verify", **openapi.VERIFY)
     async def verify(request: Request) -> Response:
-        """Judge a path or a trajectory, whoever made it."""
+        """Validate a path or a trajectory, whoever made it."""
         return await single(request, VERIFY)
 
     @app.post("/batch", **openapi.BATCH)

@@ -1,4 +1,4 @@
-"""Motions in requests, and what the judge says of them."""
+"""Motions in requests, and what the validator says of them."""
 
 from dataclasses import asdict
 from typing import Any
@@ -7,8 +7,8 @@ from numpy import ndarray
 
 from robotdiffuse.core.bounds import FASTEST, LARGEST, form, numbers, within
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.core.types import ROWS, Path, Trajectory
+from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.validation.validator import Report
 
 MOTIONS = ("path", "trajectory")
@@ -17,7 +17,7 @@ MOTIONS = ("path", "trajectory")
 def read_motion(name: str, data: object) -> Path | Trajectory:
     """{joint_names, positions}, of a path; for a trajectory times, velocities and accelerations too.
 
-    Raises InputError, which names the field, for anything else; whether times increase is for the judge.
+    Raises InputError, which names the field, for anything else; whether times increase is for the validator.
     """
     rows = ROWS if name == "trajectory" else ("positions",)
     timed = ("times",) if name == "trajectory" else ()

@@ -7,7 +7,7 @@ from typing import Any
 from robotdiffuse.core.types import UNTIL, Status
 
 ABOUT = (
-    "Motion planning for redundant robot arms; every motion that is answered passed the judge. Metres, "
+    "Motion planning for redundant robot arms; every motion that is answered passed the validator. Metres, "
     'radians, seconds; quaternions wxyz. Errors are one line: {"error": "..."}. Problems are those of '
     "problem files in JSON: they name a robot of /robots and hold all that they need, for files are not "
     "read. A header X-Request-ID names a request, so that DELETE /requests/{name} can end it; closing the "

@@ -12,8 +12,8 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server.app import make_app
 from robotdiffuse.server.connection import Connection
-from robotdiffuse.server.worker_pool import Pool
 from robotdiffuse.server.settings import GRACE, KEPT, ServeSettings
+from robotdiffuse.server.worker_pool import Pool
 
 BACKLOG = 128
 """Connections that wait to be taken."""

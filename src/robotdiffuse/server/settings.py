@@ -9,7 +9,7 @@ from robotdiffuse.core.settings import Count, Natural, Positive, Settings
 PREPARING = 300.0
 """Until a worker that reads a request, or compiles for it, is given up [s]."""
 GRACE = 10.0
-"""Beyond its time limit that a call may take, as for the judge and timing, until its worker is killed [s]."""
+"""Beyond its time limit that a call may take, as for the validator and timing, until its worker is killed [s]."""
 CANCELLING = 1.0
 """Until a worker that was told to leave its call is killed [s]."""
 SENDING = 10.0

@@ -17,20 +17,20 @@ import orjson
 from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.core.deadline import check_left, left_by
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
-from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
-from robotdiffuse.planning.planner import Planner
-from robotdiffuse.planning.context import Call, Request
-from robotdiffuse.problems.files import problem_from_record
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.core.input_files import parse_json
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import UNTIL
+from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
+from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.problems.files import problem_from_record
+from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
 from robotdiffuse.server.motions import MOTIONS, read_motion, report_record
 from robotdiffuse.server.settings import GRACE
-from robotdiffuse.core.types import UNTIL
 from robotdiffuse.validation.validator import Report, Verifier
 
 PLAN, VERIFY = "plan", "verify"
@@ -114,7 +114,7 @@ def respond(number: int, what: str, body: bytes) -> Answer:
     try:
         with left_by(leave):
             leave()  # told so before it began
-            answer = (_plan if what == PLAN else _judge)(state, body)
+            answer = (_plan if what == PLAN else _validator)(state, body)
         return answer._replace(memory=_memory())
     except InputError as error:
         return failed(400, str(error))
@@ -161,7 +161,7 @@ def _plan(state: _State, body: bytes) -> Answer:
     planner = _planner(asked.get("planner", DEFAULT_PLANNER))
     planner.prepare(problem.robot)
     planner.load_wanted(problem.robot)
-    Call(planner.name, problem, request=_request(given), time_limit=time_limit, seed=seed)
+    PlanningContext(planner.name, problem, request=_request(given), time_limit=time_limit, seed=seed)
     _warmed(planner, problem, asked["problem"]["robot"])
     state.shared.due = time.monotonic() + time_limit + GRACE
     result: PlanResult = planner.plan(problem, **given)
@@ -202,18 +202,18 @@ def _warmed(planner: Planner, problem: Problem, robot: str) -> None:
         _warm.add((planner.name, robot))
 
 
-def _judge(state: _State, body: bytes) -> Answer:
+def _validator(state: _State, body: bytes) -> Answer:
     values = check_fields("the request", _record(body), ("problem",), MOTIONS)
     problem = problem_from_record(values["problem"], state.robots)
     motions = {name: read_motion(name, values[name]) for name in MOTIONS if name in values}
     if not motions:
         raise InputError("the request has neither path nor trajectory")
     state.shared.due = time.monotonic() + state.longest + GRACE
-    judge = Verifier(problem)
+    validator = Verifier(problem)
     reports: dict[str, Report] = {}
     for name, motion in motions.items():
         check_left()
-        reports[name] = getattr(judge, name)(motion)
+        reports[name] = getattr(validator, name)(motion)
     valid = all(report.valid for report in reports.values())
     record = {"valid": valid} | {name: report_record(report) for name, report in reports.items()}
     return _answer(record, "valid" if valid else "invalid")

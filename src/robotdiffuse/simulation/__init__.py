@@ -22,8 +22,8 @@ _import_pybullet()
 
 from robotdiffuse.simulation.camera import DepthCamera, DepthImage, point_cloud, render  # noqa: E402
 from robotdiffuse.simulation.recording import FilmSettings, write_gif, write_png  # noqa: E402
-from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle  # noqa: E402
 from robotdiffuse.simulation.replay import Replay, ReplayContact, ReplaySettings, replay  # noqa: E402
+from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle  # noqa: E402
 from robotdiffuse.simulation.world import World  # noqa: E402
 
 __all__ = [

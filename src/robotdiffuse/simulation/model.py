@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.transforms import rpy_from_rotation
 from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.robots.visual_meshes import VisualMesh, load_visual
-from robotdiffuse.core.transforms import rpy_from_rotation
 
 LEAST_MASS, LEAST_INERTIA = 0.01, 1e-4
 """Of links without geometry, or next to none [kg], [kg m^2]: PyBullet cannot move a link without mass."""

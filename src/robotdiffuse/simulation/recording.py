@@ -35,7 +35,7 @@ FLOOR_GAP = 0.002
 """Between the floor and the lowest thing above it [m]."""
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 MOMENTS = (0.0, 0.33, 0.67, 1.0)
-"""Shares of the duration at which views are judged; a picture shows them all, the last one solid."""
+"""Shares of the duration at which views are validated; a picture shows them all, the last one solid."""
 
 
 @dataclass(frozen=True)

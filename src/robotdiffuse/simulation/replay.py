@@ -17,10 +17,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import DENSITY, World
-from robotdiffuse.core.types import Trajectory
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""PyBullet as a second, independent judge of collision (extra `sim`).
+"""PyBullet as a second, independent validator of collision (extra `sim`).
 
 It shares nothing with our kinematics and collision code but the data: the robot goes to PyBullet as a URDF,
 with its own forward kinematics, broad phase and closest points by its GJK. Bullet blows convex meshes up by
@@ -14,10 +14,10 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.simulation.world import World
-from robotdiffuse.core.types import Path
 
 FAR = 10.0
 """Distances are looked for up to this [m]."""

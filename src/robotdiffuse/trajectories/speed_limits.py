@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.settings import Bound, Count, NotNegative, OneOf, Positive, Settings
+from robotdiffuse.robots.dynamics import Dynamics
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline
 from robotdiffuse.trajectories.jerk_kernel import smoothed
 from robotdiffuse.trajectories.timing_kernel import fastest, sampled, slowdown
-from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.settings import Bound, Count, NotNegative, OneOf, Positive, Settings
 
 COMPILED, TOPPRA = "compiled", "toppra"
 FINE = 0.001

@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import NOTHING, Beside, Rows, TimingSettings, timed_piece
 from robotdiffuse.trajectories.timing import rounded_corners
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.types import Path, Trajectory
 
 PLACES = 8
 """Parts of about equal length that a path is cut into; more take longer and gain little."""

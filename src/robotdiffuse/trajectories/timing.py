@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
@@ -18,8 +20,6 @@ from robotdiffuse.trajectories.speed_limits import (
     can_begin,
     timed_piece,
 )
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.types import Path, Trajectory
 
 SHRINKS = (0.25, 0.25, 0.0)
 """Factors on the deviation of a corner each time that its rounding is refused; 0: the motion stops there."""
@@ -42,7 +42,7 @@ def time_parameterize(
 ) -> Trajectory:
     """The fastest motion along the path, from rest to rest, within the robot's limits at every row.
 
-    Corners of the path are rounded so that the motion need not stop there. `valid` judges the whole motion.
+    Corners of the path are rounded so that the motion need not stop there. `valid` validates the whole motion.
     Where it refuses, `free` is asked about the corners, one by one, and those that fail are rounded less; in
     the end the motion stops at them. With stops at all corners the rows lie on the path itself, so that a
     path that is free always has a trajectory; that one is returned without asking.

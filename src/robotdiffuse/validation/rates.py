@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.core.types import Trajectory
+from robotdiffuse.robots.robot import Robot
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What counts as right: the judge's settings, and how far a configuration is off a goal."""
+"""What counts as right: the validator's settings, and how far a configuration is off a goal."""
 
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -7,11 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
+from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
+from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.robots.kinematics import link_origins, link_pose
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.settings import Bound, Natural, NotNegative, Positive, Settings
-from robotdiffuse.core.transforms import inverse, rotation_angle, rpy_from_rotation
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ class VerifySettings(Settings, name="verify"):
     jump: Positive = 1.5
     """A step of a trajectory longer than this times what the velocity limit allows in its time is a jump."""
     chord: Positive = 1e-3
-    """Between rows a trajectory is judged on straight lines, unless the cubic through their positions and
+    """Between rows a trajectory is validated on straight lines, unless the cubic through their positions and
     velocities, as controllers follow it, leaves them by more than this [rad] or [m]: then along the cubic."""
     constraint_chord: Positive = 1e-6
-    """Path constraints are judged along that cubic always: on straight lines that leave it by no more than
+    """Path constraints are validated along that cubic always: on straight lines that leave it by no more than
     this [rad] or [m], which is taken from their tolerances."""
     reversal_angle: NotNegative = float(np.radians(150))
     """A turn in joint space by more than this [rad] is a sharp reversal ..."""

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.torque_bounds import Stretches
-from robotdiffuse.core.types import Trajectory
 
 RESOLUTION = 1e-3
 """Share of a limit to which a torque between two looks is told from one beyond it."""

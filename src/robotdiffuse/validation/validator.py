@@ -1,7 +1,7 @@
-"""The judge: is a motion free of collision, within limits, and from the start to the goal?
+"""The validator: is a motion free of collision, within limits, and from the start to the goal?
 
 Collision between waypoints is settled by a certificate, not by sampling: see collision/motions.py. The rates
-of a trajectory are those of its positions over its times, whatever it says of itself: see rates.py. The judge
+of a trajectory are those of its positions over its times, whatever it says of itself: see rates.py. The validator
 knows nothing of planners.
 """
 
@@ -13,23 +13,23 @@ import numpy as np
 from numba import njit
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import LARGEST, within
 from robotdiffuse.collision.convex_geometry import describe_contact
 from robotdiffuse.collision.motions import Contact, ContinuousCollision
+from robotdiffuse.core.bounds import LARGEST, within
 from robotdiffuse.core.errors import InputError, joined
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.robots.dynamics import Dynamics
+from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
 from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, goal_error, passes
 from robotdiffuse.validation.torques import Pieces, first_beyond, pieces_held, pieces_of
-from robotdiffuse.core.types import Path, Trajectory
 
 if TYPE_CHECKING:  # what most problems do not need is imported where one does
     from robotdiffuse.collision.moving_obstacles import MovingCollision, TimedContact
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 LONGEST = 1e5
-"""Motion that is judged [s], about a day."""
+"""Motion that is validated [s], about a day."""
 
 
 @dataclass(frozen=True)
@@ -76,20 +76,20 @@ class Report:
 
 
 def verify(problem: Problem, path: Path, settings: VerifySettings = DEFAULT) -> Report:
-    """Judge a path for a problem. It has no times, so obstacles that move are left to `verify_trajectory`.
+    """Validate a path for a problem. It has no times, so obstacles that move are left to `verify_trajectory`.
     Raises InputError if its joints are not those of the robot."""
     return verifier(problem, settings).path(path)
 
 
 def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
-    """Judge a trajectory with its rates and times, and among obstacles that move from its first row to its
+    """Validate a trajectory with its rates and times, and among obstacles that move from its first row to its
     last. Its velocities and accelerations must be those of its positions, from rest, or the problem's start
     velocity, to rest; for what is between the rows see `VerifySettings.chord`."""
     return verifier(problem, settings).trajectory(trajectory)
 
 
 class Verifier:
-    """Judges motions for one problem; what the robot and the scene need is prepared once."""
+    """Validates motions for one problem; what the robot and the scene need is prepared once."""
 
     def __init__(self, problem: Problem, settings: VerifySettings = DEFAULT) -> None:
         self.problem, self.settings, self.robot = problem, settings, problem.robot
@@ -121,7 +121,7 @@ class Verifier:
             message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
             return Report(False, Violation("time", at, message), None, None)
         if trajectory.duration - trajectory.times[0] > LONGEST:
-            message = f"the motion takes {trajectory.duration:.6g} s; at most {LONGEST:g} s can be judged"
+            message = f"the motion takes {trajectory.duration:.6g} s; at most {LONGEST:g} s can be validated"
             return Report(False, Violation("time", float(trajectory.times[0]), message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
@@ -361,7 +361,7 @@ def _apart(q, step):
 
 @lru_cache(maxsize=8)
 def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
-    """The Verifier of a problem; the last few are kept, so that many paths of one problem are judged fast."""
+    """The Verifier of a problem; the last few are kept, so that many paths of one problem are validated fast."""
     return Verifier(problem, settings)
 
 

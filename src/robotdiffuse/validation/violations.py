@@ -1,12 +1,19 @@
-"""All that is wrong with a motion, where the judge names what comes first."""
+"""All that is wrong with a motion, where the validator names what comes first."""
 
 import numpy as np
 
 from robotdiffuse.collision.contacts import contacts
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.validation.rates import between_rows
-from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.validation.validator import DEFAULT, Report, VerifySettings, Violation, collision_violation, verifier
+from robotdiffuse.validation.validator import (
+    DEFAULT,
+    Report,
+    VerifySettings,
+    Violation,
+    collision_violation,
+    verifier,
+)
 
 RATES = ("rest", "rates", "velocity", "acceleration", "jump")
 CONTACTS = ("scene_collision", "self_collision")
@@ -19,9 +26,9 @@ def violations(
 
     Of contacts each, from where it begins; joint limits for each joint; of all else the first of its kind.
     """
-    judge = verifier(problem, settings)
+    validator = verifier(problem, settings)
     timed = isinstance(motion, Trajectory)
-    report: Report = judge.trajectory(motion) if timed else judge.path(motion)
+    report: Report = validator.trajectory(motion) if timed else validator.path(motion)
     if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
         return () if report.violation is None else (report.violation,)
     still = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}

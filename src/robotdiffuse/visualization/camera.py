@@ -10,8 +10,8 @@ from scipy.spatial import ConvexHull
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.visualization import style
-from robotdiffuse.visualization.style import Surface
 from robotdiffuse.visualization.rasterizer import draw
+from robotdiffuse.visualization.style import Surface
 
 AZIMUTHS = 18
 ELEVATIONS = np.radians((15.0, 25.0))

@@ -13,11 +13,11 @@ from tempfile import TemporaryDirectory
 from PIL import Image
 
 from robotdiffuse.core.output_files import check_output, write_atomically
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.types import Path, Trajectory
-from robotdiffuse.visualization.replay_page import write_replay
 from robotdiffuse.visualization.picture import PictureSettings, render
+from robotdiffuse.visualization.replay_page import write_replay
 
 THUMBNAIL = PictureSettings(480, 300, ghosts=3)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult, ResultFile
 from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult, ResultFile
 from robotdiffuse.visualization.replay_page import write_replay
 
 

@@ -12,13 +12,13 @@ from PIL import Image, ImageDraw, ImageFont
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.camera import Camera, best_view
-from robotdiffuse.visualization.style import GOAL, START, Surface, join
 from robotdiffuse.visualization.rasterizer import blend_ghost, draw, light_lattice, shade
+from robotdiffuse.visualization.style import GOAL, START, Surface, join
 
 SUPERSAMPLING = 2
 SKY_LIGHTS, SKY_MAP = 60, 320

@@ -15,10 +15,10 @@ from numpy import ndarray
 
 from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
-from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.visualization import style
 from robotdiffuse.visualization.camera import TRACE_POINTS, VERTICAL_FIELD, view_of_motion
 from robotdiffuse.visualization.style import GOAL, START, Surface

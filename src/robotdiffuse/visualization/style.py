@@ -9,12 +9,12 @@ from numpy import ndarray
 
 from robotdiffuse.collision.exact_meshes import forward_frames
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
-from robotdiffuse.perception.depth_view import SeenPoints, UnseenPoints
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
-from robotdiffuse.core.types import Path, Trajectory
 
 START, GOAL = (0x4F, 0x7F, 0xD9), (0x10, 0xA3, 0x7F)
 """sRGB colours of both ends of a motion; the trace runs from one to the other."""
@@ -146,7 +146,7 @@ def obstacle_colors(scene: Scene) -> list[tuple[int, int, int]]:
 
 
 def _color(shape: Shape, own: tuple[int, int, int]) -> tuple[int, int, int]:
-    if isinstance(shape, SeenPoints | UnseenPoints):
+    if isinstance(shape, SeenPoints | AssumedPoints):
         return SEEN if isinstance(shape, SeenPoints) else UNSEEN
     return FURNITURE if _extent(shape) > FURNITURE_SIZE else own
 
@@ -238,7 +238,7 @@ def facts(motion: Path | Trajectory, result: PlanResult | None) -> list[tuple[st
     if result is not None and result.min_clearance is not None:
         rows.append(("clearance", f"{result.min_clearance * 1e3:.1f} mm"))
     if result is not None and result.confidence is not None:
-        rows.append(("free in unseen space", f"{100 * result.confidence:.0f} %"))
+        rows.append(("free in unknown space", f"{100 * result.confidence:.0f} %"))
     if isinstance(motion, Trajectory):
         rows.append(("duration", f"{motion.duration:.2f} s"))
     else:

@@ -22,6 +22,7 @@ from helpers.motion_stores import random_motions, write_motions
 from robotdiffuse.cli import main
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
 from robotdiffuse.learning.checkpoint import load_network, save_network
 from robotdiffuse.learning.denoisers.unet import UNetSettings
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings
@@ -43,10 +44,9 @@ from robotdiffuse.planning.baselines.mpd import (
 )
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 PANDA = load_robot("panda")

@@ -14,6 +14,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning.baselines.lattice.planner import (
     AStar,
     AStarSearch,
@@ -29,7 +30,6 @@ from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify
 
 ARM = box_arm()

@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
 from robotdiffuse.learning.checkpoint import load_network, save_network
 from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, MPiNetsNetworkSettings, RollOuts
 from robotdiffuse.learning.networks.point_groups import group_points
@@ -19,10 +20,9 @@ from robotdiffuse.planning.baselines.mpinets import MPiNets, MPiNetsSettings
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import BOX, PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")

@@ -10,8 +10,9 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import path_length
-from robotdiffuse.datasets.rows import resample
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
+from robotdiffuse.datasets.rows import resample
 from robotdiffuse.learning.checkpoint import save_network
 from robotdiffuse.learning.networks.mpnet import (
     MPNetNetwork,
@@ -22,15 +23,14 @@ from robotdiffuse.learning.networks.mpnet import (
 )
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
 from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_code
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
-from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.scene_arrays import PackedScenes
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")
@@ -80,9 +80,9 @@ def planning(weights: str, problem: Problem, **changes: object) -> NeuralPlannin
     """A round of the planner, before it begins."""
     settings = replace(MPNetPlannerSettings(weights), **changes)
     checker = CollisionChecker(problem.robot, problem.scene)
-    ends = Ends(checker, problem.start, np.array([RIGHT]))
-    call, rng = Call("mpnet", problem, 60.0, 0), np.random.default_rng(1)
-    return NeuralPlanning(call, ends, network(), settings, rng)
+    start_goal = StartGoal(checker, problem.start, np.array([RIGHT]))
+    context, rng = PlanningContext("mpnet", problem, 60.0, 0), np.random.default_rng(1)
+    return NeuralPlanning(context, start_goal, network(), settings, rng)
 
 
 def wall_problem(scene: Scene = WALL) -> Problem:
@@ -160,8 +160,8 @@ def test_waypoints_are_a_step_apart_or_the_goal() -> None:
     at_goal = (following == goal).all(1)
     assert len(here) == len(data) * SMALL.waypoints and 0 < at_goal.mean() < 0.7
     assert (np.abs(moved[~at_goal] - 0.5) < 0.06).all() and (moved < 0.56).all() and (moved > 0).all()
-    ends = np.concatenate([data.q[:, 0], data.q[:, -1]])
-    to_the_end = (goal[:, None] == ends).all(2).any(1).mean()
+    start_goal = np.concatenate([data.q[:, 0], data.q[:, -1]])
+    to_the_end = (goal[:, None] == start_goal).all(2).any(1).mean()
     assert 0.4 < to_the_end < 0.8, "half have sub-goals"
 
 

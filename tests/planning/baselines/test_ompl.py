@@ -15,14 +15,14 @@ from helpers.box_arm import box_arm
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import explain_collision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning.baselines import ompl as planners
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")
@@ -204,7 +204,7 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
     assert plan(planner, problem(RIGHT)).solved
 
 
-class FreeEnds(planners.Ends):
+class FreeEnds(planners.StartGoal):
     """Ends that nobody checks."""
 
     def __init__(self, *_):

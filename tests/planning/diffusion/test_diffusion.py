@@ -7,13 +7,13 @@ import pytest
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path, Status
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
-from robotdiffuse.core.types import Path, Status
 from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")

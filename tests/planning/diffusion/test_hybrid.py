@@ -10,11 +10,10 @@ from helpers.box_arm import box_arm
 from helpers.small_model import small_model
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
 from robotdiffuse.learning.checkpoint import load_model
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.weights_registry import weights_for
-from robotdiffuse.planning.search.aorrtc import AORRTCSettings
-from robotdiffuse.planning.search.anytime import SLICE, AnytimeSearch
 from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.planning.diffusion.hybrid import (
     BATCH_WORK,
@@ -22,14 +21,15 @@ from robotdiffuse.planning.diffusion.hybrid import (
     RobotDiffuseSettings,
     unlearned_starts,
 )
+from robotdiffuse.planning.search.anytime import SLICE, AnytimeSearch
+from robotdiffuse.planning.search.aorrtc import AORRTCSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, PointCloud, Sphere
-from robotdiffuse.core.types import Status
+from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 PANDA = load_robot("panda")
@@ -54,7 +54,7 @@ def no_search(monkeypatch):
     monkeypatch.setattr(AnytimeSearch, "_slice", idle)
 
 
-def test_the_network_solves_and_the_judge_agrees(planner, no_search):
+def test_the_network_solves_and_the_validator_agrees(planner, no_search):
     result = planner.plan(PROBLEM, time_limit=10.0)
     assert result.stage == "network" and result.path is not None and result.trajectory is not None
     assert verify(PROBLEM, result.path).valid and verify_trajectory(PROBLEM, result.trajectory).valid
@@ -187,8 +187,8 @@ def test_batches_have_their_share_of_the_work(monkeypatch):
     assert counts[0.0] == 0 and counts[0.5] >= 40_000 // BATCH_WORK - 1
 
 
-def test_a_candidate_that_the_judge_refuses_is_not_returned(planner, monkeypatch):
-    """The compiled check is not the judge: candidates through the ball are called free here, and refused."""
+def test_a_candidate_that_the_validator_refuses_is_not_returned(planner, monkeypatch):
+    """The compiled check is not the validator: candidates through the ball are called free here, and refused."""
 
     def through(self, _model, _checker, _code, start, goals, _rng):
         line = start + np.linspace(0, 1, 48)[:, None] * (goals[0] - start)
@@ -207,7 +207,7 @@ def test_a_robot_without_weights_is_planned_by_search_and_noise(planner):
     assert any("no weights" in note for note in result.notes)
 
 
-def test_smooth_noise_solves_and_the_judge_agrees(planner, no_search):
+def test_smooth_noise_solves_and_the_validator_agrees(planner, no_search):
     problem = Problem(replace(PANDA, name="stranger"), Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
     result = planner.plan(problem, time_limit=10.0)
     assert result.stage == "smooth_noise" and result.path is not None and verify(problem, result.path).valid

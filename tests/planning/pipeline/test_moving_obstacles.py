@@ -9,10 +9,10 @@ import robotdiffuse as rd
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.pipeline.moving_obstacles_kernel import WAITED, earliest
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify_trajectory
 
 PANDA = rd.load_robot("panda")

@@ -1,4 +1,4 @@
-"""Policies for unseen space: rungs only add obstacles, carved free at the ends; what results say of it."""
+"""Policies for unknown space: assumptions only add obstacles, carved free at the ends; what results say of it."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -10,10 +10,8 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.planner import Planner
-from robotdiffuse.planning.context import Request
-from robotdiffuse.perception.confidence import RATES, confidence
+from robotdiffuse.core.results import load_result
+from robotdiffuse.core.types import FIRST, Status
 from robotdiffuse.perception.assumptions import (
     CARVED,
     FINE,
@@ -22,21 +20,23 @@ from robotdiffuse.perception.assumptions import (
     THRESHOLDS,
     Padded,
     Voxels,
-    rungs,
+    assumptions,
     voxels_in,
 )
-from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, surface, sweep
-from robotdiffuse.planning.pipeline.unknown_space import AS_SEEN, plan_beside_unseen
-from robotdiffuse.problems.problem import PoseGoal, Problem
-from robotdiffuse.core.results import load_result
-from robotdiffuse.robots import load_robot
-from robotdiffuse.robots.kinematics import link_pose, placed_spheres
+from robotdiffuse.perception.confidence import RATES, confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, surface, sweep
+from robotdiffuse.planning import load_planner
+from robotdiffuse.planning.context import Request
+from robotdiffuse.planning.pipeline.unknown_space import AS_SEEN, plan_with_unknown_space
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.problems.problem import PoseGoal, Problem
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.kinematics import link_pose, placed_spheres
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
-from robotdiffuse.core.types import FIRST, Status
 from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")
@@ -57,34 +57,34 @@ def taken(scene: Scene, T: ndarray = AHEAD) -> DepthView:
     return ray_cast(scene, T, (150.0, 150.0, 79.5, 59.5), (160, 120), PANDA, START)
 
 
-def partial(unseen: str, *views: DepthView) -> Problem:
-    return Problem(PANDA, Scene(), START, GOAL, views=views or (taken(DEEP),), unseen=unseen)
+def partial(unknown: str, *views: DepthView) -> Problem:
+    return Problem(PANDA, Scene(), START, GOAL, views=views or (taken(DEEP),), unknown=unknown)
 
 
 def true_voxels() -> Float32[ndarray, "nx ny nz"]:
     return voxels_within(DEEP, LOW, FINE, FINE_SHAPE).astype(np.float32)
 
 
-@pytest.mark.parametrize("unseen", ["optimistic", "padded", "occupied"])
-def test_solved_means_free_of_what_was_seen(planner: Planner, unseen: str) -> None:
-    problem = partial(unseen)
+@pytest.mark.parametrize("unknown", ["optimistic", "padded", "occupied"])
+def test_solved_means_free_of_what_was_seen(planner: Planner, unknown: str) -> None:
+    problem = partial(unknown)
     result = planner.plan(problem, time_limit=2.0)
-    assert (result.rung != "") == (result.confidence is not None) == result.solved
+    assert (result.assumption != "") == (result.confidence is not None) == result.solved
     if result.solved:
         assert result.path is not None and verify(problem, result.path).valid
-    if unseen == "optimistic":
-        assert result.rung == AS_SEEN and result.unseen_region is not None
-    if unseen == "occupied" and not result.solved:
+    if unknown == "optimistic":
+        assert result.assumption == AS_SEEN and result.unknown_region is not None
+    if unknown == "occupied" and not result.solved:
         assert "space that no view saw" in result.reason
 
 
-def test_imagined_obstacles_are_kept_clear_of(planner: Planner) -> None:
-    """As seen, the way leads through the back of the box; with its voxels imagined, past it."""
+def test_predicted_obstacles_are_kept_clear_of(planner: Planner) -> None:
+    """As seen, the way leads through the back of the box; with its voxels predicted, past it."""
     truth = Problem(PANDA, DEEP, START, GOAL)
     through = planner.plan(partial("optimistic"), time_limit=2.0)
     assert through.path is not None and not verify(truth, through.path).valid
-    past = plan_beside_unseen(planner, partial("imagined"), 4.0, 0, REQUEST, true_voxels())
-    assert past.rung == "imagined, p > 0.1" and past.swept_probability == 0
+    past = plan_with_unknown_space(planner, partial("predicted"), 4.0, 0, REQUEST, true_voxels())
+    assert past.assumption == "predicted, p > 0.1" and past.swept_probability == 0
     assert past.path is not None and verify(truth, past.path).valid
     assert past.confidence is not None and through.confidence is not None
     assert past.confidence > through.confidence
@@ -92,8 +92,8 @@ def test_imagined_obstacles_are_kept_clear_of(planner: Planner) -> None:
 
 def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Planner) -> None:
     everywhere = np.full(FINE_SHAPE, np.float32(0.01))
-    problem = partial("imagined")
-    chosen = plan_beside_unseen(planner, problem, 4.0, 0, REQUEST, everywhere)
+    problem = partial("predicted")
+    chosen = plan_with_unknown_space(planner, problem, 4.0, 0, REQUEST, everywhere)
     first = planner.attempt(replace(problem, views=()), 1.0, 0, REQUEST)
     unknown = observe(problem.views, PANDA, START).unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
@@ -104,14 +104,14 @@ def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Plann
     assert chosen.swept_probability <= 0.01 * (swept & unknown & ~voxels_in(ends)).sum() * (1 + 1e-3)
 
 
-def test_occupied_crosses_nothing_unseen_but_at_the_ends(planner: Planner) -> None:
+def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> None:
     around = [(2.4, 0.0, 0.6), (-2.4, 0.0, 0.6), (0.0, 2.4, 0.6), (0.0, -2.4, 0.6), (0.1, 0.0, 3.2)]
     behind = Scene([Box([-0.6, 0.0, 0.3], [0.3, 0.3, 0.3])])
     views = [taken(behind, looking_at(np.array(at), np.array([0.0, 0.0, 0.4]))) for at in around]
     near = START + 0.15 * (GOAL - START)
     problem = replace(partial("occupied", *views), goal=near)
     result = planner.plan(problem, time_limit=20.0, until=FIRST)
-    assert result.rung == "unseen is occupied" and result.confidence == RATES["unseen is occupied"]
+    assert result.assumption == "unknown is occupied" and result.confidence == RATES["unknown is occupied"]
     assert result.path is not None
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, near)]).astype(np.float32)
     swept, path = np.zeros(SHAPE, np.bool_), result.path.positions.astype(np.float32)
@@ -130,27 +130,31 @@ def test_goals_given_as_a_pose(planner: Planner) -> None:
 def test_an_end_in_what_was_seen_is_named(planner: Planner) -> None:
     blocked = Scene([Box(link_pose(PANDA, GOAL, PANDA.tip)[:3, 3], [0.3, 0.3, 0.3])])
     result = planner.plan(partial("padded", taken(blocked)), time_limit=4.0)
-    assert result.status is Status.INVALID_GOAL and result.rung == "" and result.confidence is None
+    assert result.status is Status.INVALID_GOAL and result.assumption == "" and result.confidence is None
 
 
-def test_rungs_are_carved_free_at_the_ends() -> None:
+def test_assumptions_are_carved_free_at_the_ends() -> None:
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
     solid = np.ones(FINE_SHAPE, np.bool_)
     volume = observe([taken(DEEP)], PANDA, START)
-    chain = [*rungs(partial("padded"), volume, None), *rungs(partial("occupied"), volume, None)]
-    assert [rung.padding for rung in chain if isinstance(rung, Padded)] == list(PADDINGS)
-    for rung in (*chain, Voxels("all", solid, partial("imagined"))):
-        cloud = rung.obstacles(ends)
+    chain = [*assumptions(partial("padded"), volume, None), *assumptions(partial("occupied"), volume, None)]
+    assert [assumption.padding for assumption in chain if isinstance(assumption, Padded)] == list(PADDINGS)
+    for assumption in (*chain, Voxels("all", solid, partial("predicted"))):
+        cloud = assumption.obstacles(ends)
         away = np.linalg.norm(cloud.points[:, None] - ends[None, :, :3], axis=2) - ends[:, 3]
         assert len(cloud.points) and away.min() > cloud.point_radius
-        assert rung.touched(ends) > 0 or isinstance(rung, Padded)
-    assert len(Voxels("all", solid, partial("imagined")).obstacles(ends[:1]).points) < 0.15 * solid.size
+        assert assumption.touched(ends) > 0 or isinstance(assumption, Padded)
+    assert len(Voxels("all", solid, partial("predicted")).obstacles(ends[:1]).points) < 0.15 * solid.size
 
 
-def test_thresholds_fall_from_rung_to_rung() -> None:
+def test_thresholds_fall_from_assumption_to_rung() -> None:
     volume = observe([taken(DEEP)], PANDA, START)
     p = np.random.default_rng(0).random(FINE_SHAPE).astype(np.float32) ** 3
-    occupied = [rung.occupied for rung in rungs(partial("imagined"), volume, p) if isinstance(rung, Voxels)]
+    occupied = [
+        assumption.occupied
+        for assumption in assumptions(partial("predicted"), volume, p)
+        if isinstance(assumption, Voxels)
+    ]
     assert len(occupied) == len(THRESHOLDS)
     assert all((b <= a).all() and b.sum() < a.sum() for a, b in pairwise(occupied))
 
@@ -170,19 +174,19 @@ def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:
 
 
 def test_confidence_falls_with_the_probability_that_is_swept() -> None:
-    for rung in ("imagined, p > 0.1", AS_SEEN):
-        stated = [confidence(rung, risk) for risk in (0.0, 0.1, 1.0, 10.0, 1000.0)]
+    for assumption in ("predicted, p > 0.1", AS_SEEN):
+        stated = [confidence(assumption, risk) for risk in (0.0, 0.1, 1.0, 10.0, 1000.0)]
         assert all(0 <= b <= a <= 1 for a, b in pairwise(stated))
-    assert all(0 < confidence(rung) < 1 for rung in RATES)
+    assert all(0 < confidence(assumption) < 1 for assumption in RATES)
 
 
 def test_files_of_results_keep_it(planner: Planner, tmp_path: Path) -> None:
-    result = plan_beside_unseen(planner, partial("imagined"), 4.0, 0, REQUEST, true_voxels())
+    result = plan_with_unknown_space(planner, partial("predicted"), 4.0, 0, REQUEST, true_voxels())
     result.save(tmp_path / "result.json")
     again = load_result(tmp_path / "result.json").result
-    for name in ("rung", "confidence", "swept_probability", "unseen_region"):
+    for name in ("assumption", "confidence", "swept_probability", "unknown_region"):
         assert getattr(again, name) == getattr(result, name)
-    assert again.unseen_region is not None and len(again.unseen_region[0]) == 3
+    assert again.unknown_region is not None and len(again.unknown_region[0]) == 3
 
 
 def test_the_part_that_weighs_most_is_boxed() -> None:

@@ -53,8 +53,8 @@ def test_every_command_is_a_certified_stop(count: int, seed: int) -> None:
         if command.renewed:
             renewed += 1
             anywhere = [rd.MovingObstacle(rd.Sphere(place, 0.1), max_speed=SPEED) for place in seen]
-            judge = MovingCollision(PANDA, anywhere, 1e-4, 0.5)
-            assert judge.sweep(motion.times + PERIOD, motion.positions).contact is None
+            validator = MovingCollision(PANDA, anywhere, 1e-4, 0.5)
+            assert validator.sweep(motion.times + PERIOD, motion.positions).contact is None
             still = rd.Problem(
                 PANDA,
                 rd.Scene([FLOOR]),

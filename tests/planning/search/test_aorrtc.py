@@ -11,7 +11,7 @@ from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.trajectories.simplification import simplify, tighten
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning import context
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.search.aorrtc import AORRTC, AORRTCSettings
@@ -21,7 +21,7 @@ from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box
-from robotdiffuse.core.types import Status
+from robotdiffuse.trajectories.simplification import simplify, tighten
 from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")
@@ -198,8 +198,8 @@ def test_a_short_limit_is_a_time_out() -> None:
     assert result.status is Status.TIMEOUT and result.path is None
 
 
-def test_one_slow_judging_does_not_take_later_calls_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A first call that loads code judged for a second; calls of a tenth of that then ended at once."""
+def test_one_slow_validation_does_not_take_later_calls_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A first call that loads code validated for a second; calls of a tenth of that then ended at once."""
     monkeypatch.setitem(context._finishing, "panda", 1.0)
     assert AORRTC().plan(AROUND, 0.3, until="limit").solved
     assert context._finishing["panda"] < 1.0

@@ -1,5 +1,5 @@
 """Planning under path constraints: what is found keeps them at every millimetre, by kinematics that share no
-code with search and judge; what cannot be is told."""
+code with search and validator; what cannot be is told."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
+from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
+from robotdiffuse.core.types import Path, Status
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.constraints import Constraint
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose, link_poses
-from robotdiffuse.core.transforms import rotation_angle, rotation_from_rpy, transform
-from robotdiffuse.core.types import Path, Status
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 PANDA = rd.load_robot("panda")
@@ -94,7 +94,7 @@ def test_speed_of_a_line_is_kept_and_used() -> None:
     assert found is not None and found.kind == "speed" and "allows 0.2 m/s" in found.message
 
 
-def test_judge_names_constraint_amount_and_place() -> None:
+def test_validator_names_constraint_amount_and_place() -> None:
     """The straight line in joint space turns the base joint: the hand is 103 mm off in its middle."""
     straight = Path(PANDA.joint_names, np.stack([START, GOAL]))
     found = verify(problem([LINE]), straight).violation

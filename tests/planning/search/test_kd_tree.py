@@ -5,7 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robotdiffuse.planning.search.shared_tree.kd_tree import BUCKET, insert, make_kd_tree, make_neighbours, query
+from robotdiffuse.planning.search.shared_tree.kd_tree import (
+    BUCKET,
+    insert,
+    make_kd_tree,
+    make_neighbours,
+    query,
+)
 
 
 def tree_of(points: np.ndarray):

@@ -11,11 +11,11 @@ from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.trajectories.simplification import shortcut
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning import start_goal
 from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.start_goal import retreat
 from robotdiffuse.planning.search.rrt_connect import RRTConnect, RRTConnectSettings
+from robotdiffuse.planning.start_goal import retreat
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
@@ -23,7 +23,7 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.types import Status
+from robotdiffuse.trajectories.simplification import shortcut
 from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")

@@ -14,9 +14,14 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.search.shared_tree import kernel
-from robotdiffuse.planning.search.shared_tree.planner import SharedTreeRRTStar, SharedTreeSearch, SharedTreeSettings
+from robotdiffuse.planning.search.shared_tree.planner import (
+    SharedTreeRRTStar,
+    SharedTreeSearch,
+    SharedTreeSettings,
+)
 from robotdiffuse.planning.search.shared_tree.tree import best_cost, make_tree
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.families.rop_dense import ROP_DENSE
@@ -25,7 +30,6 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify
 
 PANDA = load_robot("panda")

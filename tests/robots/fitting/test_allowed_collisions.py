@@ -8,6 +8,7 @@ import pytest
 
 from helpers.box_arm import box_arm, box_mesh
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import inverse, transform
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.fitting.add import AddReport
 from robotdiffuse.robots.fitting.allowed_collisions import (
@@ -19,7 +20,6 @@ from robotdiffuse.robots.fitting.allowed_collisions import (
 )
 from robotdiffuse.robots.fitting.false_collisions import Refusals
 from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
-from robotdiffuse.core.transforms import inverse, transform
 
 QUICK = SamplingSettings(samples=1500)
 

@@ -10,16 +10,16 @@ import trimesh
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
+from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.fitting.allowed_collisions import Links, SamplingSettings
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.robots.fitting.convex_pair_tables import joint_table
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface
-from robotdiffuse.robots.joint_tables import JointTable
 from robotdiffuse.robots.fitting.preparation import PreparationSettings, Prepared, prepare
-from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings
+from robotdiffuse.robots.joint_tables import JointTable
+from robotdiffuse.robots.robot import Joint, Robot
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.transforms import transform
 
 PAIR = ("fork", "flange")
 QUICK = PreparationSettings(

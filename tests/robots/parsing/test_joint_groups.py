@@ -7,9 +7,9 @@ import pytest
 from helpers.example_robots import urdf_file
 from helpers.made_arms import chain, joint, link, row, written
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
 from robotdiffuse.robots.parsing.urdf import read_urdf
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 
 ARM = chain("base", row("j", 6))
 

@@ -11,17 +11,17 @@ import trimesh
 import robotdiffuse.robots as robots
 from helpers.example_robots import AWKWARD
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.transforms import rotation_from_rpy
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.fitting.add import add_robot
 from robotdiffuse.robots.fitting.allowed_collisions import SamplingSettings
-from robotdiffuse.robots.robot_folder import read_bundle, read_source, write_bundle
 from robotdiffuse.robots.fitting.convex_parts import THIN, convex_hull
-from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
 from robotdiffuse.robots.fitting.preparation import PreparationSettings
-from robotdiffuse.robots.robot import TURNS, Robot
 from robotdiffuse.robots.fitting.sphere_fitting import covered
+from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
 from robotdiffuse.robots.parsing.urdf import UrdfTree, read_urdf
-from robotdiffuse.core.transforms import rotation_from_rpy
+from robotdiffuse.robots.robot import TURNS, Robot
+from robotdiffuse.robots.robot_folder import read_bundle, read_source, write_bundle
 
 ARM = """<robot name="tiny">
   <link name="base"><collision><origin xyz="0 0 0.05"/>

@@ -6,11 +6,17 @@ import re
 import pytest
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.visualization.live.files import first_problem, problem_for, problem_text, replay_page, uploaded_problem
 from robotdiffuse.planning import load_planner
 from robotdiffuse.problems.files import problem_record
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
+from robotdiffuse.visualization.live.files import (
+    first_problem,
+    problem_for,
+    problem_text,
+    replay_page,
+    uploaded_problem,
+)
 
 
 @pytest.fixture(scope="module")

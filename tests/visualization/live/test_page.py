@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
+from robotdiffuse.core.transforms import rotation_from_quaternion, transform
+from robotdiffuse.problems.goals import PoseGoal
+from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.visualization.live.access import bound
 from robotdiffuse.visualization.live.files import first_problem, problem_text
 from robotdiffuse.visualization.live.session import Choice, Session
-from robotdiffuse.problems.goals import PoseGoal
-from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 
 if TYPE_CHECKING:
     from robotdiffuse.visualization.live.page import Page

@@ -10,21 +10,21 @@ import pytest
 
 from helpers.slow_planner import SlowPlanner
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.visualization.live.certificate import FREE, NONE, WRONG, certificate
-from robotdiffuse.visualization.live.latest_task import Latest
-from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, held_at, new_obstacle, resized
-from robotdiffuse.visualization.live.session import Choice, Session, State
+from robotdiffuse.core.registry import Entry
+from robotdiffuse.core.transforms import rotation_about, transform
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.goals import AnyGoal, JointGoal, PoseGoal
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.registry import Entry
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Mesh, PointCloud, Sphere
-from robotdiffuse.core.transforms import rotation_about, transform
-from robotdiffuse.core.types import Status
 from robotdiffuse.validation.validator import verify_trajectory
+from robotdiffuse.visualization.live.certificate import FREE, NONE, WRONG, certificate
+from robotdiffuse.visualization.live.latest_task import Latest
+from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, held_at, new_obstacle, resized
+from robotdiffuse.visualization.live.session import Choice, Session, State
 
 START = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 END = np.array([1.2, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
@@ -41,8 +41,8 @@ def until(session: Session, holds: Callable[[State], object]) -> State:
 
 
 def settled(state: State) -> bool:
-    judged = state.motion is None or (state.verdict is not None and state.verdict.version == state.version)
-    return judged and not state.planning
+    validated = state.motion is None or (state.verdict is not None and state.verdict.version == state.version)
+    return validated and not state.planning
 
 
 def a_problem(shapes: tuple = ()) -> Problem:
@@ -66,13 +66,18 @@ def in_the_way(session: Session) -> np.ndarray:
     return transform(link_pose(session.state.problem.robot, q, "panda_hand")[:3, 3])
 
 
-def test_a_motion_is_planned_judged_and_certified(session: Session) -> None:
+def test_a_motion_is_planned_validated_and_certified(session: Session) -> None:
     state = session.state
     assert state.motion is not None and state.motion.solved and state.motion is state.answer
     assert state.verdict is not None and state.verdict.report.valid
     shown = certificate(state)
     assert shown.kind == FREE and "clearance at least" in shown.headline
-    assert [stage for stage, _ in state.seconds] == ["first path", "planning", "timing", "judging once more"]
+    assert [stage for stage, _ in state.seconds] == [
+        "first path",
+        "planning",
+        "timing",
+        "validating once more",
+    ]
 
 
 def test_the_certificate_turns_red_at_once_and_green_with_the_new_plan(session: Session) -> None:

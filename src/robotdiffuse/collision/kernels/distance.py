@@ -1,6 +1,6 @@
 """Compiled signed distances of the covering spheres, and gradients: one configuration after the other.
 
-The yes-or-no check is in `lanes.py`; these serve where the amount of clearance matters: the judge, guidance,
+The yes-or-no check is in `lanes.py`; these serve where the amount of clearance matters: the validator, guidance,
 refinement, and the clearances that the denoiser sees.
 """
 

@@ -1,4 +1,4 @@
-"""The compiled part of the judge's certificate; see `collision/motions.py`.
+"""The compiled part of the validator's certificate; see `collision/motions.py`.
 
 A check is a link against the scene, or a pair of links. A piece of a motion is settled for a check when the
 lower bound of its clearance along the piece leaves a margin: `tightness` of the least clearance measured of

@@ -1,4 +1,4 @@
-"""The motions of a bench before a second judge: PyBullet, on the meshes, with its own kinematics."""
+"""The motions of a bench before a second validator: PyBullet, on the meshes, with its own kinematics."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,11 +6,11 @@ from pathlib import Path as FilePath
 from typing import NamedTuple
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import Record, read_records
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.simulation.validator import OracleContact, PyBulletOracle
-from robotdiffuse.core.types import Path
 
 STEP = 0.02
 """Between the configurations that are looked at [rad, joint-space L2]."""

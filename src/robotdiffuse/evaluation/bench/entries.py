@@ -5,10 +5,10 @@ from pathlib import Path as FilePath
 from typing import Any
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
-from robotdiffuse.planning.planner import Planner
-from robotdiffuse.planning.context import Request
 from robotdiffuse.core.settings import Settings
+from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
+from robotdiffuse.planning.context import Request
+from robotdiffuse.planning.planner import Planner
 
 
 @dataclass(frozen=True)

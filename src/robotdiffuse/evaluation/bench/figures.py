@@ -15,8 +15,8 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench.curves import Curve, curves
-from robotdiffuse.evaluation.bench.run_folder import Bench, plain_name
 from robotdiffuse.evaluation.bench.outcomes import Calls, Key, Outcome, calls_on, counting, outcome
+from robotdiffuse.evaluation.bench.run_folder import Bench, plain_name
 from robotdiffuse.evaluation.comscore import Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric
 from robotdiffuse.evaluation.problem_sets import read_cases

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from robotdiffuse.evaluation.records import CRASHED, ENDED, OVERRAN, RAISED, Record
 from robotdiffuse.core.types import Status
+from robotdiffuse.evaluation.records import CRASHED, ENDED, OVERRAN, RAISED, Record
 
 LATE_SHARE, LATE = 0.1, 0.05
 """A returned motion may be this share of the limit, or this time [s], late: planners stop in time, and then
-the judge takes its own."""
+the validator takes its own."""
 SHORTEST = 1 + 1e-6
 """A path so many times as long as the shortest known one is as short."""
 RAN_OUT, GAVE_UP, LATER = "time ran out", "gave up before", "found one later"

@@ -11,17 +11,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.evaluation import style
-from robotdiffuse.evaluation.bench import plots
-from robotdiffuse.evaluation.bench import report
+from robotdiffuse.evaluation.bench import plots, report
 from robotdiffuse.evaluation.bench.figures import Comparison, Section
-from robotdiffuse.evaluation.bench.run_folder import Bench
 from robotdiffuse.evaluation.bench.outcomes import Outcome, calls_on, counting, outcome
-from robotdiffuse.evaluation.style import card
+from robotdiffuse.evaluation.bench.run_folder import Bench
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import Record
+from robotdiffuse.evaluation.style import card
 from robotdiffuse.evaluation.tables import html as html_table
-from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.problems.held_out import Case
 from robotdiffuse.problems.problem import JointGoal
 

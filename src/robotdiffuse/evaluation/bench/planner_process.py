@@ -17,6 +17,9 @@ from dataclasses import astuple
 from pathlib import Path as FilePath
 from typing import TextIO
 
+from robotdiffuse.core.processes import Companion
+from robotdiffuse.core.registry import Entry, added, take_over
+from robotdiffuse.core.types import SHORT
 from robotdiffuse.evaluation.bench.entries import Contestant
 from robotdiffuse.evaluation.methods import measure_of, planner_calls
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN
@@ -24,16 +27,13 @@ from robotdiffuse.evaluation.runs import Fields, Trial
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.processes import Companion
-from robotdiffuse.core.registry import Entry, added, take_over
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.types import SHORT
 
 FAR_SIDE = sys.executable, "-m", "robotdiffuse.evaluation.bench.planner_process"
 START_SECONDS = 300.0
 """Most time to start and to warm up; the first time ever, kernels are compiled."""
 PATIENCE = 20.0
-"""Beyond the time limit [s], for judging and timing, until a process that does not answer is killed."""
+"""Beyond the time limit [s], for validating and timing, until a process that does not answer is killed."""
 PATIENCE_WITH_RESTARTS = 20.0
 """Time limits until then where a planner is restarted, as the timing of each of its paths is not counted."""
 END = "end"

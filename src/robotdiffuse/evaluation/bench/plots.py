@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from robotdiffuse.evaluation.bench.figures import Comparison, Section
-from robotdiffuse.evaluation.bench.run_folder import base_name, plain_name
 from robotdiffuse.evaluation.bench.outcomes import FAILURES
-from robotdiffuse.evaluation.style import FAINT, INK, LINE, SOFT, as_svg, make_figure, percent_axis
+from robotdiffuse.evaluation.bench.run_folder import base_name, plain_name
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN, RAISED
 from robotdiffuse.evaluation.statistics import wilson_interval
+from robotdiffuse.evaluation.style import FAINT, INK, LINE, SOFT, as_svg, make_figure, percent_axis
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from robotdiffuse.evaluation.bench.figures import ROP, Comparison, Row, Section
-from robotdiffuse.evaluation.bench.run_folder import Bench, base_name, plain_name
 from robotdiffuse.evaluation.bench.outcomes import FAILURES
+from robotdiffuse.evaluation.bench.run_folder import Bench, base_name, plain_name
 from robotdiffuse.evaluation.comscore import PAPER_TABLE_1, Indicators, comscores
 from robotdiffuse.evaluation.records import RESTARTED
 from robotdiffuse.evaluation.statistics import Paired
@@ -39,9 +39,9 @@ NOTES = (
     "changes nothing then. Compared are the problems on which all planners of a table have such a call.",
     "success: verified motions found by the limit, with the 95 % interval over problems (Wilson). A motion "
     "that a call returned up to 10 % or 50 ms after its own limit counts: planners stop in time, then the "
-    "judge takes its own.",
+    "validator takes its own.",
     "collision: share of problems on which the planner's last answer was a path in collision, which the "
-    "judge refused.",
+    "validator refused.",
     "length: the paper's, the ways of all links together, mean over the problems that the planner itself "
     "solved; planners that solve easy problems only look short. Where a call ran on and returned a shorter "
     "path, its length by the limit is the returned one's, scaled by the joint-space lengths.",

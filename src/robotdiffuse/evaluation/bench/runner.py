@@ -10,13 +10,13 @@ from pathlib import Path as FilePath
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import alone_in
 from robotdiffuse.evaluation.bench.entries import Contestant
 from robotdiffuse.evaluation.bench.workers import on_ray, on_this_machine
 from robotdiffuse.evaluation.machine import processor, versions
 from robotdiffuse.evaluation.problem_sets import gather_cases, problem_set_name
 from robotdiffuse.evaluation.records import RESTARTED, Record, RecordFile, record_path
 from robotdiffuse.evaluation.runs import Trial, run_trials, trials_of
-from robotdiffuse.core.output_files import alone_in
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.held_out import Case
 

@@ -1,4 +1,4 @@
-"""Checks of a data set: every shard whole, its motions judged anew, by our judge and by PyBullet on meshes.
+"""Checks of a data set: every shard whole, its motions validated anew, by our validator and by PyBullet on meshes.
 
 Nothing of what the factory said is taken on trust: a problem is rebuilt from its row alone.
 """
@@ -13,6 +13,9 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.processes import Workers, in_order
+from robotdiffuse.core.types import Path
 from robotdiffuse.datasets.manifest import Manifest, read_manifest
 from robotdiffuse.datasets.shards import (
     Shard,
@@ -24,22 +27,19 @@ from robotdiffuse.datasets.shards import (
     read_shard,
     scenes_of,
 )
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.tables import Column, Table
-from robotdiffuse.core.processes import Workers, in_order
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.types import Path
 from robotdiffuse.validation.validator import Verifier, VerifySettings
 
 KINDS: dict[str, str] = {
     "damaged": "shards damaged",
     "ends": "start or goal not exact",
     "limits": "joint limits exceeded",
-    "collision": "collisions found by the judge",
+    "collision": "collisions found by the validator",
     "pybullet": "collisions found by PyBullet",
-    "motion": "otherwise refused by the judge",
+    "motion": "otherwise refused by the validator",
     "cost": "length or detour not as recorded",
     "clearance": "clearance not as recorded",
 }
@@ -92,15 +92,15 @@ class DataCheck:
     planned: int
     """Motions that the manifest announces."""
     checked: int
-    """Motions that were judged."""
+    """Motions that were validated."""
     pybullet: bool
-    """Whether PyBullet judged too."""
+    """Whether PyBullet validated too."""
     counts: dict[str, int]
     """Findings by kind, for all of KINDS."""
     examples: tuple[Finding, ...]
     """The first few of each kind, by shard and row."""
     least_clearance: float
-    """The least recorded distance between arm and obstacles of the judged motions [m]; nan if none."""
+    """The least recorded distance between arm and obstacles of the validated motions [m]; nan if none."""
     seconds: float
     """Wall time."""
 
@@ -116,7 +116,7 @@ class DataCheck:
         asked = {kind: kind != "pybullet" or self.pybullet for kind in KINDS}
         rows = [
             ("shards, motions", f"{self.shards:,}, {self.motions:,}{planned}"),
-            ("judged", f"{self.checked:,} in {self.seconds:.1f} s ({rate:.0f}/s)"),
+            ("validated", f"{self.checked:,} in {self.seconds:.1f} s ({rate:.0f}/s)"),
             *(
                 (name, f"{self.counts[kind]:,}" if asked[kind] else "not asked")
                 for kind, name in KINDS.items()
@@ -141,10 +141,10 @@ def check_data(
 ) -> DataCheck:
     """Check the structure of every shard, and `count` random motions (all by default).
 
-    Each motion is judged on a problem that is rebuilt from its row: ends, limits, collision by the judge, and
+    Each motion is validated on a problem that is rebuilt from its row: ends, limits, collision by the validator, and
     by PyBullet on meshes at and between the waypoints; and what is recorded of it is compared with what is
     measured. `robot`: that of the data, by default found by the name in the manifest. The motions and the
-    findings do not depend on `workers` (processes). `progress` is called with the numbers of judged motions
+    findings do not depend on `workers` (processes). `progress` is called with the numbers of validated motions
     and of all.
     Raises InputError if there is no data set, for another robot than that of the data, and if PyBullet is
     wanted but not installed.
@@ -167,7 +167,7 @@ def check_data(
             for i in range(0, len(picked), CHUNK)
         ]
         total, done, least = sum(len(part) for _, part in chosen), 0, np.inf
-        for part in in_order(processes.each(task.judge, [(some,) for some in chosen])):
+        for part in in_order(processes.each(task.validator, [(some,) for some in chosen])):
             found += part.findings
             done, least = done + part.motions, min(least, part.least_clearance)
             if progress is not None:
@@ -193,13 +193,13 @@ def _need_pybullet() -> None:
         if error.name != "pybullet":
             raise
         raise InputError(
-            "the second judge needs PyBullet, whose wheels stop at Python 3.11: pip install "
+            "the second validator needs PyBullet, whose wheels stop at Python 3.11: pip install "
             "'robotdiffuse[sim]', or leave it out by --no-pybullet (pybullet=False)"
         ) from None
 
 
 @dataclass(frozen=True)
-class _Judged:
+class _Validated:
     """What came out of some rows of a shard."""
 
     motions: int
@@ -223,8 +223,8 @@ class _Task:
         except InputError as error:
             return str(error)
 
-    def judge(self, part: tuple[int, Int[ndarray, "n"]]) -> _Judged:
-        """Judge some rows of a shard."""
+    def validator(self, part: tuple[int, Int[ndarray, "n"]]) -> _Validated:
+        """Validate some rows of a shard."""
         index, rows = part
         shard = read_shard(self.folder, index)
         findings: list[Finding] = []
@@ -233,7 +233,7 @@ class _Task:
         if self.pybullet:
             findings += self._second_opinion(shard, rows)
         least = float(shard["clearance"][rows].min(initial=np.inf))
-        return _Judged(len(rows), sorted(findings, key=lambda f: f.row or 0), least)
+        return _Validated(len(rows), sorted(findings, key=lambda f: f.row or 0), least)
 
     def _second_opinion(self, shard: Shard, rows: Int[ndarray, "n"]) -> Iterator[Finding]:
         from robotdiffuse.simulation.validator import PyBulletOracle

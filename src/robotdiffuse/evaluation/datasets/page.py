@@ -7,11 +7,11 @@ from pathlib import Path as FilePath
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.evaluation import style
 from robotdiffuse.evaluation.datasets import plots
 from robotdiffuse.evaluation.datasets.plots import PLOTS, Plot
 from robotdiffuse.evaluation.datasets.report import DataFigures, facts, read_figures
-from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.datasets.manifest import Manifest, read_manifest
 from robotdiffuse.datasets.shards import SPLITS, existing_shards, read_shard, scenes_of, shard_path, split_of
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.tables import Column, Table
 
 QUANTITIES = {

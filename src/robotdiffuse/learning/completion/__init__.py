@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from robotdiffuse.perception.observed_volume import ObservedVolume
 
 
-def imagine(
+def predict(
     volume: "ObservedVolume", network: "CompletionNetwork | None" = None
 ) -> Float32[ndarray, "112 112 64"]:
     """The probability that each voxel of 2 cm holds an obstacle; 0 where it was seen free, and farther than

@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from numpy import ndarray
 from torch import Tensor, nn
 
+from robotdiffuse.core.settings import Count, Settings
 from robotdiffuse.learning.completion.samples import BITS, FREE, STEP
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL
-from robotdiffuse.core.settings import Count, Settings
 
 CHANNELS = 7
 """Occupied, free, depth behind a surface, the arm's shadow, out of view, height, distance from the base's

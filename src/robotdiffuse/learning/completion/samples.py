@@ -13,12 +13,12 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.problems.families import load_family
-from robotdiffuse.problems.families.family import Range, base_spheres
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, ObservedVolume, observe
 from robotdiffuse.perception.ray_caster import DepthNoise, looking_at, ray_cast, voxels_within
+from robotdiffuse.problems.families import load_family
+from robotdiffuse.problems.families.family import Range, base_spheres
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 FINE = VOXEL / 2

@@ -12,8 +12,8 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.learning.costs.cost import Cost
 from robotdiffuse.problems import constraint_kernel as kernel
-from robotdiffuse.problems.constraint_kernel import ANGLE_WEIGHT, DISTANCE
 from robotdiffuse.problems.compiled_constraints import PathConstraints
+from robotdiffuse.problems.constraint_kernel import ANGLE_WEIGHT, DISTANCE
 
 
 def path_constraints(constraints: PathConstraints, share: float) -> Cost:

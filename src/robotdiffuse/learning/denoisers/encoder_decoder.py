@@ -6,6 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from robotdiffuse.core.settings import Count
 from robotdiffuse.learning.denoisers.base import AttentionSettings, Denoiser
 from robotdiffuse.learning.denoisers.layers import (
     Block,
@@ -16,7 +17,6 @@ from robotdiffuse.learning.denoisers.layers import (
     start_at_zero,
     two_layers,
 )
-from robotdiffuse.core.settings import Count
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Count, Sizes
 from robotdiffuse.learning.denoisers.base import Denoiser, DenoiserSettings
 from robotdiffuse.learning.denoisers.layers import (
     LevelEmbedding,
@@ -16,7 +17,6 @@ from robotdiffuse.learning.denoisers.layers import (
     start_small,
     two_layers,
 )
-from robotdiffuse.core.settings import Count, Sizes
 
 
 @dataclass(frozen=True)

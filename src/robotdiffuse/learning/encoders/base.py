@@ -12,12 +12,12 @@ from numpy import ndarray
 from numpy.random import Generator
 from torch import Tensor, nn
 
+from robotdiffuse.core.settings import Count, Settings
 from robotdiffuse.learning.max_pool import greatest
+from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.seen_points import seen_points
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
-from robotdiffuse.core.settings import Count, Settings
 
 
 @dataclass(frozen=True)

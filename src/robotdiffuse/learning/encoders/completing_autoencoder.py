@@ -19,13 +19,13 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Count
 from robotdiffuse.learning.completion.network import CompletionNetwork, CompletionSettings
 from robotdiffuse.learning.completion.samples import OCCUPIED, pack
 from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, observe
-from robotdiffuse.core.settings import Count
+from robotdiffuse.robots.robot import Robot
 
 SHARE = 8
 """A cell of the bottleneck has so many voxels along each edge."""

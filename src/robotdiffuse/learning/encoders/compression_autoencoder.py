@@ -14,9 +14,9 @@ from jaxtyping import Float
 from numpy.random import Generator
 from torch import Tensor, nn
 
+from robotdiffuse.core.settings import Count, Sizes
 from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
 from robotdiffuse.scenes.surface_clouds import sort_points
-from robotdiffuse.core.settings import Count, Sizes
 
 
 @dataclass(frozen=True)

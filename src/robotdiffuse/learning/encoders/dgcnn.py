@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
+from robotdiffuse.core.settings import Count, Sizes
 from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max, pool_mean
 from robotdiffuse.learning.max_pool import greatest
-from robotdiffuse.core.settings import Count, Sizes
 
 SLOPE = 0.2
 """Of the leaky ReLU below zero, as in the original."""

@@ -15,8 +15,8 @@ from numpy.random import Generator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Sizes
+from robotdiffuse.learning.encoders.base import Autoencoder, EncoderSettings, fp32
 
 QUERIES = 96
 """Points per cloud at which the distance field is reconstructed."""

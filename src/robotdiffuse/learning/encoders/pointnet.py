@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max
 from robotdiffuse.core.settings import Count, Sizes
+from robotdiffuse.learning.encoders.base import Encoder, EncoderSettings, fp32, pool_max
 
 
 @dataclass(frozen=True)

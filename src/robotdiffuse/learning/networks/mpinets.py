@@ -38,6 +38,7 @@ from numpy import ndarray
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings, Share, Sizes
 from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.networks.pointnet2 import GroupAll, SetAbstraction
 from robotdiffuse.learning.robot_identity import RobotIdentity
@@ -48,9 +49,8 @@ from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
-from robotdiffuse.scenes.surface_points import VisibleRegion
 from robotdiffuse.scenes.surface_clouds import surface_clouds
-from robotdiffuse.core.settings import Count, NotNegative, Positive, Settings, Share, Sizes
+from robotdiffuse.scenes.surface_points import VisibleRegion
 
 SMOOTH = 0.1
 """Added to the distance to the goal, in units of half the joint ranges, where it is made a direction."""

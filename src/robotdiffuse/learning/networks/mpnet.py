@@ -39,14 +39,14 @@ from numpy import ndarray
 from torch import Generator, Tensor, nn
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Share, Sizes
 from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData, fast_bf16
 from robotdiffuse.learning.training.validation import motions_free
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 from robotdiffuse.scenes.surface_clouds import surface_clouds
-from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings, Share, Sizes
+from robotdiffuse.scenes.surface_points import PANDA_REGION, VisibleRegion
 
 BITS = 10
 """Of each coordinate in the place of a point along the space-filling curve."""

@@ -15,8 +15,8 @@ from robotdiffuse.learning.networks.base import BaselineNetwork
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.learning.training.config import BaselineTraining
-from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.loop import Validation
+from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.task import MotionTrainee, train
 from robotdiffuse.robots import load_robot
 

@@ -13,11 +13,11 @@ from jaxtyping import Bool, Float, Float16, Float32, Int
 from numpy import ndarray
 from torch import Tensor
 
-from robotdiffuse.datasets.rows import read_rows
-from robotdiffuse.datasets.shards import SPLITS, shard_indices
-from robotdiffuse.datasets.augmentation import turns_about_vertical
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.datasets.augmentation import turns_about_vertical
+from robotdiffuse.datasets.rows import read_rows
+from robotdiffuse.datasets.shards import SPLITS, shard_indices
 from robotdiffuse.learning.checkpoint import fingerprint
 from robotdiffuse.learning.clearance_features import PackedClearanceFn
 from robotdiffuse.learning.encoders.base import Encoder

@@ -11,8 +11,8 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits
 
+from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
 from robotdiffuse.learning.checkpoint import save_code, save_completion
-from robotdiffuse.learning.training.prefetch import MOST, SamplesAhead
 from robotdiffuse.learning.completion.network import (
     CompletionNetwork,
     CompletionSettings,
@@ -27,14 +27,14 @@ from robotdiffuse.learning.encoders.completing_autoencoder import (
 )
 from robotdiffuse.learning.training.batches import fast_bf16, random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining, ShareBelowOne, TrainingSettings
-from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.loop import Validation
+from robotdiffuse.learning.training.prefetch import MOST, SamplesAhead
+from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.task import Trainee, train
+from robotdiffuse.perception.observed_volume import VOXEL
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.perception.observed_volume import VOXEL
-from robotdiffuse.core.settings import Count, Filled, Natural, OneOf, Positive
 
 HELD_OUT = 20261122
 """Seed of the samples that are held out; training's are drawn from other seed sequences."""
@@ -43,7 +43,7 @@ VALIDATION = 4
 CALIBRATION = 12
 """Samples of each family that the temperature is fitted to."""
 CHECKED = 24
-"""Further ones of each that the trained network is judged by."""
+"""Further ones of each that the trained network is validated by."""
 THRESHOLD = 0.1
 """Probability above which a voxel counts as occupied in figures."""
 EACH = 17

@@ -4,13 +4,6 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.denoisers import DENOISERS
-from robotdiffuse.learning.denoisers.base import DenoiserSettings
-from robotdiffuse.learning.encoders import COMPLETES, ENCODERS
-from robotdiffuse.learning.encoders.base import EncoderSettings
-from robotdiffuse.learning.motion_model import MOST_WAYPOINTS, ModelParts
-from robotdiffuse.learning.networks import NETWORKS
-from robotdiffuse.learning.training.losses import LossSettings
 from robotdiffuse.core.settings import (
     Bound,
     Count,
@@ -22,6 +15,13 @@ from robotdiffuse.core.settings import (
     SettingsOf,
     Share,
 )
+from robotdiffuse.learning.denoisers import DENOISERS
+from robotdiffuse.learning.denoisers.base import DenoiserSettings
+from robotdiffuse.learning.encoders import COMPLETES, ENCODERS
+from robotdiffuse.learning.encoders.base import EncoderSettings
+from robotdiffuse.learning.motion_model import MOST_WAYPOINTS, ModelParts
+from robotdiffuse.learning.networks import NETWORKS
+from robotdiffuse.learning.training.losses import LossSettings
 
 ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 DEVICES = ("cpu", "cuda")

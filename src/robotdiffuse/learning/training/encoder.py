@@ -13,12 +13,12 @@ from robotdiffuse.learning.encoders import make_encoder
 from robotdiffuse.learning.encoders.base import Autoencoder, Encoder
 from robotdiffuse.learning.training.batches import random_scenes, scene_clouds
 from robotdiffuse.learning.training.config import EncoderTraining
-from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.loop import Validation
+from robotdiffuse.learning.training.processes import Processes, on_cpu
 from robotdiffuse.learning.training.task import Trainee, train
 
 READ, CHECKED = 2048, 512
-"""Scenes that a linear read-out is fitted to, and further ones that it is judged by."""
+"""Scenes that a linear read-out is fitted to, and further ones that it is validated by."""
 SPOTS = np.stack(
     np.meshgrid([-0.6, -0.2, 0.2, 0.6], [-0.6, -0.2, 0.2, 0.6], [0.2, 0.5, 0.8], indexing="ij"), -1
 ).reshape(-1, 3)
@@ -60,13 +60,13 @@ class _EncoderTrainee(Trainee):
         return error + settings.regularization * theta
 
     def validate(self, fraction: float) -> Validation:
-        return Validation(self._judge(128, 123)[0].item())
+        return Validation(self._validator(128, 123)[0].item())
 
     def finish(self) -> dict[str, float]:
         settings = self.settings
         rng = np.random.default_rng(settings.seed + 1)
         scenes = random_scenes(READ, settings.max_obstacles, rng)
-        report = self._judge(512, settings.seed + 2)[1]
+        report = self._validator(512, settings.seed + 2)[1]
         trained = self._trained = on_cpu(self.module)
         with torch.no_grad():
             clouds = scene_clouds(trained, scenes, rng).split(256)
@@ -76,7 +76,7 @@ class _EncoderTrainee(Trainee):
     def save(self, folder: FilePath, training: dict[str, Any]) -> None:
         save_encoder(self._trained, folder, training)
 
-    def _judge(self, count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
+    def _validator(self, count: int, seed: int) -> tuple[Float[Tensor, ""], dict[str, float]]:
         with torch.no_grad():
             return self._reconstruction(count, self._most, np.random.default_rng(seed))
 
@@ -93,7 +93,7 @@ def linear_readout(encoder: Encoder, max_obstacles: int, rng: np.random.Generato
     """What of a scene stands in z in plain sight: a yardstick that is the same for all encoders.
 
     A linear map from z to the signed distances of fixed places around the arm to the obstacles, fitted to
-    random scenes and judged by others. `readout`: its mean error [m]; `readout_of_constant`: that of the mean
+    random scenes and validated by others. `readout`: its mean error [m]; `readout_of_constant`: that of the mean
     distances, with no z at all.
     """
     scenes = random_scenes(READ + CHECKED, max_obstacles, rng)

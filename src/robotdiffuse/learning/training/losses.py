@@ -14,10 +14,10 @@ from torch import Tensor
 
 from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.robots.forward_kinematics import ForwardKinematics
-from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.core.settings import Count, NotNegative, Settings, Share
 from robotdiffuse.core.transforms import rotation_from_quaternion
+from robotdiffuse.robots.forward_kinematics import ForwardKinematics
+from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 
 POINT_UNIT = 0.1
 """[m] in L_point and L_collision, so that they are of the size of L_joint."""

@@ -9,9 +9,9 @@ from concurrent.futures import Future, ProcessPoolExecutor
 
 import numpy as np
 
-from robotdiffuse.learning.completion.samples import Samples, draw_samples
 from robotdiffuse.core.processes import interrupts_not_passed_on, prepare_worker
 from robotdiffuse.core.registry import Added, added
+from robotdiffuse.learning.completion.samples import Samples, draw_samples
 from robotdiffuse.robots.robot import Robot
 
 NICE = 5

@@ -16,8 +16,8 @@ from robotdiffuse.learning.encoders.base import Encoder
 from robotdiffuse.learning.training.batches import TrajectoryData, load_data
 from robotdiffuse.learning.training.config import MotionTraining, TrainingSettings
 from robotdiffuse.learning.training.growing_data import GrowingData
-from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.loop import TrainingRun, Validation
+from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.robots.robot import Robot
 
 HELD_OUT = 2000

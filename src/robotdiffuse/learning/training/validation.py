@@ -1,7 +1,7 @@
 """Validations that plan: what a network in training would solve by itself, without search, and without
 guidance unless it sees no scene.
 
-Covering spheres decide, not the judge: it is for curves of training, which compare a network with itself.
+Covering spheres decide, not the validator: it is for curves of training, which compare a network with itself.
 """
 
 import numpy as np

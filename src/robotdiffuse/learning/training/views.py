@@ -8,8 +8,8 @@ from numpy import ndarray
 
 from robotdiffuse.learning.completion.samples import camera_view
 from robotdiffuse.learning.encoders.base import Encoder
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.perception.depth_view import DepthView
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
 
 

@@ -31,6 +31,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Bound, Count, Filled, Natural, NotNegative, Positive, Settings, Share
 from robotdiffuse.learning.diffusion import NoiseSchedule
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.baselines.guided_prior import (
@@ -41,7 +42,6 @@ from robotdiffuse.planning.baselines.guided_prior import (
     limited,
     sample,
 )
-from robotdiffuse.core.settings import Bound, Count, Filled, Natural, NotNegative, Positive, Settings, Share
 
 
 @dataclass(frozen=True)

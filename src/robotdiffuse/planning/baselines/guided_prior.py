@@ -1,4 +1,4 @@
-"""What MPD and EDMP share: batches of guided samples of the trajectory prior, until one passes the judge.
+"""What MPD and EDMP share: batches of guided samples of the trajectory prior, until one passes the validator.
 
 - *MPD*: J. Carvalho, A. Le, M. Baierl, D. Koert, J. Peters, "Motion Planning Diffusion: Learning and Planning
   of Robot Motions with Diffusion Models", IROS 2023.
@@ -36,13 +36,13 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free, path_length
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.learning.motion_model import MotionModel, one_thread
-from robotdiffuse.learning.samplers.ddpm import ancestral
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
-from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive
+from robotdiffuse.learning.motion_model import MotionModel, one_thread
+from robotdiffuse.learning.samplers.ddpm import ancestral
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
+from robotdiffuse.planning.start_goal import StartGoal
 
 RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of a sample [m]."""
@@ -79,7 +79,7 @@ Own = TypeVar("Own", bound=PriorSettings)
 class GuidedPrior(LearnedPlanner[Own]):
     """A planner that samples batches from the prior under guidance.
 
-    The free samples of a batch go to the judge, the shortest first; where none passes, the next batch is
+    The free samples of a batch go to the validator, the shortest first; where none passes, the next batch is
     drawn from new noise, until time runs out. There is no search, and no sample is shortened or repaired.
     """
 
@@ -97,15 +97,17 @@ class GuidedPrior(LearnedPlanner[Own]):
     ) -> Float[ndarray, "count waypoints dof"] | None:
         """A batch of guided samples, float32; None if `stop` says so before they are done."""
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        prior, samples = self.network(call.problem.robot), self.settings.samples
-        start, goals = shared_out(*ends.rows(), samples)
-        space = search_space(ends.checker, RESOLUTION)
+        prior, samples = self.network(context.problem.robot), self.settings.samples
+        start, goals = shared_out(*start_goal.rows(), samples)
+        space = search_space(start_goal.checker, RESOLUTION)
         closest: Attempt | None = None
         batches = 0
-        while call.remaining > 0:
-            drawn = self.draw(prior, ends.checker, start, goals, call.rng, lambda: call.remaining <= 0)
+        while context.remaining > 0:
+            drawn = self.draw(
+                prior, start_goal.checker, start, goals, context.rng, lambda: context.remaining <= 0
+            )
             if drawn is None:
                 break
             batches += 1
@@ -115,15 +117,15 @@ class GuidedPrior(LearnedPlanner[Own]):
                     if closest is None or attempt[:2] < closest[:2]:
                         closest = attempt
                     break
-                result = call.finish(ends.complete(attempt.path), self.name)
+                result = context.finish(start_goal.complete(attempt.path), self.name)
                 if result is not None:
                     return result
         if closest is not None:
             # so that the result says what is wrong with it; the exact meshes may even call it free
-            result = call.finish(ends.complete(closest.path), self.name)
+            result = context.finish(start_goal.complete(closest.path), self.name)
             if result is not None:
                 return result
-        return call.unsolved(
+        return context.unsolved(
             f"none of {batches * samples} samples of the network is free of collision"
             if batches
             else f"time ran out before the first {samples} samples were done; it takes a longer limit"

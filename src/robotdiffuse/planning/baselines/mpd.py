@@ -35,6 +35,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.settings import Count, Natural, NotNegative, Share
 from robotdiffuse.learning.diffusion import NoiseSchedule
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.baselines.guided_prior import (
@@ -45,7 +46,6 @@ from robotdiffuse.planning.baselines.guided_prior import (
     limited,
     sample,
 )
-from robotdiffuse.core.settings import Count, Natural, NotNegative, Share
 
 EXPONENTIAL_BETAS = (1e-4, 1.0)
 """Variance that the first and last step of MPD's exponential schedule add."""

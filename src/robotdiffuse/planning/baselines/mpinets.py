@@ -11,7 +11,7 @@ Differences from the paper, besides those of the network:
   policy goes on. For a pose the goals are configurations by inverse kinematics.
 - The paper has one roll-out. The repetitions, which cost its success nothing, use the time that all planners
   have. They are spread over the goals, the nearest first, and end where the arm collides.
-- Nothing is repaired or shortened. A motion that the judge refuses is not a result; where nothing better was
+- Nothing is repaired or shortened. A motion that the validator refuses is not a result; where nothing better was
   found, the first one is handed to it, so that the result says what was wrong.
 """
 
@@ -26,13 +26,13 @@ from torch import Tensor
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, RollOuts
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
-from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.core.settings import Count, NotNegative, Positive
+from robotdiffuse.learning.networks.mpinets import MPiNetsNetwork, RollOuts
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
+from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.scenes.surface_points import sample_surface
 
 STILL = 1e-4
 """The policy stands still where no joint moves further in a step [rad]; it would for ever."""
@@ -59,33 +59,33 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
     name = network_name = "mpinets"
     settings_class = MPiNetsSettings
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        network, rng = self.network(call.problem.robot), call.rng
+        network, rng = self.network(context.problem.robot), context.rng
         best: _Motion | None = None
         tried = 0
-        while best is None or call.remaining > 0:
+        while best is None or context.remaining > 0:
             count = self.settings.batch if tried else 1
-            for motion in self._roll_outs(call, network, ends, tried, count, rng):
+            for motion in self._roll_outs(context, network, start_goal, tried, count, rng):
                 if motion.free:
-                    result = call.finish(motion.path(ends), "policy")
+                    result = context.finish(motion.path(start_goal), "policy")
                     if result is not None:
                         return result
                 if best is None or motion.arrived > best.arrived:
                     best = motion
             tried += count
-        # the judge looks at the meshes, which the covering spheres stick out of: it may be good after all
-        result = call.finish(best.path(ends), "policy")
+        # the validator looks at the meshes, which the covering spheres stick out of: it may be good after all
+        result = context.finish(best.path(start_goal), "policy")
         if result is not None:
             return result
         what = "reached the goal, but not free of collision" if best.arrived else "did not reach the goal"
-        return call.unsolved(f"{tried} roll-outs of the policy, the best of which {what}")
+        return context.unsolved(f"{tried} roll-outs of the policy, the best of which {what}")
 
     def _roll_outs(
         self,
-        call: Call,
+        context: PlanningContext,
         network: MPiNetsNetwork,
-        ends: Ends,
+        start_goal: StartGoal,
         tried: int,
         count: int,
         rng: np.random.Generator,
@@ -95,11 +95,11 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         `tried` were tried before; the very first goes on even if it collides.
         """
         settings, first = self.settings, tried == 0
-        space = search_space(ends.checker, settings.resolution)
-        start, goals = ends.rows()
+        space = search_space(start_goal.checker, settings.resolution)
+        start, goals = start_goal.rows()
         order = np.argsort(np.linalg.norm(goals - start, axis=1), kind="stable")
         goal = goals[order[np.arange(tried, tried + count) % len(order)]]
-        clouds = scene_clouds(network, ends.checker, count, rng)
+        clouds = scene_clouds(network, start_goal.checker, count, rng)
         roll_outs = RollOuts(network, clouds, np.repeat(start[None], count, 0), goal)
         motions = [_Motion(start, end) for end in goal]
         for step in range(settings.steps + 1):
@@ -111,7 +111,7 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
             roll_outs.stop(
                 np.array([motion.arrived or (motion.collided and not first) for motion in motions])
             )
-            if step == settings.steps or not roll_outs.running.any() or call.remaining <= 0:
+            if step == settings.steps or not roll_outs.running.any() or context.remaining <= 0:
                 break
             noise = settings.noise * rng.standard_normal(goal.shape, dtype=np.float32)
             roll_outs.advance(None if first else noise)
@@ -143,12 +143,12 @@ class _Motion:
             self.waypoints.append(self.goal)
             self.arrived = True
 
-    def path(self, ends: Ends) -> Float[ndarray, "n dof"]:
+    def path(self, start_goal: StartGoal) -> Float[ndarray, "n dof"]:
         """Its waypoints, with the exact ends of the problem as far as it has reached them."""
         if self.arrived:
-            return ends.complete(np.stack(self.waypoints))
+            return start_goal.complete(np.stack(self.waypoints))
         return np.concatenate(
-            [ends.start[None], np.stack(self.waypoints[1:] or self.waypoints).astype(np.float64)]
+            [start_goal.start[None], np.stack(self.waypoints[1:] or self.waypoints).astype(np.float64)]
         )
 
 

@@ -32,15 +32,15 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import finer, search_space
-from robotdiffuse.learning.networks.mpnet import MPNetNetwork
-from robotdiffuse.trajectories.simplification import shortcut
-from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
-from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
+from robotdiffuse.learning.networks.mpnet import MPNetNetwork
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
+from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.scenes.surface_points import sample_surface
+from robotdiffuse.trajectories.simplification import shortcut
 
 SEARCH_ITERATIONS = 500
 """Iterations of RRT-Connect between two looks at the clock, in hybrid replanning."""
@@ -60,7 +60,7 @@ class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
     hybrid_range: Positive = 1.0
     """Longest extension of a tree of RRT-Connect [rad, joint-space L2]."""
     resolution: Positive = 0.03
-    """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
+    """No point of the arm moves further than this between two checks of a motion [m]; the validator's certificate
     covers the rest, and after a path that it refuses it is half of that."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
@@ -72,26 +72,31 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
     name = network_name = "mpnet"
     settings_class = MPNetPlannerSettings
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        network, settings, best, rounds = self.network(call.problem.robot), self.settings, Attempt.none(), 0
-        while rounds == 0 or call.remaining > 0:
-            one = NeuralPlanning(call, ends, network, settings, call.rng)
+        network, settings, best, rounds = (
+            self.network(context.problem.robot),
+            self.settings,
+            Attempt.none(),
+            0,
+        )
+        while rounds == 0 or context.remaining > 0:
+            one = NeuralPlanning(context, start_goal, network, settings, context.rng)
             found = one.best()
             rounds += 1
             if found.broken == 0:
-                result = call.finish(ends.complete(found.path), self.name, one.reason(rounds))
+                result = context.finish(start_goal.complete(found.path), self.name, one.reason(rounds))
                 if result is not None:
                     return result
                 settings = replace(settings, resolution=finer(settings.resolution))
             elif found.broken < best.broken:
                 best = found
         if len(best.path):
-            result = call.finish(ends.complete(best.path), self.name)
+            result = context.finish(start_goal.complete(best.path), self.name)
             if result is not None:
                 return result
-        return call.unsolved(
-            f"no path of the network was free in {call.elapsed:.2f} s and {rounds} rounds of "
+        return context.unsolved(
+            f"no path of the network was free in {context.elapsed:.2f} s and {rounds} rounds of "
             f"{settings.attempts} attempts; a longer time limit or hybrid replanning may find one"
         )
 
@@ -113,20 +118,22 @@ class NeuralPlanning:
 
     def __init__(
         self,
-        call: Call,
-        ends: Ends,
+        context: PlanningContext,
+        start_goal: StartGoal,
         network: MPNetNetwork,
         settings: MPNetPlannerSettings,
         rng: np.random.Generator,
     ) -> None:
-        self.call, self.network, self.settings = call, network, settings
-        self.space = search_space(ends.checker, settings.resolution, ends.kept_clearance(settings.clearance))
+        self.context, self.network, self.settings = context, network, settings
+        self.space = search_space(
+            start_goal.checker, settings.resolution, start_goal.kept_clearance(settings.clearance)
+        )
         self.generator = Generator().manual_seed(int(rng.integers(2**63)))
         self.state = random_state(int(rng.integers(2**31)))
-        start, goals = ends.rows()
+        start, goals = start_goal.rows()
         self.starts = np.tile(start, (settings.attempts, 1))
         self.goals = goals[(np.arange(settings.attempts) + rng.integers(len(goals))) % len(goals)]
-        self.z = scene_code(network, ends.checker, rng)
+        self.z = scene_code(network, start_goal.checker, rng)
         self.replanned = 0
         """How often what collides was planned anew."""
         self.searched = False
@@ -137,7 +144,7 @@ class NeuralPlanning:
         paths = [self.contracted(path) for path in self.between(self.starts, self.goals, True)]
         free = [self.segments_free(path) for path in paths]
         while not any(f.all() for f in free):
-            if self.replanned == self.settings.replanning or self.call.remaining <= 0:
+            if self.replanned == self.settings.replanning or self.context.remaining <= 0:
                 break
             self.replanned += 1
             paths = [self.contracted(path) for path in self.replan(paths)]
@@ -166,7 +173,7 @@ class NeuralPlanning:
         forth, back = [[q] for q in starts], [[q] for q in goals]
         near, far, apart = forth, back, list(range(len(starts)))
         for _ in range(self.settings.steps):
-            if not apart or self.call.remaining <= 0:
+            if not apart or self.context.remaining <= 0:
                 break
             q, goal = (np.stack([rows[i][-1] for i in apart]) for rows in (near, far))
             for i, state in zip(apart, self.next_states(q, goal), strict=True):
@@ -210,7 +217,7 @@ class NeuralPlanning:
     def searched_between(self, a: Float[ndarray, "dof"], b: Float[ndarray, "dof"]) -> Float[ndarray, "n dof"]:
         """A free path from a to b by RRT-Connect; the straight line if time runs out."""
         trees = rrt_kernel.make_trees(a, b[None], SEARCH_CAPACITY)
-        while self.call.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
+        while self.context.remaining > 0 and trees.sizes.max() < SEARCH_CAPACITY:
             longest = np.float32(self.settings.hybrid_range)
             path = rrt_kernel.connect(self.space, trees, longest, SEARCH_ITERATIONS, self.state)
             if len(path):

@@ -9,7 +9,7 @@ every state and every motion; those answer with the compiled kernel that `rrt_co
 *First-solution planners* (RRT, RRT-Connect, PRM) end with their first path, which OMPL's PathSimplifier then
 shortens as in its SimpleSetup and in MoveIt. *Anytime planners* (RRT*, Informed RRT*, BIT*, AORRTC) minimize
 joint-space length until time runs out, or until the path is as short as the straight line. Whenever a path is
-IMPROVEMENT shorter than the last, the judge looks at it, so that a late path that it refuses costs no plan.
+IMPROVEMENT shorter than the last, the validator looks at it, so that a late path that it refuses costs no plan.
 
 *Seeds.* OMPL has one source of seeds for the whole process, which is set anew for each search, so that a seed
 gives a path again as long as time does not run out (anytime planners mostly end when it does). The exception
@@ -32,13 +32,13 @@ from robotdiffuse.collision.kernels import lane_collision
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import finer, search_space
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.planner import Planner, ever_finer
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
 from robotdiffuse.core.types import Path
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.planner import Planner, ever_finer
+from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.robots.robot import Robot
 
 try:
     from ompl import base as ob
@@ -62,7 +62,7 @@ SAME = 1e-6
 @dataclass(frozen=True)
 class OmplSettings(Settings, name="ompl"):
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
+    """No point of the arm moves further than this between two checks of a motion [m]; the validator's certificate
     covers the rest, and after a path that it refuses the search begins anew at half the distance."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m], as for rrt_connect."""
@@ -91,49 +91,51 @@ class OmplPlanner(Planner[OmplSettings]):
                 f"ompl.range is {self.settings.range}; {self.name} has no range, so it must be None"
             )
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
         with _quiet():
-            return self._best(call, ends) if self.anytime else self._first(call, ends)
+            return self._best(context, start_goal) if self.anytime else self._first(context, start_goal)
 
-    def _first(self, call: Call, ends: Ends) -> PlanResult:
-        for settings, attempt in ever_finer(call, self.settings):
-            search = _Search(call, ends, self, settings, attempt)
+    def _first(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        for settings, attempt in ever_finer(context, self.settings):
+            search = _Search(context, start_goal, self, settings, attempt)
             if not search.run():
-                return call.unsolved(search.gave_up)
+                return context.unsolved(search.gave_up)
             if settings.simplify:
                 search.simplify()
-            result = call.finish(ends.complete(search.path()), self.name)
+            result = context.finish(start_goal.complete(search.path()), self.name)
             if result is not None:
                 return result
-        return call.unsolved()
+        return context.unsolved()
 
-    def _best(self, call: Call, ends: Ends) -> PlanResult:
-        """The shortest path that the judge let pass until time runs out or none can be shorter."""
-        problem, settings, attempt = call.problem, self.settings, 0
-        start, goals = ends.rows()
+    def _best(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        """The shortest path that the validator let pass until time runs out or none can be shorter."""
+        problem, settings, attempt = context.problem, self.settings, 0
+        start, goals = start_goal.rows()
         nearest = float(np.linalg.norm(goals - start, axis=1).min())
         enough = (1 + OPTIMAL) * max(nearest, SAME)
         best, shortest, searched = None, np.inf, np.inf
-        search = _Search(call, ends, self, settings, attempt)
+        search = _Search(context, start_goal, self, settings, attempt)
         while search.run(shorter_than=max((1 - IMPROVEMENT) * searched, enough)):
-            path = Path(problem.robot.joint_names, ends.complete(search.path()))
+            path = Path(problem.robot.joint_names, start_goal.complete(search.path()))
             searched = search.cost
             if path.length < shortest:
-                if call.judge.path(path).valid:
+                if context.validator.path(path).valid:
                     best, shortest = path.positions, path.length
-                    call.improved(shortest)
+                    context.improved(shortest)
                     if searched <= enough:
                         break
                 else:
                     settings = replace(settings, resolution=finer(settings.resolution))
                     attempt, searched = attempt + 1, np.inf
-                    search = _Search(call, ends, self, settings, attempt)
-            if call.remaining <= 0:
+                    search = _Search(context, start_goal, self, settings, attempt)
+            if context.remaining <= 0:
                 break
         if best is None:
-            return call.unsolved(search.gave_up)
-        return call.finish(best, self.name) or call.unsolved("the judge refused the motion along the path")
+            return context.unsolved(search.gave_up)
+        return context.finish(best, self.name) or context.unsolved(
+            "the validator refused the motion along the path"
+        )
 
 
 class OmplRRT(OmplPlanner):
@@ -188,8 +190,8 @@ class OmplAORRTC(OmplPlanner):
 class _Watch:
     """Ends a search by OMPL, and keeps what Python raised below it: no exception passes through C++."""
 
-    def __init__(self, call: Call) -> None:
-        self.call = call
+    def __init__(self, context: PlanningContext) -> None:
+        self.context = context
         self._error: BaseException | None = None
         self._condition: ob.PlannerTerminationCondition | None = None
         self._planner: Any = None
@@ -199,7 +201,7 @@ class _Watch:
     def until_time_is_over(self) -> Iterator[ob.PlannerTerminationCondition]:
         """Raises after it what was caught within it."""
         # not a condition in Python: PRM's second thread would wait forever for the lock that the first holds
-        yield from self._while(ob.timedPlannerTerminationCondition(max(self.call.remaining, 0.0)))
+        yield from self._while(ob.timedPlannerTerminationCondition(max(self.context.remaining, 0.0)))
 
     @contextmanager
     def until_shorter(self, planner: Any, than: float) -> Iterator[ob.PlannerTerminationCondition]:
@@ -232,7 +234,7 @@ class _Watch:
 
     def _is_over(self) -> bool:
         try:
-            return self.call.remaining <= 0 or self._planner.bestCost().value() < self._shorter_than
+            return self.context.remaining <= 0 or self._planner.bestCost().value() < self._shorter_than
         except BaseException as error:
             self.caught(error)
             return True
@@ -276,16 +278,23 @@ class _Motions(ob.MotionValidator):
 
 
 class _Search:
-    """One search by OMPL; it can be continued. Paths are not yet judged."""
+    """One search by OMPL; it can be continued. Paths are not yet validated."""
 
     def __init__(
-        self, call: Call, ends: Ends, planner: OmplPlanner, settings: OmplSettings, attempt: int
+        self,
+        context: PlanningContext,
+        start_goal: StartGoal,
+        planner: OmplPlanner,
+        settings: OmplSettings,
+        attempt: int,
     ) -> None:
         # OMPL hands a seed from this source to each generator that it makes from here on; 0 is none
-        ou.RNG.setSeed(int(np.random.SeedSequence([call.seed, attempt]).generate_state(1)[0]) or 1)
-        self._call, self._robot = call, call.problem.robot
-        self._watch = _Watch(call)
-        space = search_space(ends.checker, settings.resolution, ends.kept_clearance(settings.clearance))
+        ou.RNG.setSeed(int(np.random.SeedSequence([context.seed, attempt]).generate_state(1)[0]) or 1)
+        self._call, self._robot = context, context.problem.robot
+        self._watch = _Watch(context)
+        space = search_space(
+            start_goal.checker, settings.resolution, start_goal.kept_clearance(settings.clearance)
+        )
         # Python keeps what C++ refers to, until the search is over
         self._states = _state_space(self._robot)
         self._information = ob.SpaceInformation(self._states)
@@ -294,7 +303,7 @@ class _Search:
         self._information.setStateValidityChecker(self._validity)
         self._information.setMotionValidator(self._motions)
         self._information.setup()
-        start, goals = ends.rows()
+        start, goals = start_goal.rows()
         self._backwards = planner.backwards
         first, last = (goals, start[None]) if self._backwards else (start[None], goals)
         self._goals = ob.GoalStates(self._information)

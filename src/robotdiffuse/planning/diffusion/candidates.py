@@ -8,13 +8,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import usable_ends
-from robotdiffuse.planning.learned import nearest_goals
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.diffusion.hybrid import WAYPOINTS, RobotDiffuse
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
+from robotdiffuse.planning.learned import nearest_goals
+from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
 
 TIME = 1.0
 """Limit for finding configurations of the goal [s]."""
@@ -41,24 +41,24 @@ def draw_candidates(problem: Problem, seed: int = 0) -> Candidates:
     """
     planner = _planner()
     model = planner.model(problem.robot)
-    call = Call(planner.name, problem, TIME, seed)
-    ends = usable_ends(call)
-    if isinstance(ends, PlanResult):
-        raise InputError(f"nothing can be drawn: {ends.reason}")
-    start, goals = ends.rows()
+    context = PlanningContext(planner.name, problem, TIME, seed)
+    start_goal = usable_start_goal(context)
+    if isinstance(start_goal, PlanResult):
+        raise InputError(f"nothing can be drawn: {start_goal.reason}")
+    start, goals = start_goal.rows()
     if model is None:
         goals = nearest_goals(start, goals, planner.settings.samples)
-        q = smooth_noise(start, goals, planner.settings.samples, WAYPOINTS, problem.robot, call.rng)
-        q = planner.refine(ends.checker, q)
+        q = smooth_noise(start, goals, planner.settings.samples, WAYPOINTS, problem.robot, context.rng)
+        q = planner.refine(start_goal.checker, q)
     else:
-        code = planner.code(model, ends.checker, call.rng)
-        q = planner.draw(model, ends.checker, code, start, goals, call.rng)
+        code = planner.code(model, start_goal.checker, context.rng)
+        q = planner.draw(model, start_goal.checker, code, start, goals, context.rng)
     count, waypoints, dof = q.shape
     at = np.linspace(0, waypoints - 1, BETWEEN * (waypoints - 1) + 1)
     low = np.minimum(at.astype(int), waypoints - 2)
     share = (at - low)[:, None]
     dense = (1 - share) * q[:, low] + share * q[:, low + 1]
-    distances = ends.checker.link_clearances(dense.reshape(-1, dof)).reshape(count, -1)
+    distances = start_goal.checker.link_clearances(dense.reshape(-1, dof)).reshape(count, -1)
     source = "smooth_noise" if model is None else "network"
     return Candidates(
         source, np.asarray(q, np.float64), distances.min(axis=1, initial=1.0).astype(np.float64)

@@ -1,13 +1,13 @@
 """The paper's method and nothing else: encoder, sampling, guidance.
 
 The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
-collision guidance; every sample goes to the judge as it is, and the shortest valid one is the answer. Where
+collision guidance; every sample goes to the validator as it is, and the shortest valid one is the answer. Where
 none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line, no
 search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance solve.
 Around it, `planning.diffusion.hybrid` puts what makes a motion dependable.
 
 Path constraints are a further cost of guidance, and each waypoint of a sample is projected onto them before
-the judge, who proves them between the waypoints too, is asked. The network has never seen any.
+the validator, who proves them between the waypoints too, is asked. The network has never seen any.
 
 Unless the settings say otherwise, the weights are used with the sampler and the steps that they name, and
 without guidance this is the network alone: `guidance_steps` 0.
@@ -24,22 +24,22 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Count, Natural, NotNegative, OneOf, Share
+from robotdiffuse.core.types import Path
 from robotdiffuse.learning.costs.cost import Cost
 from robotdiffuse.learning.costs.path_constraints import path_constraints
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.weights_registry import weights_for
-from robotdiffuse.planning.planner import CONSTRAINTS
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.search.constrained import SHARE, corner_kept
-from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
+from robotdiffuse.planning.planner import CONSTRAINTS
+from robotdiffuse.planning.search.constrained import SHARE, corner_kept
+from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.surface_points import sample_surface
-from robotdiffuse.core.settings import Count, Natural, NotNegative, OneOf, Share
-from robotdiffuse.core.types import Path
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
@@ -157,7 +157,7 @@ def encode(
 def _projected(
     constraints: PathConstraints, path: Float[ndarray, "waypoints dof"]
 ) -> Float[ndarray, "waypoints dof"]:
-    """The path with all waypoints between its ends on what the constraints leave; as it is, for the judge to
+    """The path with all waypoints between its ends on what the constraints leave; as it is, for the validator to
     refuse, where one of them leads nowhere."""
     between = constraints.projected(path[1:-1], SHARE)
     return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
@@ -170,18 +170,18 @@ class Diffusion(ModelSampler[DiffusionSettings]):
     settings_class = DiffusionSettings
     keeps = frozenset({CONSTRAINTS})
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        model, rng = self.network(call.problem.robot), call.rng
-        start, goals = ends.rows()
-        code = encode(model, ends.checker, self.settings.points, rng)
-        names, constraints = call.problem.robot.joint_names, call.judge.constraints
+        model, rng = self.network(context.problem.robot), context.rng
+        start, goals = start_goal.rows()
+        code = encode(model, start_goal.checker, self.settings.points, rng)
+        names, constraints = context.problem.robot.joint_names, context.validator.constraints
         costs = {} if constraints is None else {"path_constraints": path_constraints(constraints, SHARE)}
-        every, valid, until = list[Path](), list[Path](), call.time_limit
-        while not every or call.elapsed < until:
+        every, valid, until = list[Path](), list[Path](), context.time_limit
+        while not every or context.elapsed < until:
             batch = self.draw(
                 model,
-                ends.checker,
+                start_goal.checker,
                 code,
                 start,
                 goals,
@@ -191,18 +191,18 @@ class Diffusion(ModelSampler[DiffusionSettings]):
             )
             if constraints is not None:
                 batch = [_projected(constraints, q) for q in batch]
-            paths = [Path(names, ends.complete(q)) for q in batch]
-            passed = [path for path in paths if call.judge.path(path).valid]
+            paths = [Path(names, start_goal.complete(q)) for q in batch]
+            passed = [path for path in paths if context.validator.path(path).valid]
             for path in passed:
-                call.improved(path.length)
+                context.improved(path.length)
             if passed and not valid:
-                until = min(call.elapsed + self.settings.optimize_time, call.time_limit)
+                until = min(context.elapsed + self.settings.optimize_time, context.time_limit)
             every, valid = every + paths, valid + passed
         reason = f"{len(valid)} of {len(every)} samples of the network are valid"
-        # where none is, the judge is asked about one once more, so that the result says what is wrong with it
+        # where none is, the validator is asked about one once more, so that the result says what is wrong with it
         for path in sorted(valid or every[-1:], key=lambda path: path.length):
             how = f"solved by network: {reason}"
-            result = call.finish(path.positions, "network", how, keeps=partial(corner_kept, constraints))
+            result = context.finish(path.positions, "network", how, keeps=partial(corner_kept, constraints))
             if result is not None:
                 return result
-        return call.unsolved(reason)
+        return context.unsolved(reason)

@@ -6,7 +6,7 @@ or, where none of them is free, the same after more gradient steps (refinement).
 told clearances, and no code (see `RobotDiffuse.code`). For an arm without weights the batches are smooth
 noise after as many such steps (see smooth_noise.py). What the batches propose is simplified by the same code
 as what search finds, and the shortest path of either bounds the next search. Everything goes through the
-judge, and the result names the stage that its path comes from.
+validator, and the result names the stage that its path comes from.
 
 Under path constraints it is search alone: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
 shorter (the mean of 20 upright cups and of 20 lines; median: the same).
@@ -26,19 +26,19 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Bound, Count, Natural
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.weights_registry import weights_for
-from robotdiffuse.planning.search.aorrtc import AORRTC, STEP, AORRTCSettings
-from robotdiffuse.planning.search.anytime import AnytimeSearch, anytime
-from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS
-from robotdiffuse.planning.context import Call
+from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.diffusion.diffusion import ModelSampler, SamplingSettings, encode
-from robotdiffuse.planning.start_goal import Ends
-from robotdiffuse.planning.learned import nearest_goals
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
-from robotdiffuse.core.results import PlanResult
+from robotdiffuse.planning.learned import nearest_goals
+from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS
+from robotdiffuse.planning.search.anytime import AnytimeSearch, anytime
+from robotdiffuse.planning.search.aorrtc import AORRTC, STEP, AORRTCSettings
+from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.settings import Bound, Count, Natural
 
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import MotionModel
@@ -114,31 +114,31 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             self.model(robot)
             self.at_hand.add(weights)
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        settings, robot = self.settings, call.problem.robot
-        if call.problem.constraints:
+        settings, robot = self.settings, context.problem.robot
+        if context.problem.constraints:
             from robotdiffuse.planning.search.constrained import plan_constrained
 
-            return plan_constrained(call, ends, settings.search)
-        search = AnytimeSearch(call, ends, settings.search, AORRTC.name)
+            return plan_constrained(context, start_goal, settings.search)
+        search = AnytimeSearch(context, start_goal, settings.search, AORRTC.name)
         weights = self.weights(robot)
         if weights is not None:
-            batches = _NetworkBatches(self, call, ends, search, weights)
+            batches = _NetworkBatches(self, context, start_goal, search, weights)
         else:
-            batches = _Batches(self, call, ends, search)
+            batches = _Batches(self, context, start_goal, search)
             note = f"there are no weights for {robot.name}; planned by search and smooth noise"
-            call.notes.append(note)
+            context.notes.append(note)
 
         def improve() -> None:
             if batches.due:
                 batches.offer()
             else:
-                search.improve(call.search_until, STEP)
+                search.improve(context.search_until, STEP)
 
         return anytime(
-            call,
-            ends,
+            context,
+            start_goal,
             search,
             lambda: search.pays(settings.search.gain, settings.search.patience),
             improve,
@@ -162,8 +162,10 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 class _Batches:
     """Batches of smooth noise in the anytime loop of a call."""
 
-    def __init__(self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch) -> None:
-        self.planner, self.call, self.ends, self.search = planner, call, ends, search
+    def __init__(
+        self, planner: RobotDiffuse, context: PlanningContext, start_goal: StartGoal, search: AnytimeSearch
+    ) -> None:
+        self.planner, self.context, self.start_goal, self.search = planner, context, start_goal, search
         self._spent = 0
 
     @property
@@ -182,22 +184,22 @@ class _Batches:
         return self._time_for("batch")
 
     def _time_for(self, part: str) -> bool:
-        return self.call.remaining > LONGER * self.planner.seconds[part]
+        return self.context.remaining > LONGER * self.planner.seconds[part]
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:
         """A batch or its refinement, which counts as work and whose time the next ones will know."""
-        began = self.call.elapsed
+        began = self.context.elapsed
         yield
-        took, self._spent = self.call.elapsed - began, self._spent + BATCH_WORK
+        took, self._spent = self.context.elapsed - began, self._spent + BATCH_WORK
         self.planner.seconds[part] = max(took, 0.5 * (self.planner.seconds[part] + took))
 
     def _draw(self) -> None:
-        planner, checker, count = self.planner, self.ends.checker, self.planner.settings.samples
-        start, goals = self.ends.rows()
+        planner, checker, count = self.planner, self.start_goal.checker, self.planner.settings.samples
+        start, goals = self.start_goal.rows()
         goals = nearest_goals(start, goals, count)
         with self._timed("batch"):
-            q = smooth_noise(start, goals, count, WAYPOINTS, checker.robot, self.call.rng)
+            q = smooth_noise(start, goals, count, WAYPOINTS, checker.robot, self.context.rng)
             q = planner.refine(checker, q)
         self._take(q, "smooth_noise")
 
@@ -207,7 +209,7 @@ class _Batches:
         ordered = sorted(np.ascontiguousarray(q, np.float32), key=path_length)
         paths = list(islice((path for path in ordered if motions_free(space, path).all()), most))
         for path in paths:
-            if self.call.remaining > 0 or self.search.best is None:
+            if self.context.remaining > 0 or self.search.best is None:
                 self.search.offer(path, stage)
         return bool(paths)
 
@@ -216,34 +218,39 @@ class _NetworkBatches(_Batches):
     """Batches of the network in its place, refined where none is free."""
 
     def __init__(
-        self, planner: RobotDiffuse, call: Call, ends: Ends, search: AnytimeSearch, weights: FilePath
+        self,
+        planner: RobotDiffuse,
+        context: PlanningContext,
+        start_goal: StartGoal,
+        search: AnytimeSearch,
+        weights: FilePath,
     ) -> None:
-        super().__init__(planner, call, ends, search)
+        super().__init__(planner, context, start_goal, search)
         self._weights = weights
 
     def _can(self) -> bool:
         """Whether there is time for a batch, and for loading the network, which takes seconds once."""
         self.planner.wanted.add(self._weights)
-        at_hand = self._weights in self.planner.at_hand or self.call.remaining > LOAD_SECONDS
+        at_hand = self._weights in self.planner.at_hand or self.context.remaining > LOAD_SECONDS
         return at_hand and super()._can()
 
     @cached_property
     def _model(self) -> "MotionModel":
-        model = self.planner.model(self.call.problem.robot)
+        model = self.planner.model(self.context.problem.robot)
         assert model is not None  # there are weights, or these were no batches of a network
         return model
 
     @cached_property
     def _code(self) -> Float[ndarray, "code"] | None:
-        return self.planner.code(self._model, self.ends.checker, self.call.rng)
+        return self.planner.code(self._model, self.start_goal.checker, self.context.rng)
 
     def _draw(self) -> None:
-        planner, checker, call = self.planner, self.ends.checker, self.call
+        planner, checker, context = self.planner, self.start_goal.checker, self.context
         model = self._model
         planner.at_hand.add(self._weights)
-        start, goals = self.ends.rows()
+        start, goals = self.start_goal.rows()
         with self._timed("batch"):
-            sampled = planner.draw(model, checker, self._code, start, goals, call.rng)
+            sampled = planner.draw(model, checker, self._code, start, goals, context.rng)
         if not self._take(sampled, "network") and self._time_for("refinement"):
             with self._timed("refinement"):
                 refined = planner.refine(checker, sampled)

@@ -6,7 +6,7 @@ and backwards, at full speed or slower, are timed within the limits as always. W
 waits, reach the end first is found by going through a grid of times once: a place is reached at a time if the
 arm rested there before, or a motion that nothing is in the way of ends there (safe intervals, M. Phillips and
 M. Likhachev, "SIPP: Safe interval path planning for dynamic environments", ICRA 2011, on a grid). The grid
-only proposes: the motion as a whole is judged in time. Without success other paths are tried: other seeds,
+only proposes: the motion as a whole is validated in time. Without success other paths are tried: other seeds,
 and ways round where the obstacles are at some time.
 
 A path by waypoints is timed as one: no motion between rests goes through a waypoint, so that the arm stops at
@@ -21,17 +21,17 @@ import numpy as np
 
 from robotdiffuse.collision.kernels.moving_obstacles import free_over
 from robotdiffuse.collision.moving_obstacles import MovingCollision, links_of
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Status, Trajectory
+from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.pipeline.moving_obstacles_kernel import earliest
+from robotdiffuse.planning.pipeline.waypoints import plan_by_waypoints
+from robotdiffuse.planning.search.constrained import corner_kept
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.trajectories.stops import APART, PACES, Rests
 from robotdiffuse.trajectories.timing import time_parameterize
-from robotdiffuse.planning.context import Call, Request
-from robotdiffuse.planning.search.constrained import corner_kept
-from robotdiffuse.planning.pipeline.waypoints import plan_by_waypoints
-from robotdiffuse.planning.pipeline.moving_obstacles_kernel import earliest
-from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
-from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.validation.tolerances import goal_error
-from robotdiffuse.core.types import Path, Status, Trajectory
 from robotdiffuse.validation.validator import verifier
 
 if TYPE_CHECKING:
@@ -51,24 +51,24 @@ def plan_among_moving(
     planner: "Planner", problem: Problem, time_limit: float, seed: int, request: Request
 ) -> PlanResult:
     """A motion among the problem's moving obstacles, certified in time until it ends."""
-    call = Call(planner.name, problem, time_limit, seed, request)
+    context = PlanningContext(planner.name, problem, time_limit, seed, request)
     robot = problem.robot
     still = replace(problem, moving=())
-    contact = call.judge.settings.contact
+    contact = context.validator.settings.contact
     collision = MovingCollision(robot, problem.moving, contact, 0.0)
     first = collision.sweep(np.zeros(1), problem.start[None]).contact
     if first is not None:
-        return call.fail(
+        return context.fail(
             Status.INVALID_START, f"the start is in collision: {first.link} touches {first.obstacle}"
         )
     rng, attempt, tried = np.random.default_rng(seed), 0, 0
     horizon, reason = 0.0, ""
-    while attempt == 0 or call.remaining > 0:
+    while attempt == 0 or context.remaining > 0:
         scene = problem.scene
         if attempt % 2:  # ways round the obstacles as they stand at some time
             time = float(rng.uniform(0.0, horizon))
             scene = Scene([*scene.shapes, *(one.at(time) for one in problem.moving if one.known)])
-        limit = max(SHARE * (time_limit - call.elapsed), 1e-3)
+        limit = max(SHARE * (time_limit - context.elapsed), 1e-3)
         asked = replace(still, scene=scene), limit, seed + attempt // 2, request
         found = plan_by_waypoints(planner, *asked) if problem.waypoints else planner.attempt(*asked)
         attempt += 1
@@ -78,22 +78,22 @@ def plan_among_moving(
             continue
         tried += 1
         horizon = max(horizon, found.trajectory.duration)
-        for clearance in (call.clearance, 0.0):
-            timed = _timed(call, problem, collision, found.path, clearance)
+        for clearance in (context.clearance, 0.0):
+            timed = _timed(context, problem, collision, found.path, clearance)
             if timed is None:
                 continue
-            report = call.judge.trajectory(timed)
+            report = context.validator.trajectory(timed)
             if report.violation is None:
-                return _solved(call, found, timed, report.scene_clearance, report.self_clearance)
+                return _solved(context, found, timed, report.scene_clearance, report.self_clearance)
             reason = f"; last: {report.violation.message}"
-    return call.fail(
+    return context.fail(
         Status.TIMEOUT,
         f"no timing of {tried} paths with waits and retreats gets by the moving obstacles{reason}",
     )
 
 
 def _solved(
-    call: Call, found: PlanResult, timed: Trajectory, scene: float | None, itself: float | None
+    context: PlanningContext, found: PlanResult, timed: Trajectory, scene: float | None, itself: float | None
 ) -> PlanResult:
     assert found.scene_clearance is not None and found.self_clearance is not None
     assert scene is not None and itself is not None
@@ -101,13 +101,13 @@ def _solved(
     return replace(
         found,
         reason=f"{found.reason}, timed among moving obstacles",
-        planning_time=call.elapsed,
-        seed=call.seed,
+        planning_time=context.elapsed,
+        seed=context.seed,
         trajectory=timed,
         scene_clearance=scene,
         self_clearance=itself,
         min_clearance=min(scene, itself),
-        notes=(*call.notes, *(note for note in found.notes if note not in call.notes)),
+        notes=(*context.notes, *(note for note in found.notes if note not in context.notes)),
     )
 
 
@@ -121,25 +121,25 @@ def _stops(problem: Problem, path: Path) -> list[int]:
 
 
 def _timed(
-    call: Call,
+    context: PlanningContext,
     problem: Problem,
     collision: MovingCollision,
     path: Path,
     clearance: float,
 ) -> Trajectory | None:
     """The earliest motion along the path that the grid knows, None if there is none."""
-    robot, judge = problem.robot, verifier(replace(problem, moving=()))
+    robot, validator = problem.robot, verifier(replace(problem, moving=()))
     if path.length < APART:
-        return time_parameterize(robot, path, lambda _: True, judge.collision_free, call.timing)
+        return time_parameterize(robot, path, lambda _: True, validator.collision_free, context.timing)
     rests = Rests(
         robot,
         path,
-        lambda t: judge.trajectory(t).valid,
-        judge.collision_free,
-        call.timing,
+        lambda t: validator.trajectory(t).valid,
+        validator.collision_free,
+        context.timing,
         STEP,
-        partial(corner_kept, judge.constraints),
-        call.beside,
+        partial(corner_kept, validator.constraints),
+        context.beside,
         _stops(problem, path),
     )
     links = links_of(robot)[1]

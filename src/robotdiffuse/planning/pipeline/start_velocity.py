@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.context import Call, Request
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Status
+from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.problems.problem import Problem
 
 if TYPE_CHECKING:
     from robotdiffuse.planning.planner import Planner
@@ -31,8 +31,8 @@ def plan_in_motion(
     Raises InputError for a velocity beyond the shares of the limits that the request asks for, and for a
     limit of jerk.
     """
-    call, robot, velocity = (
-        Call(planner.name, problem, time_limit, seed, request),
+    context, robot, velocity = (
+        PlanningContext(planner.name, problem, time_limit, seed, request),
         problem.robot,
         problem.start_velocity,
     )
@@ -57,15 +57,17 @@ def plan_in_motion(
     beyond = np.flatnonzero(((rest < robot.lower) | (rest > robot.upper)) & ~np.array(robot.continuous))
     if len(beyond):
         name = robot.joint_names[int(beyond[0])]
-        return call.fail(Status.INVALID_START, f"{name} cannot stop from start_velocity within its limits")
+        return context.fail(Status.INVALID_START, f"{name} cannot stop from start_velocity within its limits")
     result = planner.attempt(replace(problem, start=rest, start_velocity=None), time_limit, seed, request)
     if result.path is None:
         return replace(result, reason=f"from where the arm can stop: {result.reason}")
     waypoints = np.concatenate([problem.start[None], result.path.positions])
     notes = tuple(note for note in result.notes if note not in problem.notes)
-    found = call.finish(waypoints, result.stage or planner.name, notes=notes)
+    found = context.finish(waypoints, result.stage or planner.name, notes=notes)
     if found is not None:
         return found
-    why = call.judge.path(replace(result.path, positions=waypoints)).violation
+    why = context.validator.path(replace(result.path, positions=waypoints)).violation
     what = "" if why is None else f": {why.message}"
-    return call.fail(Status.INVALID_START, f"the arm cannot stop from start_velocity along a free way{what}")
+    return context.fail(
+        Status.INVALID_START, f"the arm cannot stop from start_velocity along a free way{what}"
+    )

@@ -1,4 +1,4 @@
-"""One motion by waypoints: legs that any planner plans, timed as one where waypoints are blended, judged as a
+"""One motion by waypoints: legs that any planner plans, timed as one where waypoints are blended, validated as a
 whole.
 
 A leg begins where the one before it ended. Where a goal has many configurations, the planner takes one, from
@@ -16,25 +16,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from robotdiffuse.trajectories.corner_rounding import corner_middle
-from robotdiffuse.planning.context import Call, Request
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path, Status, Trajectory
+from robotdiffuse.planning.context import PlanningContext, Request
 from robotdiffuse.problems.goals import Goal, JointGoal
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
+from robotdiffuse.trajectories.corner_rounding import corner_middle
 from robotdiffuse.validation.tolerances import DEFAULT, goal_error
-from robotdiffuse.core.types import Path, Status, Trajectory
 from robotdiffuse.validation.validator import verifier
 
 if TYPE_CHECKING:
     from robotdiffuse.planning.planner import Planner
 
 SHARE = 0.9
-"""Of a blend that is used, for the motion is judged at places."""
+"""Of a blend that is used, for the motion is validated at places."""
 WIDEST, NARROWER, NARROWINGS = 10.0, 0.9, 80
 """Corners are first tried so many times as wide as the blend, for joints may move frames little [rad/m]; then
 narrower each time, so often."""
 SOON = 1e-3
-"""Time limit of what is judged when time has run out [s]."""
+"""Time limit of what is validated when time has run out [s]."""
 
 
 def plan_by_waypoints(
@@ -46,7 +46,7 @@ def plan_by_waypoints(
     Each leg has an equal share of the time that is left. The result's `planning_time` is that of all legs and
     of the last verdict, its `progress` the whole path's alone.
     """
-    call = Call(planner.name, problem, time_limit, seed, request)
+    context = PlanningContext(planner.name, problem, time_limit, seed, request)
     goals = (*problem.waypoints, problem.goal)
     many_ways = [not (isinstance(goal, JointGoal) and len(goal.positions) == 1) for goal in goals]
     attempt = 0
@@ -54,7 +54,7 @@ def plan_by_waypoints(
         legs: list[PlanResult] = []
         start = problem.start
         for k, goal in enumerate(goals):
-            left = max(time_limit - call.elapsed, SOON) / (len(goals) - k)
+            left = max(time_limit - context.elapsed, SOON) / (len(goals) - k)
             leg = replace(problem, start=start, goal=goal, waypoints=(), blend=(), notes=())
             legs.append(planner.attempt(leg, left, seed + attempt, request))
             path = legs[-1].path
@@ -62,33 +62,35 @@ def plan_by_waypoints(
                 break
             start = path.positions[-1]
         else:
-            return _joined(call, legs, _motions(call, request, legs))
+            return _joined(context, legs, _motions(context, request, legs))
         attempt += 1
-        if not any(many_ways[: len(legs) - 1]) or call.remaining <= 0:
+        if not any(many_ways[: len(legs) - 1]) or context.remaining <= 0:
             failed = legs[-1]
             what = f"leg {len(legs)} of {len(goals)}: {failed.reason}"
             # where a later leg begins is no fault of the problem's start
             later = len(legs) > 1 and failed.status is Status.INVALID_START
-            return call.fail(Status.NO_PATH if later else failed.status, what)
+            return context.fail(Status.NO_PATH if later else failed.status, what)
 
 
-def _motions(call: Call, request: Request, legs: Sequence[PlanResult]) -> list[Trajectory]:
+def _motions(context: PlanningContext, request: Request, legs: Sequence[PlanResult]) -> list[Trajectory]:
     """The motions between stops: of each leg, or of those between which waypoints are blended."""
-    blend, motions, first = call.problem.blend, list[Trajectory](), 0
+    blend, motions, first = context.problem.blend, list[Trajectory](), 0
     for k in range(len(legs)):
         if k == len(blend) or blend[k] == 0:
             run = legs[first : k + 1]
             stopping = [leg.trajectory for leg in run if leg.trajectory is not None]
-            one = _without_stops(call, request, run, first) if len(run) > 1 else None
+            one = _without_stops(context, request, run, first) if len(run) > 1 else None
             pays = one is not None and one.duration < sum(motion.duration for motion in stopping)
             motions += [one] if one is not None and pays else stopping
             first = k + 1
     return motions
 
 
-def _without_stops(call: Call, request: Request, legs: Sequence[PlanResult], first: int) -> Trajectory | None:
-    """Legs from the first on as one motion, which does not stop in between; None if the judge refuses it."""
-    problem, last = call.problem, first + len(legs) - 1
+def _without_stops(
+    context: PlanningContext, request: Request, legs: Sequence[PlanResult], first: int
+) -> Trajectory | None:
+    """Legs from the first on as one motion, which does not stop in between; None if the validator refuses it."""
+    problem, last = context.problem, first + len(legs) - 1
     goals, blend = (*problem.waypoints, problem.goal), problem.blend[first:last]
     path = _path(legs)
     part = replace(
@@ -99,7 +101,7 @@ def _without_stops(call: Call, request: Request, legs: Sequence[PlanResult], fir
         blend=blend,
         notes=(),
     )
-    whole = Call(call.planner, part, max(call.remaining, SOON), call.seed, request)
+    whole = PlanningContext(context.planner, part, max(context.remaining, SOON), context.seed, request)
     whole.timing = replace(whole.timing, line_intervals=len(legs) * whole.timing.line_intervals)
     corners = np.cumsum([len(leg.path.positions) - 1 for leg in legs[:-1] if leg.path is not None])
     deviations = np.full(len(path.positions), whole.timing.corner_deviation)
@@ -109,7 +111,7 @@ def _without_stops(call: Call, request: Request, legs: Sequence[PlanResult], fir
     closer = verifier(part, replace(DEFAULT, contact=max(kept, DEFAULT.contact)))
     found = whole.finish(
         path.positions,
-        call.planner,
+        context.planner,
         keeps=lambda q: closer.collision_free(replace(path, positions=q)),
         deviations=deviations,
     )
@@ -134,13 +136,17 @@ def _path(legs: Sequence[PlanResult]) -> Path:
     return Path(paths[0].joint_names, rows)
 
 
-def _joined(call: Call, legs: Sequence[PlanResult], motions: Sequence[Trajectory]) -> PlanResult:
-    """The legs as one motion, judged as one."""
+def _joined(
+    context: PlanningContext, legs: Sequence[PlanResult], motions: Sequence[Trajectory]
+) -> PlanResult:
+    """The legs as one motion, validated as one."""
     path, trajectory = _path(legs), _one_after_another(motions)
-    reports = call.judge.path(path), call.judge.trajectory(trajectory)
+    reports = context.validator.path(path), context.validator.trajectory(trajectory)
     for report in reports:
         if report.violation is not None:
-            return call.fail(Status.NO_PATH, f"the legs are free, not the whole: {report.violation.message}")
+            return context.fail(
+                Status.NO_PATH, f"the legs are free, not the whole: {report.violation.message}"
+            )
     scene = min(report.scene_clearance for report in reports if report.scene_clearance is not None)
     itself = min(report.self_clearance for report in reports if report.self_clearance is not None)
     stages = dict.fromkeys(leg.stage for leg in legs)
@@ -148,16 +154,16 @@ def _joined(call: Call, legs: Sequence[PlanResult], motions: Sequence[Trajectory
     return replace(
         legs[-1],
         reason=f"solved in {len(legs)} legs by {', '.join(stages)}",
-        planning_time=call.elapsed,
-        seed=call.seed,
+        planning_time=context.elapsed,
+        seed=context.seed,
         stage=next(iter(stages)) if len(stages) == 1 else legs[-1].planner,
         path=path,
         trajectory=trajectory,
         min_clearance=min(scene, itself),
         scene_clearance=scene,
         self_clearance=itself,
-        notes=(*call.notes, *(note for note in notes if note not in call.notes)),
-        progress=((call.elapsed, path.length),),
+        notes=(*context.notes, *(note for note in notes if note not in context.notes)),
+        progress=((context.elapsed, path.length),),
     )
 
 

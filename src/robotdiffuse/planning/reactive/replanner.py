@@ -3,7 +3,7 @@
 **What is promised.** Whatever `Replanner.step` returns is a motion that ends at rest, and that is certified
 until it rests: no point of the arm comes near a place where an obstacle can be by then, wherever it goes
 from where it was last seen, no faster than its greatest speed (`collision/moving_obstacles.py`); the path itself passed
-the judge among what stands still and of the arm with itself. When no such motion goes on, the last one is
+the validator among what stands still and of the arm with itself. When no such motion goes on, the last one is
 kept, which was certified too. An arm at rest may be run into: what comes is told to be no slower than it
 likes, and may corner any arm. The loop gives way before that where it sees it coming.
 
@@ -21,26 +21,26 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import numbers, rigid_transform, within
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import Space, motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.collision.moving_obstacles import MovingCollision
+from robotdiffuse.core.bounds import numbers, rigid_transform, within
 from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
-from robotdiffuse.planning.context import Call, Request
-from robotdiffuse.planning.reactive.timed_path import Course, Speeds
-from robotdiffuse.planning.start_goal import Ends, usable_ends
-from robotdiffuse.problems.problem import Problem
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.scenes.moving_obstacles import MovingObstacle
-from robotdiffuse.scenes.shape_transforms import placed
-from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, transform
 from robotdiffuse.core.types import Trajectory
+from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.reactive.timed_path import Course, Speeds
+from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
+from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
+from robotdiffuse.problems.problem import Problem
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.moving_obstacles import MovingObstacle
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shape_transforms import placed
+from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.validation.validator import verifier
 
 SLACK = 1e-3
@@ -118,7 +118,7 @@ class Replanner:
                 raise InputError(f"problem.{what}: the replanner knows of none; rd.plan does")
         self.problem, self.settings, self.seed = problem, settings, seed
         self._robot, self._still = problem.robot, replace(problem, moving=())
-        self._judge = verifier(self._still)
+        self._validator = verifier(self._still)
         self._rng = np.random.default_rng(seed)
         self._seen = {one.name: _Seen(one) for one in problem.moving}
         self._now, self._searches = -np.inf, 0
@@ -159,15 +159,15 @@ class Replanner:
 
     def _begun(self) -> tuple[Course, Float[ndarray, "k dof"], Space]:
         """The first course, the configurations of the goal, and what motions are checked in."""
-        call = Call("replanner", self._still, FIRST_TIME, self.seed)
-        ends = usable_ends(call)
-        if isinstance(ends, PlanResult):
-            raise InputError(f"the replanner cannot begin: {ends.reason}")
-        search = AnytimeSearch(call, ends, SearchSettings(), "replanner", bounded=False)
-        while search.first(call.search_until) and search.best is not None:
-            course = Course.certified(self._robot, self._judge, ends.complete(search.best), True)
+        context = PlanningContext("replanner", self._still, FIRST_TIME, self.seed)
+        start_goal = usable_start_goal(context)
+        if isinstance(start_goal, PlanResult):
+            raise InputError(f"the replanner cannot begin: {start_goal.reason}")
+        search = AnytimeSearch(context, start_goal, SearchSettings(), "replanner", bounded=False)
+        while search.first(context.search_until) and search.best is not None:
+            course = Course.certified(self._robot, self._validator, start_goal.complete(search.best), True)
             if course is not None:
-                return course, np.array(ends.goals), search_space(ends.checker, COARSE)
+                return course, np.array(start_goal.goals), search_space(start_goal.checker, COARSE)
             search.refuse(None)
         raise InputError("the replanner cannot begin: no path was found among what stands still")
 
@@ -243,24 +243,24 @@ class Replanner:
             return None
         chosen = np.array([root for root, free in zip(roots, usable[1:], strict=True) if free])
         request = Request(clearance=float(guess.berth.min()) + settings.clearance)
-        call = Call("replanner", self._still, FIRST_TIME, self.seed + self._searches, request)
+        context = PlanningContext("replanner", self._still, FIRST_TIME, self.seed + self._searches, request)
         search = AnytimeSearch(
-            call, Ends(checker, start, chosen), SearchSettings(), "replanner", bounded=False
+            context, StartGoal(checker, start, chosen), SearchSettings(), "replanner", bounded=False
         )
         if not search.first(FIRST_TIME, work=settings.iterations) or search.best is None:
             return None
-        path = search.ends.complete(search.best)
+        path = search.start_goal.complete(search.best)
         end = int(np.abs(np.array(roots) - path[-1]).max(axis=1).argmin())
-        return Course.certified(self._robot, self._judge, np.concatenate([path, after[end]]), True)
+        return Course.certified(self._robot, self._validator, np.concatenate([path, after[end]]), True)
 
     def _dodge(self, guess: "_Ahead", rest: Float[ndarray, "dof"], time: float) -> Course | None:
         """A straight way to where nothing comes for longest, by the guess; None where that is here."""
         settings, robot = self.settings, self._robot
         ways = self._rng.normal(size=(settings.dodges, robot.dof))
         ways *= settings.dodge / np.linalg.norm(ways, axis=1, keepdims=True)
-        ends = np.clip(rest + ways, robot.lower, robot.upper)
+        start_goal = np.clip(rest + ways, robot.lower, robot.upper)
         best, best_time = None, guess.comes(rest, time, settings.horizon) or np.inf
-        for end in ends:
+        for end in start_goal:
             lasts = float((np.abs(end - rest) / robot.velocity).max()) + DODGE_TIME
             comes = guess.comes_to(np.stack([rest, end]), np.array([time, time + lasts]), settings.horizon)
             if comes is not None and comes <= best_time:
@@ -272,7 +272,7 @@ class Replanner:
                 break
         if best is None:
             return None
-        return Course.certified(robot, self._judge, np.stack([rest, best]), False)
+        return Course.certified(robot, self._validator, np.stack([rest, best]), False)
 
     def _change_course(self) -> None:
         """At rest, onto the next course, or what follows the one that the arm is on."""

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import braking_kernel
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 from robotdiffuse.trajectories.speed_limits import TimingSettings, symmetric, timing_grid
-from robotdiffuse.trajectories.timing_kernel import controllable, sampled
 from robotdiffuse.trajectories.timing import rounded_corners
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.trajectories.timing_kernel import controllable, sampled
 from robotdiffuse.validation.validator import Verifier
 
 VELOCITY, ACCELERATION = 0.99, 0.96
@@ -55,7 +55,7 @@ class Speeds(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """A polyline with rounded corners that passed the judge, along which the arm need not stop."""
+    """A polyline with rounded corners that passed the validator, along which the arm need not stop."""
 
     robot: Robot
     line: BlendedPolyline
@@ -66,17 +66,17 @@ class Course:
 
     @staticmethod
     def certified(
-        robot: Robot, judge: Verifier, waypoints: Float[ndarray, "n dof"], to_goal: bool
+        robot: Robot, validator: Verifier, waypoints: Float[ndarray, "n dof"], to_goal: bool
     ) -> "Course | None":
-        """The course through waypoints; None where the judge does not find them free, or all are the same."""
+        """The course through waypoints; None where the validator does not find them free, or all are the same."""
         path = Path(robot.joint_names, waypoints)
-        if path.length < APART or not judge.collision_free(path):
+        if path.length < APART or not validator.collision_free(path):
             return None
 
         def free(motion: Trajectory) -> bool:
-            return judge.collision_free(Path(motion.joint_names, motion.positions))
+            return validator.collision_free(Path(motion.joint_names, motion.positions))
 
-        rows, deviations = rounded_corners(robot, path, free, judge.collision_free)
+        rows, deviations = rounded_corners(robot, path, free, validator.collision_free)
         stops = [0, *(np.flatnonzero(deviations == 0) + 1).tolist(), len(rows) - 1]
         course = None
         for first, last in reversed(list(pairwise(stops))):

@@ -1,4 +1,4 @@
-"""The anytime loop of planners that search: a first path, then ever shorter ones, and the judge on the
+"""The anytime loop of planners that search: a first path, then ever shorter ones, and the validator on the
 way."""
 
 from collections.abc import Callable, Sequence
@@ -11,13 +11,13 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import finer
-from robotdiffuse.trajectories.simplification import simplify, tighten
-from robotdiffuse.planning.search import rrt_kernel
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, Positive, Settings
 from robotdiffuse.core.types import FIRST, SHORT, Tree
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.search import rrt_kernel
+from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.trajectories.simplification import simplify, tighten
 
 LEAST_CLEARANCE = 0.002
 """Tried even if none is wanted [m]: contact within that is costly to tell from none, and paths are hardly
@@ -29,8 +29,8 @@ HELP_AFTER = 8_000
 LOOSER = 1.15
 """The bound of rounds, times the length of the best path: what trees hold is not simplified yet, and where it
 is tight they hold no path as short as a simplified one that goes the long way round."""
-JUDGE_AFTER = 4_000
-"""Iterations between two shorter paths that are judged on the way: at the end of the time, what the judge
+VALIDATE_AFTER = 4_000
+"""Iterations between two shorter paths that are validated on the way: at the end of the time, what the validator
 refuses would cost all that was found since the last path that passed."""
 SLICE = 100
 """Iterations between two looks at the clock."""
@@ -47,7 +47,7 @@ class SearchSettings(Settings):
     range: Positive = 0.7
     """Longest extension of a tree [rad, joint-space L2]: longer ones are in vain more often."""
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of a motion [m]; the judge's certificate
+    """No point of the arm moves further than this between two checks of a motion [m]; the validator's certificate
     covers the rest, and after a path that it refuses the search looks twice as closely."""
     smoothings: Natural = 1
     """Rounds of smoothing of each path that is found."""
@@ -67,8 +67,8 @@ class AnytimeSearch:
 
     def __init__(
         self,
-        call: Call,
-        ends: Ends,
+        context: PlanningContext,
+        start_goal: StartGoal,
         settings: SearchSettings,
         name: str,
         bounded: bool = True,
@@ -80,8 +80,14 @@ class AnytimeSearch:
         clearances: what is tried, falling, in place of the call's clearance and parts of it [m]; each for so
             many iterations, `tries`, without a path.
         """
-        self.call, self.ends, self.settings, self.name, self.bounded = call, ends, settings, name, bounded
-        self.start, self.goals = ends.rows()
+        self.context, self.start_goal, self.settings, self.name, self.bounded = (
+            context,
+            start_goal,
+            settings,
+            name,
+            bounded,
+        )
+        self.start, self.goals = start_goal.rows()
         self.best: Float[ndarray, "n dof"] | None = None
         """The shortest path so far, free at the resolution of the search."""
         self.length = np.float32(np.inf)
@@ -98,11 +104,11 @@ class AnytimeSearch:
         self._lengths = list[tuple[int, float]]()
         self._loose = False
         """Whether the best path is the first one, which is tightened once there is time to improve it."""
-        self._state = random_state(call.seed)
+        self._state = random_state(context.seed)
         self._round: _Round | None = None
         self._grown: rrt_kernel.Trees | None = None
         """Those that found the shortest path of the search, or that grow."""
-        wanted = [share * call.clearance for share in (1.0, 0.5, 0.25)]
+        wanted = [share * context.clearance for share in (1.0, 0.5, 0.25)]
         usual = [*(kept for kept in wanted if kept > LEAST_CLEARANCE), LEAST_CLEARANCE, 0.0]
         self._clearances, self._tries = [*clearances] or usual, tries
         self._enter(0)
@@ -115,9 +121,9 @@ class AnytimeSearch:
     @property
     def notes(self) -> tuple[str, ...]:
         """What the result says of the clearance."""
-        if self.clearance >= self.call.clearance:
+        if self.clearance >= self.context.clearance:
             return ()
-        kept, asked = 100 * self.clearance, 100 * self.call.clearance
+        kept, asked = 100 * self.clearance, 100 * self.context.clearance
         return (f"searched {kept:.2g} cm away from obstacles, not {asked:.2g} cm: there no path was found",)
 
     @property
@@ -144,7 +150,7 @@ class AnytimeSearch:
         """
         self._straight()
         enough = self.work + work
-        while self.best is None and self.call.elapsed < until and self.work < enough:
+        while self.best is None and self.context.elapsed < until and self.work < enough:
             self._slice()
             if self.best is None and self._tried >= self._tries:
                 self._lower(help_out)
@@ -157,7 +163,7 @@ class AnytimeSearch:
         if self._loose and self.best is not None:
             self.offer(self.best, self.stage)
             self._loose = False
-        while not self.shortest and self.call.elapsed < until and self.work < enough:
+        while not self.shortest and self.context.elapsed < until and self.work < enough:
             self._slice()
 
     def pays(self, gain: float, patience: int) -> bool:
@@ -184,12 +190,12 @@ class AnytimeSearch:
     def _take(self, path: Float[ndarray, "n dof"], length: float, stage: str) -> bool:
         """The path is the best one now."""
         if self.best is None:
-            self.first_at = self.call.elapsed
+            self.first_at = self.context.elapsed
         self.best, self.length, self.stage = path, np.float32(length), stage
         self.history.append((path, stage))
         self._lengths.append((self.work, length))
         self._round = None
-        self.call.improved(length)
+        self.context.improved(length)
         return True
 
     def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
@@ -198,7 +204,7 @@ class AnytimeSearch:
         return bool(motions_free(self.space, rows).all())
 
     def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
-        """Look twice as closely from now on, since the judge refused the best path; in its place is the last
+        """Look twice as closely from now on, since the validator refused the best path; in its place is the last
         that it accepted."""
         self.settings = replace(self.settings, resolution=finer(self.settings.resolution))
         self.best = accepted
@@ -208,7 +214,7 @@ class AnytimeSearch:
 
     def _enter(self, level: int) -> None:
         self._level, self._tried = level, 0
-        self.space = self.ends.space(self.settings.resolution, self.clearance)
+        self.space = self.start_goal.space(self.settings.resolution, self.clearance)
 
     def _lower(self, help_out: Callable[[], None] | None) -> None:
         """The next lower clearance, at which what the trees hold stays valid; after the lowest one, whatever
@@ -256,46 +262,46 @@ class _Round:
 
 
 class Answers:
-    """The best motion of a search that passed the judge."""
+    """The best motion of a search that passed the validator."""
 
-    def __init__(self, call: Call, ends: Ends) -> None:
-        self.call, self.ends = call, ends
+    def __init__(self, context: PlanningContext, start_goal: StartGoal) -> None:
+        self.context, self.start_goal = context, start_goal
         self.best: PlanResult | None = None
         self._path: ndarray | None = None
-        self._judged_at = 0
+        self._validated_at = 0
 
     def due(self, search: AnytimeSearch) -> bool:
-        """Whether a path is to be judged before the search goes on: the first one, and then shorter ones, now
+        """Whether a path is to be validated before the search goes on: the first one, and then shorter ones, now
         and then."""
-        rested = search.work >= self._judged_at + JUDGE_AFTER
+        rested = search.work >= self._validated_at + VALIDATE_AFTER
         return self.best is None or (rested and search.best is not self._path)
 
     def take(self, search: AnytimeSearch) -> bool:
-        """Whether the best path of the search passes the judge; if not, the search goes on from the last that
+        """Whether the best path of the search passes the validator; if not, the search goes on from the last that
         did."""
         assert search.best is not None
-        self._judged_at = search.work
+        self._validated_at = search.work
         if search.best is self._path:
             return True
         if self._accepts(search.best, search.stage, search):
             return True
-        if self.call.remaining <= 0 and self.best is None:
+        if self.context.remaining <= 0 and self.best is None:
             # there is no time to search on: the one before, if there is one
             return any(self._accepts(*before, search) for before in search.history[-2:-1])
         search.refuse(self._path)
         return False
 
     def _accepts(self, path: ndarray, stage: str, search: AnytimeSearch) -> bool:
-        waypoints = self.ends.complete(path)
-        result = self.call.finish(waypoints, stage, notes=search.notes, keeps=search.keeps_clearance)
+        waypoints = self.start_goal.complete(path)
+        result = self.context.finish(waypoints, stage, notes=search.notes, keeps=search.keeps_clearance)
         if result is not None:
             self.best, self._path = result, path
         return result is not None
 
 
 def anytime(
-    call: Call,
-    ends: Ends,
+    context: PlanningContext,
+    start_goal: StartGoal,
     search: AnytimeSearch,
     pays: Callable[[], bool],
     improve: Callable[[], None],
@@ -308,16 +314,16 @@ def anytime(
     """
 
     def ended() -> bool:
-        done = call.until == FIRST or search.shortest or call.remaining <= 0
-        return done or (call.until == SHORT and not pays())
+        done = context.until == FIRST or search.shortest or context.remaining <= 0
+        return done or (context.until == SHORT and not pays())
 
-    answers = Answers(call, ends)
-    while search.first(call.search_until, help_out):
-        if ended() or (call.ample and answers.due(search)):
+    answers = Answers(context, start_goal)
+    while search.first(context.search_until, help_out):
+        if ended() or (context.ample and answers.due(search)):
             if answers.take(search) and ended():
                 break
-            if answers.best is None and call.remaining <= 0:
+            if answers.best is None and context.remaining <= 0:
                 break
         else:
             improve()
-    return replace(answers.best or call.unsolved(), trees=search.trees)
+    return replace(answers.best or context.unsolved(), trees=search.trees)

@@ -7,12 +7,12 @@ round finds is simplified and tightened, and bounds the next if it is shorter.
 from dataclasses import dataclass
 from typing import Annotated
 
-from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, anytime
-from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS, Planner
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS, Planner
+from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planning.start_goal import StartGoal
 
 STEP = 1_000
 """Iterations between two questions whether more of them pay."""
@@ -33,18 +33,18 @@ class AORRTC(Planner[AORRTCSettings]):
     settings_class = AORRTCSettings
     keeps = frozenset({CONSTRAINTS, CLEARANCE})
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
         settings = self.settings
-        if call.problem.constraints:
+        if context.problem.constraints:
             from robotdiffuse.planning.search.constrained import plan_constrained
 
-            return plan_constrained(call, ends, settings)
-        search = AnytimeSearch(call, ends, settings, self.name)
+            return plan_constrained(context, start_goal, settings)
+        search = AnytimeSearch(context, start_goal, settings, self.name)
         return anytime(
-            call,
-            ends,
+            context,
+            start_goal,
             search,
             lambda: search.pays(settings.gain, settings.patience),
-            lambda: search.improve(call.search_until, STEP),
+            lambda: search.improve(context.search_until, STEP),
         )

@@ -1,19 +1,19 @@
 """Search under path constraints: RRT-Connect on what they leave, shortened, in the loop of `aorrtc`.
 
 What aorrtc, rrt_connect and robotdiffuse plan with where a problem has constraints. The search keeps a little
-room to the tolerances, which corners and rounding need; the judge proves what comes of it.
+room to the tolerances, which corners and rounding need; the validator proves what comes of it.
 """
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, anytime
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.search import constrained_kernel
-from robotdiffuse.planning.start_goal import Ends
-from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.core.results import PlanResult
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.search import constrained_kernel
+from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 STAGE = "constrained_rrt_connect"
 SLICE = 20
@@ -26,30 +26,30 @@ SHORTCUTS = 60
 """Of each path that is found."""
 
 
-def plan_constrained(call: Call, ends: Ends, settings: SearchSettings) -> PlanResult:
+def plan_constrained(context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> PlanResult:
     """The answer of a call on a problem with path constraints."""
-    search = ConstrainedSearch(call, ends, settings)
+    search = ConstrainedSearch(context, start_goal, settings)
 
     def improve() -> None:
-        search.improve(call.search_until, SLICE)
+        search.improve(context.search_until, SLICE)
 
-    return anytime(call, ends, search, lambda: search.found < SEARCHES, improve)
+    return anytime(context, start_goal, search, lambda: search.found < SEARCHES, improve)
 
 
 class ConstrainedSearch(AnytimeSearch):
     """Restarts of RRT-Connect under constraints."""
 
-    def __init__(self, call: Call, ends: Ends, settings: SearchSettings) -> None:
-        constraints = call.judge.constraints
+    def __init__(self, context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> None:
+        constraints = context.validator.constraints
         assert constraints is not None  # or other searches would do
         self.constraints: PathConstraints = constraints
-        rows, start = constraints.rows, ends.start_lead
+        rows, start = constraints.rows, start_goal.start_lead
         assert start is not None  # or there would be no ends
         self.kept = constraints.limits(SHARE)
-        at_ends = constraints.values(np.stack([start, *ends.goal_leads])).max(axis=0) + AT_ENDS
+        at_ends = constraints.values(np.stack([start, *start_goal.goal_leads])).max(axis=0) + AT_ENDS
         self.kept = np.minimum(np.maximum(self.kept, at_ends), rows.limit)
-        super().__init__(call, ends, settings, STAGE, bounded=False)
-        self.start, self.goals = start, np.stack(ends.goal_leads)
+        super().__init__(context, start_goal, settings, STAGE, bounded=False)
+        self.start, self.goals = start, np.stack(start_goal.goal_leads)
         self._trees: constrained_kernel.Trees | None = None
 
     @property
@@ -86,7 +86,10 @@ class ConstrainedSearch(AnytimeSearch):
 
     def _slice(self) -> None:
         settings = self.settings
-        if self._trees is None or self._trees.sizes.max() >= self._trees.nodes.shape[1] - constrained_kernel.MOST_PIECES:
+        if (
+            self._trees is None
+            or self._trees.sizes.max() >= self._trees.nodes.shape[1] - constrained_kernel.MOST_PIECES
+        ):
             room = settings.iterations + len(self.goals) + 2 * constrained_kernel.MOST_PIECES
             self._trees = constrained_kernel.make_trees(self.start, self.goals, room)
         path = constrained_kernel.search(self.limits, self._trees, settings.range, SLICE, self._state)

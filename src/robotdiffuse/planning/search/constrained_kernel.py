@@ -47,7 +47,7 @@ class Limits(NamedTuple):
     rows: tuple
     """`problems.constraint_kernel.Rows`"""
     kept: np.ndarray
-    """[m] limits of the rows, with some room to those of the judge."""
+    """[m] limits of the rows, with some room to those of the validator."""
 
 
 class Trees(NamedTuple):

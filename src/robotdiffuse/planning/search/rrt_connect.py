@@ -3,12 +3,12 @@ others."""
 
 from dataclasses import dataclass
 
-from robotdiffuse.planning.search.anytime import SLICE, AnytimeSearch, SearchSettings, anytime
-from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS, Planner
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS, Planner
+from robotdiffuse.planning.search.anytime import SLICE, AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planning.start_goal import StartGoal
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,18 @@ class RRTConnect(Planner[RRTConnectSettings]):
     settings_class = RRTConnectSettings
     keeps = frozenset({CONSTRAINTS, CLEARANCE})
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
         settings = self.settings
-        if call.problem.constraints:
+        if context.problem.constraints:
             from robotdiffuse.planning.search.constrained import plan_constrained
 
-            return plan_constrained(call, ends, settings)
-        search = AnytimeSearch(call, ends, settings, self.name, bounded=False)
+            return plan_constrained(context, start_goal, settings)
+        search = AnytimeSearch(context, start_goal, settings, self.name, bounded=False)
 
         def pays() -> bool:
-            return search.found < settings.searches or call.elapsed < search.first_at + settings.optimize_time
+            return (
+                search.found < settings.searches or context.elapsed < search.first_at + settings.optimize_time
+            )
 
-        return anytime(call, ends, search, pays, lambda: search.improve(call.search_until, SLICE))
+        return anytime(context, start_goal, search, pays, lambda: search.improve(context.search_until, SLICE))

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
+from robotdiffuse.core.settings import Count, Natural, Share
 from robotdiffuse.problems.families.family import PositiveRange
 from robotdiffuse.problems.families.furniture import (
     DOWN,
@@ -20,7 +21,6 @@ from robotdiffuse.problems.families.furniture import (
     is_free,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.settings import Count, Natural, Share
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Positive, Settings
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_origins
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.settings import Positive, Settings
 
 Range = tuple[float, float]
 PositiveRange = tuple[Positive, Positive]
@@ -143,7 +143,7 @@ def reaching_configurations(
     settings: InverseKinematicsSettings = FULL_POSE,
 ) -> Float[ndarray, "k dof"]:
     """Up to `count` free configurations with the tip at its target, as float32: what data hold, so that the
-    judge sees exactly these. Arms of fewer than six joints reach positions alone.
+    validator sees exactly these. Arms of fewer than six joints reach positions alone.
 
     Solutions with a joint at a limit, where the solver clips it, would be far too many, and are left out.
     """

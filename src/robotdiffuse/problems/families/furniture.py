@@ -15,6 +15,8 @@ from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Natural, Positive, Share
+from robotdiffuse.core.transforms import rotation_about, rotation_z_to, transform
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
     POSE_JOINTS,
@@ -31,8 +33,6 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.settings import Natural, Positive, Share
-from robotdiffuse.core.transforms import rotation_about, rotation_z_to, transform
 
 FLOOR = Box((0.0, 0.0, -0.05), (3.0, 3.0, 0.1), name="floor")
 """With its top at z = 0: wide enough for all that stands around the arm."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.random import Generator
 
+from robotdiffuse.core.settings import Natural, Positive, Share
 from robotdiffuse.problems.families.family import PositiveRange
 from robotdiffuse.problems.families.furniture import (
     AHEAD,
@@ -17,7 +18,6 @@ from robotdiffuse.problems.families.furniture import (
     count,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.settings import Natural, Positive, Share
 
 BENEATH = 0.25
 """Counters at least this high may be open in front, with a region beneath [m]."""

@@ -10,6 +10,7 @@ from numpy.random import Generator
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Natural, OneOf
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
     POSITION,
@@ -28,7 +29,6 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import IDENTITY, Box, Sphere
-from robotdiffuse.core.settings import Natural, OneOf
 
 KINDS = ("sphere", "box")
 FLOOR = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")

@@ -6,6 +6,7 @@ from typing import Annotated
 import numpy as np
 from numpy.random import Generator
 
+from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Share
 from robotdiffuse.problems.families.family import PositiveRange
 from robotdiffuse.problems.families.furniture import (
     AHEAD,
@@ -17,7 +18,6 @@ from robotdiffuse.problems.families.furniture import (
     count,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Share
 
 AtLeastTwo = Annotated[int, Bound(least=2.0)]
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from numpy.random import Generator
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.settings import Natural, Share
 from robotdiffuse.problems.families.family import PositiveRange
 from robotdiffuse.problems.families.furniture import (
     AHEAD,
@@ -15,7 +16,6 @@ from robotdiffuse.problems.families.furniture import (
     Surface,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
-from robotdiffuse.core.settings import Natural, Share
 
 BENEATH = 0.3
 """Tables at least this high have a region beneath [m]."""

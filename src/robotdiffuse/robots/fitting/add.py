@@ -9,14 +9,14 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.robots.fitting.allowed_collisions import BY_SRDF, CHECKED, LIMITS, NAMED, POSE, PairReport
-from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
-from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
-from robotdiffuse.robots.user_data_dir import user_robots
-from robotdiffuse.robots.fitting.preparation import LinkReport, PreparationSettings, Progress, prepare
 from robotdiffuse.robots.fitting.false_collisions import Refusals
-from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.fitting.preparation import LinkReport, PreparationSettings, Progress, prepare
+from robotdiffuse.robots.parsing.joint_limits import read_limits, with_limits
 from robotdiffuse.robots.parsing.srdf import read_srdf, srdf_beside
 from robotdiffuse.robots.parsing.urdf import UrdfTree
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
+from robotdiffuse.robots.user_data_dir import user_robots
 
 LITTLE, REFUSED = 0.2, 0.08
 """Shares of free configurations, and of those that spheres refuse, from which on there is a warning."""

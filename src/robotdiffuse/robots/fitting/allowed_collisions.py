@@ -15,8 +15,8 @@ from scipy.optimize import linprog
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.fitting.convex_parts import planes_of
-from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import ball_distances, deepest_touches
+from robotdiffuse.robots.robot import MOVING_KINDS, ConvexMesh, Joint, Robot
 
 ADJACENT, ALWAYS, NEVER, CHECKED = "adjacent", "always", "never", "checked"
 DEFAULT, POSE, LIMITS = "default", "pose", "limits"

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from robotdiffuse.robots.fitting.allowed_collisions import Links
 from robotdiffuse.robots.coal_geometry import coal_pose, coal_surface
+from robotdiffuse.robots.fitting.allowed_collisions import Links
 from robotdiffuse.robots.fitting.convex_parts import Surface
-from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import deepest_touches
+from robotdiffuse.robots.robot import Robot
 
 CUBE = 0.01
 """Of the places where spheres touch one is kept of each cube with this edge [m]."""

@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from robotdiffuse.robots.robot import MOVING_KINDS, Robot
+from robotdiffuse.core.transforms import inverse
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import within
 from robotdiffuse.robots.fitting.sphere_size_grid import Planes, stacked_planes
-from robotdiffuse.core.transforms import inverse
+from robotdiffuse.robots.robot import MOVING_KINDS, Robot
 
 ANGLES = 9
 """Values of the joint between two links at which hiding is tested."""

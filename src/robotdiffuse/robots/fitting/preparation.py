@@ -24,12 +24,12 @@ from robotdiffuse.robots.fitting.allowed_collisions import (
 )
 from robotdiffuse.robots.fitting.convex_pair_tables import joint_table
 from robotdiffuse.robots.fitting.convex_parts import PartSettings, Surface, convex_parts
-from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours
 from robotdiffuse.robots.fitting.false_collisions import PairRefusals, Refusals, measure_refusals
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.scaling import reach
+from robotdiffuse.robots.fitting.link_overlaps import hidden_by_neighbours
 from robotdiffuse.robots.fitting.sphere_fitting import SphereSettings, covered, fit_spheres, stick_out
 from robotdiffuse.robots.fitting.sphere_size_grid import FLOOR, Bounds, Solid
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.scaling import reach
 
 LARGE = 1.4
 """Reach [m] from which on the lengths of settings grow with the reach: a larger arm works in more room, and
@@ -130,7 +130,7 @@ class _Link:
             hidden = hidden_by_neighbours(robot, self.name)
             self.bounds = Bounds(tolerance, hidden, self.bounds.tight, _floor(robot, self.name))
         fit = fit_spheres(self.solid, self.bounds, np.random.default_rng(seed), settings)
-        fit = np.round(fit, 6)  # as the file holds them: these are judged
+        fit = np.round(fit, 6)  # as the file holds them: these are validated
         return replace(robot, spheres=robot.spheres | {self.name: fit})
 
 

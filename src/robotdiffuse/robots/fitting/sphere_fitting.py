@@ -19,7 +19,6 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.fitting.convex_parts import split
-from robotdiffuse.robots.robot import ConvexMesh, Robot
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     DIRECTIONS,
     assign,
@@ -30,6 +29,7 @@ from robotdiffuse.robots.fitting.sphere_fitting_kernel import (
     within,
 )
 from robotdiffuse.robots.fitting.sphere_size_grid import Bounds, Room, Solid, stacked_planes
+from robotdiffuse.robots.robot import ConvexMesh, Robot
 
 MARGIN = 1e-5
 """Added to the radii [m]: covers rounding in files and in single-precision kernels."""

@@ -16,8 +16,8 @@ from scipy import ndimage
 from scipy.spatial import KDTree
 
 from robotdiffuse.robots.fitting.convex_parts import planes_of
-from robotdiffuse.robots.robot import ConvexMesh
 from robotdiffuse.robots.fitting.sphere_fitting_kernel import plane_depths, rooms_at
+from robotdiffuse.robots.robot import ConvexMesh
 
 GRID_POINTS = 200_000
 """Of a grid around a link, about."""

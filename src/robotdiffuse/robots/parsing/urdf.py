@@ -13,14 +13,14 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import FASTEST, LARGEST, SMALLEST, points, within
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import parse_xml, read_triangles
+from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
 from robotdiffuse.robots.fitting.convex_parts import Surface, convex_hull
-from robotdiffuse.robots.parsing.joint_groups import passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.inertias import Inertia, inertia_of
+from robotdiffuse.robots.parsing.joint_groups import passive_notes, planned_joints, refuse_linkages
 from robotdiffuse.robots.parsing.mobile_bases import moves_in_a_plane
 from robotdiffuse.robots.parsing.packages import Packages, urdf_text
-from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
 from robotdiffuse.robots.parsing.srdf import Srdf
-from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
+from robotdiffuse.robots.robot import MOVING_KINDS, TURNS, ConvexMesh, Joint, Mimic, Robot, following
 
 MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 KINDS = (*MOVING_KINDS, "fixed")

@@ -1,13 +1,13 @@
-"""The live certificate in words: what the judge says of the motion shown, in the scene as it now is."""
+"""The live certificate in words: what the validator says of the motion shown, in the scene as it now is."""
 
 from dataclasses import dataclass
 
-from robotdiffuse.visualization.live.session import State
 from robotdiffuse.planning.planner import compiles_first
 from robotdiffuse.validation.validator import Report
+from robotdiffuse.visualization.live.session import State
 
 FREE, WRONG, NONE, WAITING = "free", "wrong", "none", "waiting"
-"""Kinds of certificates: green, red, no motion, not judged yet."""
+"""Kinds of certificates: green, red, no motion, not validated yet."""
 COLLISIONS = ("scene_collision", "self_collision")
 
 
@@ -30,7 +30,7 @@ def certificate(state: State) -> Certificate:
             return Certificate(WAITING, "planning", (compiles_first(state.problem.robot),))
         return Certificate(WAITING, "nothing planned yet")
     if verdict is None:
-        return Certificate(WAITING, "judging")
+        return Certificate(WAITING, "validating")
     report, trajectory = verdict.report, state.motion.trajectory
     assert trajectory is not None
     violation = report.violation

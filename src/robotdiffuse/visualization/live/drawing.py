@@ -9,15 +9,15 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, held_at
+from robotdiffuse.core.transforms import quaternion_from_rotation
+from robotdiffuse.core.types import Trajectory, Tree
 from robotdiffuse.planning.diffusion.candidates import Candidates
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape
-from robotdiffuse.core.transforms import quaternion_from_rotation
-from robotdiffuse.core.types import Trajectory, Tree
 from robotdiffuse.visualization import style
+from robotdiffuse.visualization.live.obstacles import dimensions, handle_pose, held_at
 from robotdiffuse.visualization.style import GOAL, START, Surface
 
 RATE = 30.0

@@ -7,15 +7,15 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.input_files import parse_json, parse_yaml
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.problems.files import load_problem, problem_from_record, save_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
-from robotdiffuse.core.input_files import parse_json, parse_yaml
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots import known_robots, load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.validation.validator import verify
 from robotdiffuse.visualization.replay_page import write_replay
 

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere, pose
 from robotdiffuse.core.transforms import inverse, rotation_from_quaternion, transform
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere, pose
 
 NEW: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
     "sphere": lambda center, size: Sphere(center, size),

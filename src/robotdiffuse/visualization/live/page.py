@@ -14,8 +14,15 @@ from numpy import ndarray
 from viser import infra
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.visualization.live.certificate import certificate
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
+from robotdiffuse.robots.kinematics import link_pose
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.robots.scaling import reach
+from robotdiffuse.validation.validator import Violation
+from robotdiffuse.visualization import style
+from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
 from robotdiffuse.visualization.live.access import SECRET, Door
+from robotdiffuse.visualization.live.certificate import certificate
 from robotdiffuse.visualization.live.drawing import (
     GHOST,
     RED,
@@ -32,13 +39,6 @@ from robotdiffuse.visualization.live.latest_task import Latest
 from robotdiffuse.visualization.live.panel import Deeds, Panel
 from robotdiffuse.visualization.live.player import Player
 from robotdiffuse.visualization.live.session import Session, State
-from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.robots.scaling import reach
-from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
-from robotdiffuse.validation.validator import Violation
-from robotdiffuse.visualization import style
-from robotdiffuse.visualization.camera import VERTICAL_FIELD, view_of_motion
 from robotdiffuse.visualization.style import GOAL, START, Surface
 
 GIZMO, SMALL_GIZMO = 0.23, 0.16

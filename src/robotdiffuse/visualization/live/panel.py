@@ -11,13 +11,13 @@ import viser
 from viser import uplot
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Path, Trajectory
+from robotdiffuse.planning import PLANNERS
+from robotdiffuse.robots.robot import Robot
 from robotdiffuse.visualization.live.certificate import FREE, NONE, WAITING, WRONG, Certificate
 from robotdiffuse.visualization.live.files import problem_text, replay_page, uploaded_problem
 from robotdiffuse.visualization.live.obstacles import LEAST, MOST, NEW, dimensions
 from robotdiffuse.visualization.live.session import KEEP_TREES, Session, State
-from robotdiffuse.planning import PLANNERS
-from robotdiffuse.robots.robot import Robot
-from robotdiffuse.core.types import Path, Trajectory
 
 COLORS = {FREE: "#0f8f6f", WRONG: "#c92f2f", NONE: "#b26a00", WAITING: "#6b7684"}
 """Of certificates."""

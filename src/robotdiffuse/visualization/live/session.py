@@ -1,8 +1,8 @@
-"""What the page knows: the problem as it was last changed, the motion shown, and the judge's word on it.
+"""What the page knows: the problem as it was last changed, the motion shown, and the validator's word on it.
 
 A session knows nothing of browsers. Changes return at once; they raise InputError where they make no sense,
 and leave the session as it was. Three threads do the rest, each of them the latest of what it is asked: one
-plans, one judges the motion shown in the scene as it now is, one looks for configurations for poses.
+plans, one validates the motion shown in the scene as it now is, one looks for configurations for poses.
 """
 
 import threading
@@ -16,22 +16,22 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shortened, unknown_name
-from robotdiffuse.visualization.live.latest_task import Latest
-from robotdiffuse.visualization.live.obstacles import handle_pose, held_at, new_obstacle, resized
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner, planner_settings
-from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.diffusion.candidates import Candidates, draw_candidates
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal, poses_of
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.core.results import PlanResult
 from robotdiffuse.robots.inverse_kinematics import InverseKinematicsSettings, inverse_kinematics
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.scaling import reach
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Shape
-from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.validation.validator import Report, verify_trajectory
+from robotdiffuse.visualization.live.latest_task import Latest
+from robotdiffuse.visualization.live.obstacles import handle_pose, held_at, new_obstacle, resized
 
 AHEAD, SIZE = np.array([0.5, 0.0, 0.5]), 0.094
 """Where new obstacles stand, and the radius of a ball, as shares of the arm's reach."""
@@ -63,13 +63,13 @@ class Choice(Settings):
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judge's word on the motion shown."""
+    """The validator's word on the motion shown."""
 
     version: int
-    """Of the problem that it was judged for."""
+    """Of the problem that it was validated for."""
     report: Report
     seconds: float
-    """What judging took [s]."""
+    """What validating took [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class State:
     motion: PlanResult | None = None
     """The motion shown: of the last result that had one."""
     verdict: Verdict | None = None
-    """On the motion shown; of an earlier version for the moment that judging takes."""
+    """On the motion shown; of an earlier version for the moment that validating takes."""
     seconds: tuple[tuple[str, float], ...] = ()
     """What the stages of the last plan took [s]."""
     candidates: Candidates | None = None
@@ -110,7 +110,7 @@ class Session:
         self._state = _opened(problem, choice)
         self._planners: dict[str, Planner] = {}
         self._planning = Latest(self._plan, "plan")
-        self._judging = Latest(self._judge, "judge")
+        self._validating = Latest(self._validator, "validator")
         self._aiming = Latest(self._aim, "aim")
         self._starting = Latest(self._begin_at, "start")
 
@@ -125,7 +125,7 @@ class Session:
 
     def close(self) -> None:
         """No more planning; what was begun ends in its own time."""
-        for thread in (self._planning, self._judging, self._aiming, self._starting):
+        for thread in (self._planning, self._validating, self._aiming, self._starting):
             thread.close()
 
     # What hands change
@@ -231,14 +231,14 @@ class Session:
                 state, version=version, planning=follow, answer=None, failure="", candidates=None
             )
             if state.motion is not None:
-                self._judging.ask(version)
+                self._validating.ask(version)
             if follow:
                 self._planning.ask(version)
         self.tell()
 
     # What the threads do
 
-    def _judge(self, _version: int) -> None:
+    def _validator(self, _version: int) -> None:
         state = self._state
         if state.motion is None:
             return
@@ -278,7 +278,7 @@ class Session:
         same = now.problem.robot is state.problem.robot
         if same and result is not None and result.trajectory is not None:
             verdict = _verdict(now.problem, result, now.version)
-            seconds = (*seconds, ("judging once more", verdict.seconds))
+            seconds = (*seconds, ("validating once more", verdict.seconds))
         with self._lock:
             current = self._state.version == version
             if current:
@@ -290,7 +290,7 @@ class Session:
             if same and verdict is not None and (current or _free(verdict)):
                 self._state = replace(self._state, motion=result, verdict=verdict)
                 if verdict.version != self._state.version:
-                    self._judging.ask(self._state.version)
+                    self._validating.ask(self._state.version)
         self.tell()
         if current and state.choice.candidates:
             self._draw(version)

@@ -32,18 +32,18 @@ from numpy import ndarray
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.motions import FINEST, levers, search_space
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.planner import Planner, ever_finer
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
+from robotdiffuse.core.types import Status
 from robotdiffuse.planning.baselines.lattice import graph as lattice_graph
 from robotdiffuse.planning.baselines.lattice import kernel
 from robotdiffuse.planning.baselines.lattice import table as table
 from robotdiffuse.planning.baselines.lattice.graph import UNITS, Lattice
-from robotdiffuse.core.results import PlanResult
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.planner import Planner, ever_finer
+from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
-from robotdiffuse.core.types import Status
 
 SLICE = 4000
 """Edges that are met between two looks at the clock, about: some take 10 microseconds."""
@@ -66,7 +66,7 @@ class LatticeSettings(Settings):
     max_nodes: Annotated[int, Bound(least=1.0, below=2.0**31 - 1)] = 2_000_000
     """Most nodes that are kept; some 60 to 80 bytes each, and more with `joints_per_move`."""
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of an edge [m]; a path that the judge
+    """No point of the arm moves further than this between two checks of an edge [m]; a path that the validator
     refuses is searched again at half the distance."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
@@ -369,23 +369,25 @@ class _LatticePlanner(Planner[Own]):
 
     search: Callable[..., AStarSearch | DStarLiteSearch]
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        padding = ends.kept_clearance(self.settings.clearance)
-        for settings, _ in ever_finer(call, self.settings):
-            search = self.search(ends.checker, *ends.rows(), settings, padding)
-            outcome = search.run(lambda: call.remaining <= 0)
+        padding = start_goal.kept_clearance(self.settings.clearance)
+        for settings, _ in ever_finer(context, self.settings):
+            search = self.search(start_goal.checker, *start_goal.rows(), settings, padding)
+            outcome = search.run(lambda: context.remaining <= 0)
             path = search.path() if outcome is Outcome.FOUND else None
             if path is None:
                 status = Status.TIMEOUT if outcome is Outcome.GOING else Status.NO_PATH
-                return call.fail(status, _reason(outcome, settings, search))
-            done = f"solved by {call.planner}: {search.expansions} expansions"
-            result = call.finish(ends.complete(path), call.planner, reason=done)
+                return context.fail(status, _reason(outcome, settings, search))
+            done = f"solved by {context.planner}: {search.expansions} expansions"
+            result = context.finish(start_goal.complete(path), context.planner, reason=done)
             if result is not None:
                 return result
             if settings.resolution <= FINEST:
                 break
-        return call.unsolved("the judge refused every path that was found; a larger clearance may help")
+        return context.unsolved(
+            "the validator refused every path that was found; a larger clearance may help"
+        )
 
 
 class AStar(_LatticePlanner[AStarSettings]):

@@ -12,7 +12,14 @@ from robotdiffuse.collision.kernels.compiled import allocation_free, random
 from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import distance, motion_free
 from robotdiffuse.planning.search.shared_tree import kd_tree
-from robotdiffuse.planning.search.shared_tree.tree import GAIN, append, best_cost, goal_cost, goal_is_open, rewire
+from robotdiffuse.planning.search.shared_tree.tree import (
+    GAIN,
+    append,
+    best_cost,
+    goal_cost,
+    goal_is_open,
+    rewire,
+)
 
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _INFINITY = np.float32(np.inf)

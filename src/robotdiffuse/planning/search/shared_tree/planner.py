@@ -34,15 +34,14 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.trajectories.simplification import shortcut
-from robotdiffuse.planning.search import rrt_kernel as connect
-from robotdiffuse.planning.planner import Planner, ever_finer
-from robotdiffuse.planning.context import Call
-from robotdiffuse.planning.start_goal import Ends
-from robotdiffuse.planning.search.shared_tree import kernel
-from robotdiffuse.planning.search.shared_tree import tree
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
+from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.planner import Planner, ever_finer
+from robotdiffuse.planning.search import rrt_kernel as connect
+from robotdiffuse.planning.search.shared_tree import kernel, tree
+from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.trajectories.simplification import shortcut
 
 END_MARGIN = 0.0005
 """What an end that is closer than the safety distance keeps less than it has [m]."""
@@ -167,8 +166,8 @@ class SharedTreeSearch:
     def _safety_distances(self) -> list[float]:
         """What is tried, falling [m]."""
         most, steps = self.settings.safety_distance, max(self.settings.steps, 1)
-        ends = (self._clearances[0], self._clearances[1:].max())
-        between = {max(float(distance) - END_MARGIN, 0.0) for distance in ends if distance < most}
+        start_goal = (self._clearances[0], self._clearances[1:].max())
+        between = {max(float(distance) - END_MARGIN, 0.0) for distance in start_goal if distance < most}
         return sorted({most * step / steps for step in range(steps + 1)} | between, reverse=True)
 
     def _enter_step(self) -> None:
@@ -223,25 +222,25 @@ class SharedTreeRRTStar(Planner[SharedTreeSettings]):
     name = "shared_tree_rrt_star"
     settings_class = SharedTreeSettings
 
-    def solve(self, call: Call, ends: Ends) -> PlanResult:
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
-        for settings, attempt in ever_finer(call, self.settings):
-            state = random_state(call.seed, attempt)
-            search = SharedTreeSearch(ends.checker, *ends.rows(), settings, state)
+        for settings, attempt in ever_finer(context, self.settings):
+            state = random_state(context.seed, attempt)
+            search = SharedTreeSearch(start_goal.checker, *start_goal.rows(), settings, state)
 
             def out_of_time(search: SharedTreeSearch = search) -> bool:
                 if search.cost < np.inf:
-                    call.improved(search.cost)
-                return call.remaining <= 0
+                    context.improved(search.cost)
+                return context.remaining <= 0
 
             search.run(out_of_time)
             path = search.path()
             if path is None:
                 break
-            result = call.finish(ends.complete(path), self.name, reason=_reason(search))
+            result = context.finish(start_goal.complete(path), self.name, reason=_reason(search))
             if result is not None:
                 return result
-        return call.unsolved()
+        return context.unsolved()
 
 
 def _reason(search: SharedTreeSearch) -> str:
