@@ -11,76 +11,58 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "robotdiffuse"
 MODULES = sorted(SOURCE.rglob("*.py"))
 
-CHAIN = (
-    "compile_cache",
-    "deadline",
-    "errors",
-    "reading",
-    "checks",
-    "registry",
-    "settings",
-    "files",
-    "processes",
-    "transforms",
-    "types",
-    "results",
-    "robots",
-    "scenes",
-    "collision",
-    "problems",
-    "rates",
-    "torques",
-    "tolerances",
-    "verify",
-    "violations",
-    "paths",
+ORDER = (
+    *("core", "robots", "scenes", "collision", "perception", "problems", "trajectories", "validation"),
+    *("certificates", "interop", "datasets", "learning", "planning", "generation", "simulation"),
+    *("evaluation", "visualization", "server", "cli"),
 )
-BELOW: dict[str, set[str]] = {room: set(CHAIN[: i + 1]) for i, room in enumerate(CHAIN)}
-BELOW["certificates"] = {*CHAIN, "certificates"}
-BELOW["handover"] = {*CHAIN, "certificates", "handover"}
-BELOW["data"] = {*CHAIN[: CHAIN.index("problems") + 1], "data"}
-BELOW["learning"] = {*BELOW["data"], "learning"}
-BELOW["planners"] = {*CHAIN, "data", "learning", "planners"}
-BELOW["simulation"] = {*CHAIN, "simulation"}
-BELOW["viewer"] = {*CHAIN, "viewer"}
-BELOW["serve"] = {*CHAIN, "planners", "serve"}
-BELOW["live"] = {*CHAIN, "data", "learning", "planners", "viewer", "live"}
-BELOW["generation"] = {*CHAIN, "data", "learning", "planners", "generation"}
-BELOW["evaluation"] = {*CHAIN, "data", "learning", "planners", "simulation", "generation", "evaluation"}
+"""A package imports only itself and packages before it."""
+APART = {
+    "certificates": {"interop"},
+    "datasets": {"validation", "certificates", "interop"},
+    "learning": {"validation", "certificates", "interop"},
+    "planning": {"certificates", "interop"},
+    "generation": {"certificates", "interop"},
+    "simulation": {"certificates", "interop", "datasets", "learning", "planning", "generation"},
+    "evaluation": {"certificates", "interop"},
+    "visualization": {"generation", "simulation", "evaluation"},
+    "server": {"certificates", "interop", "datasets", "learning", "generation", "simulation", "evaluation"}
+    | {"visualization"},
+}
+"""Packages before it that a package does without, so that it can be used, and understood, without them."""
 
 EXTRAS = {
     "pybullet": {"simulation"},
     "pybullet_data": {"simulation"},
-    "ompl": {"planners"},
-    "OpenEXR": {"scenes"},
-    "ray": {"processes"},
-    "zarr": {"data"},
+    "ompl": {"planning"},
+    "OpenEXR": {"perception"},
+    "ray": {"core"},
+    "zarr": {"datasets"},
     "accelerate": {"learning"},
-    "fastapi": {"serve"},
-    "starlette": {"serve"},
-    "uvicorn": {"serve"},
-    "orjson": {"serve"},
-    "viser": {"live"},
+    "fastapi": {"server"},
+    "starlette": {"server"},
+    "uvicorn": {"server"},
+    "orjson": {"server"},
+    "viser": {"visualization"},
     "matplotlib": {"evaluation"},
-    "foxglove_schemas_protobuf": {"handover"},
-    "mcap": {"handover"},
-    "mcap_protobuf": {"handover"},
-    "rerun": {"handover"},
-    "rosbags": {"handover"},
-    "roslibpy": {"handover"},
+    "foxglove_schemas_protobuf": {"interop"},
+    "mcap": {"interop"},
+    "mcap_protobuf": {"interop"},
+    "rerun": {"interop"},
+    "rosbags": {"interop"},
+    "roslibpy": {"interop"},
     "pinocchio": {"robots"},
     "example_robot_data": set(),
 }
-"""Packages that the core install lacks, and the rooms that may import them."""
+"""Distributions that the core install lacks, and the packages that may import them."""
 
 
-ENTRANCES = {"__init__", "__main__", "cli"}
+ENTRANCES = {"__init__", "__main__"}
 """These may import everything."""
 
 
-def room(file: Path) -> str:
-    first = file.relative_to(SOURCE).parts[0]
-    return first.removesuffix(".py")
+def package(file: Path) -> str:
+    return file.relative_to(SOURCE).parts[0].removesuffix(".py")
 
 
 def imported(file: Path) -> Iterator[str]:
@@ -95,19 +77,72 @@ def imported(file: Path) -> Iterator[str]:
 
 @pytest.mark.parametrize("file", MODULES, ids=lambda file: str(file.relative_to(SOURCE)))
 def test_imports_point_one_way(file: Path) -> None:
-    here = room(file)
+    here = package(file)
     for name in imported(file):
         top, _, rest = name.partition(".")
         if top in EXTRAS:
             assert here in EXTRAS[top], f"{here} must not import {top}: the core install lacks it"
         there = rest.partition(".")[0]
-        if top != "robotdiffuse" or here in ENTRANCES:
+        if top != "robotdiffuse" or here in ENTRANCES or there == "__version__":
             continue
-        assert there in BELOW[here] or there == "__version__", f"{here} must not import {there}"
+        before = ORDER[: ORDER.index(here) + 1]
+        assert there in before and there not in APART.get(here, ()), f"{here} must not import {there}"
 
 
-def test_every_room_has_a_place_in_the_order() -> None:
-    assert {room(file) for file in MODULES} <= {*BELOW, *ENTRANCES}
+def test_only_the_command_line_imports_visualization() -> None:
+    users = {
+        package(file)
+        for file in MODULES
+        for name in imported(file)
+        if name.startswith("robotdiffuse.visualization")
+    }
+    assert users <= {"visualization", "cli"}
+
+
+def test_every_package_has_a_place_in_the_order() -> None:
+    assert {package(file) for file in MODULES} == {*ORDER, *ENTRANCES}
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    names = {".".join(file.relative_to(SOURCE.parent).with_suffix("").parts): file for file in MODULES}
+    graph = {name: {n for full in imported(file) if (n := _module(full, names))} for name, file in names.items()}
+    circles = [ring for ring in strongly_connected(graph) if len(ring) > 1]
+    assert not circles, "\n".join(" ".join(sorted(ring)) for ring in circles)
+
+
+def _module(full: str, names: dict[str, Path]) -> str | None:
+    """The module that a full name is of, or in."""
+    while full:
+        if full in names:
+            return full
+        full = full.rpartition(".")[0]
+    return None
+
+
+def strongly_connected(graph: dict[str, set[str]]) -> list[set[str]]:
+    """Sets of nodes that all reach each other (Kosaraju's algorithm)."""
+    order, seen = [], set()
+    for root in graph:
+        stack = [(root, False)]
+        while stack:
+            node, done = stack.pop()
+            if done:
+                order.append(node)
+            elif node not in seen:
+                seen.add(node)
+                stack += [(node, True), *((other, False) for other in graph[node])]
+    back = {node: [n for n in graph if node in graph[n]] for node in graph}
+    rings, placed = [], set()
+    for root in reversed(order):
+        ring, stack = set(), [root]
+        while stack:
+            node = stack.pop()
+            if node not in placed:
+                placed.add(node)
+                ring.add(node)
+                stack += back[node]
+        rings.append(ring)
+    return rings
 
 
 def run(code: str) -> str:

@@ -1,9 +1,11 @@
 """Parts of pages that come from the code, so that they cannot go stale: `<!-- generated: NAME -->`."""
 
 import argparse
+import ast
 import re
 from collections.abc import Callable, Iterator
 from importlib import import_module
+from importlib.resources import files
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
@@ -11,18 +13,18 @@ from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
 READING_ORDER = (
-    *("planners", "problems", "robots", "scenes", "results"),
-    *("types", "verify", "certificates", "paths", "viewer", "data", "errors"),
+    *("planning", "problems", "robots", "scenes", "perception"),
+    *("core", "validation", "certificates", "visualization", "datasets"),
 )
-"""Of the rooms that public names are from."""
+"""Of the packages that public names come from."""
 TABLES = {
-    "Planners": "planners:PLANNERS",
+    "Planners": "planning:PLANNERS",
     "Families of random problems": "problems.families:FAMILIES",
     "Denoisers": "learning.denoisers:DENOISERS",
     "Encoders": "learning.encoders:ENCODERS",
     "Samplers": "learning.samplers:SAMPLERS",
-    "Files that motions are written to": "handover:WRITERS",
-    "Files that motions are read from": "handover:READERS",
+    "Files that motions are written to": "interop:WRITERS",
+    "Files that motions are read from": "interop:READERS",
     "Guidance costs": "learning.costs:COSTS",
 }
 """On the page of parts by name."""
@@ -87,13 +89,15 @@ def _cell(text: str) -> str:
 
 def public_names() -> str:
     """A directive for each public name of the package, at its home."""
-    import robotdiffuse
-
-    rooms: dict[str, list[str]] = {}
-    for name, home in robotdiffuse._HOME.items():
-        rooms.setdefault(home.split(".")[1], []).append(f"::: {home}.{name}")
-    order = sorted(rooms, key=lambda room: (*READING_ORDER, room).index(room))
-    return "\n\n".join(f"## {room.capitalize()}\n\n" + "\n\n".join(rooms[room]) for room in order)
+    packages: dict[str, list[str]] = {}
+    stub = files("robotdiffuse") / "__init__.pyi"
+    for node in ast.parse(stub.read_text()).body:
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            home = f"robotdiffuse.{node.module}"
+            directives = [f"::: {home}.{alias.name}" for alias in node.names]
+            packages.setdefault(node.module.split(".")[0], []).extend(directives)
+    order = sorted(packages, key=lambda package: (*READING_ORDER, package).index(package))
+    return "\n\n".join(f"## {name.capitalize()}\n\n" + "\n\n".join(packages[name]) for name in order)
 
 
 def tables() -> str:
