@@ -3,6 +3,10 @@
 import argparse
 import math
 
+IGNORE_JOINTS = (
+    "note joints of MoveIt files that the robot lacks rather than refuse them; what they move is ignored"
+)
+
 
 def _number(text: str) -> float:
     """nan if it is none."""

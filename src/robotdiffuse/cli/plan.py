@@ -6,7 +6,7 @@ from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from robotdiffuse.cli.arguments import natural, not_negative, positive, share
+from robotdiffuse.cli.arguments import IGNORE_JOINTS, natural, not_negative, positive, share
 from robotdiffuse.cli.console import Waiting, print_next_view, print_result
 from robotdiffuse.cli.drawing import ENDINGS, draw, show
 from robotdiffuse.core.types import SHORT, UNTIL
@@ -72,6 +72,7 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
         help="what space that the problem's views do not show is taken for: optimistic (free), padded, "
         "predicted or occupied (default: what the problem says, or optimistic)",
     )
+    parser.add_argument("--ignore-joints", action="store_true", help=IGNORE_JOINTS)
     parser.add_argument(
         "--next-view",
         action="store_true",
@@ -145,7 +146,7 @@ def run_plan(arguments: argparse.Namespace) -> int:
     ]
     if arguments.view:
         outputs.append(check_output(f"{Path(arguments.problem).stem}.html", ENDINGS))
-    problem = load_problem(arguments.problem, arguments.index)
+    problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     if arguments.unknown is not None:
         problem = with_policy(problem, arguments.unknown)
     if arguments.blend is not None:

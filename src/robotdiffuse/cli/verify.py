@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from robotdiffuse.cli.arguments import natural
+from robotdiffuse.cli.arguments import IGNORE_JOINTS, natural
 from robotdiffuse.cli.console import clearances
 from robotdiffuse.core.errors import InputError
 
@@ -41,6 +41,7 @@ def add_verify(commands: argparse._SubParsersAction) -> None:
         "--index", type=natural, default=0, help="which problem of a .jsonl file (default: 0)"
     )
     parser.add_argument("--robot", metavar="NAME", help="bundled name or URDF, beside --scene")
+    parser.add_argument("--ignore-joints", action="store_true", help=IGNORE_JOINTS)
     parser.add_argument("--topic", metavar="NAME", help="of a bag or MCAP file that holds several motions")
     parser.add_argument(
         "--all", action="store_true", help="print all that is wrong, not only what comes first"
@@ -157,20 +158,21 @@ def _asked(
         result, problem = read(arguments.motion)
         both = {"path": result.path, "trajectory": result.trajectory}
         return problem, {what: motion for what, motion in both.items() if motion is not None}, ()
-    recorded = read_motion(arguments.motion, arguments.topic)
+    recorded, more = read_motion(arguments.motion, arguments.topic), ()
     if alone:
         problem = _along(arguments.motion)
     elif arguments.problem is not None:
-        problem = load_problem(arguments.problem, arguments.index)
+        problem = load_problem(arguments.problem, arguments.index, arguments.ignore_joints)
     else:
-        from robotdiffuse.problems.moveit import read_moveit_scene
+        from robotdiffuse.problems.moveit import read_noted_moveit_scene
         from robotdiffuse.robots import load_robot
 
         robot = load_robot(arguments.robot)
-        problem = own_problem(recorded, robot, read_moveit_scene(str(arguments.scene), robot))
+        scene, more = read_noted_moveit_scene(str(arguments.scene), robot, arguments.ignore_joints)
+        problem = own_problem(recorded, robot, scene)
     try:
         fit = fitted(recorded, problem.robot)
     except InputError as error:
         raise InputError(f"{arguments.motion}: {error}") from None
     what = "trajectory" if isinstance(fit.motion, Trajectory) else "path"
-    return problem, {what: fit.motion}, fit.notes
+    return problem, {what: fit.motion}, (*more, *fit.notes)

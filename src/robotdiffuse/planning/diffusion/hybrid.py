@@ -3,10 +3,13 @@
 The straight line if it is free. Else a search for a first path, within milliseconds, then ever shorter ones;
 and, for a share of the work, batches of trajectories sampled by the diffusion model under collision guidance,
 or, where none of them is free, the same after more gradient steps (refinement). Of the scene the model is
-told clearances, and no code (see `RobotDiffuse.code`). For an arm without weights the batches are smooth
-noise after as many such steps (see smooth_noise.py). What the batches propose is simplified by the same code
-as what search finds, and the shortest path of either bounds the next search. Everything goes through the
-validator, and the result names the stage that its path comes from.
+told clearances, and no code (see `RobotDiffuse.code`). What the batches propose is simplified by the same
+code as what search finds, and the shortest path of either bounds the next search. Everything goes through
+the validator, and the result names the stage that its path comes from.
+
+For an arm without weights the batches are smooth noise after as many such steps (see smooth_noise.py). They
+are drawn only once search has a path: before that they solve less than search does in their time, see
+benchmarks/results/hard_arms.txt.
 
 Under path constraints it is search alone: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
 shorter (the mean of 20 upright cups and of 20 lines; median: the same).
@@ -122,9 +125,10 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
             return plan_constrained(context, start_goal, settings.search)
         search = AnytimeSearch(context, start_goal, settings.search, AORRTC.name)
-        weights = self.weights(robot)
+        weights, help_out = self.weights(robot), None
         if weights is not None:
             batches = _NetworkBatches(self, context, start_goal, search, weights)
+            help_out = batches.offer
         else:
             batches = _Batches(self, context, start_goal, search)
             note = f"there are no weights for {robot.name}; planned by search and smooth noise"
@@ -142,7 +146,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             search,
             lambda: search.pays(settings.search.gain, settings.search.patience),
             improve,
-            batches.offer,
+            help_out,
         )
 
     def code(
@@ -160,7 +164,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
 
 class _Batches:
-    """Batches of smooth noise in the anytime loop of a call."""
+    """Batches of smooth noise in the anytime loop of a call, once it has a path."""
 
     def __init__(
         self, planner: RobotDiffuse, context: PlanningContext, start_goal: StartGoal, search: AnytimeSearch
