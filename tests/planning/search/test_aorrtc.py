@@ -183,7 +183,7 @@ def test_no_gain_asked_for_is_no_end() -> None:
     [
         ({"until": "soon"}, r"until"),
         ({"clearance": float("nan")}, "clearance is nan"),
-        ({"velocity_scaling": 0.0}, r"velocity_scaling is 0\.0; it must be above 0 and at most 1"),
+        ({"velocity_scaling": 0.0}, r"velocity_scaling is 0\.0; it must be between 0.001 and 1"),
         ({"acceleration_scaling": 1.5}, r"acceleration_scaling is 1\.5"),
         ({"jerk": 0.0}, r"jerk is 0\.0; it must be"),
     ],
