@@ -18,6 +18,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy import ndarray
 
 from robotdiffuse.collision.kernels.moving_obstacles import free_over
 from robotdiffuse.collision.moving_obstacles import MovingCollision, links_of
@@ -160,7 +161,10 @@ def _timed(
     speed = max(one.greatest_speed for one in problem.moving)
     asked = clearance + (TRAVEL + speed * STEP) / 2
     clear = free_over(links, collision.tracks, configurations, times, asked)
-    cells = [rests.cells(motion, configurations) for motion in rests.motions]
+    cells = list[ndarray]()
+    for motion in rests.motions:
+        check_timing("the grid of times")
+        cells.append(rests.cells(motion, configurations))
     way, found = earliest(
         clear,
         np.searchsorted(s, rests.places),
