@@ -118,6 +118,7 @@ class MovingCollision:
         """The time [s] of the first place where the covering spheres are not proved to keep `least` [m], None
         for a motion that is proved. Fast, for searches and loops: what spheres cannot settle is refused."""
         every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
+        times, q = for_kernels(times), for_kernels(q)
         tasks = Tasks(times[:1], times[-1:], every)
         left = kernel.certify(self.links, self.tracks, times, q, tasks, least, 0.0, np.array([CAP]))[1]
         return min((start for start, *_ in left), default=None)
