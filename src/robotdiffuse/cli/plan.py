@@ -83,10 +83,13 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
             type=share,
             default=1.0,
             metavar="X",
-            help=f"share of the robot's {what} limits that is used, above 0 and at most 1 (default: 1)",
+            help=f"share of the robot's {what} limits that is used, from 0.001 to 1 (default: 1)",
         )
     parser.add_argument(
-        "--jerk", type=positive, metavar="J", help="most jerk of any joint, in rad/s³ (default: no limit)"
+        "--jerk",
+        type=positive,
+        metavar="J",
+        help="most jerk of any joint, at least 0.01 rad/s³ (default: no limit)",
     )
     parser.add_argument(
         "--blend",

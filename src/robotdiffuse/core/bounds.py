@@ -10,8 +10,8 @@ LARGEST = 1e4
 millimetre there, which compiled code makes up for."""
 SMALLEST = 1e-9
 """Of all sizes [m]: what is smaller is nothing in float32."""
-FASTEST = 1e6
-"""Of all rates, in their units."""
+SLOWEST, FASTEST = 1e-6, 1e6
+"""Of all rates, and the least that a joint may be limited to, in their units."""
 RIGID_SLACK = 1e-4
 """How far the rotation of a pose may be from orthonormal and its last row from 0 0 0 1, by entry."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)

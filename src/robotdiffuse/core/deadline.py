@@ -1,5 +1,5 @@
-"""The time that a call has left, for steps far below it that may take longer: the preparation of a scene.
-And whether anybody still waits for it."""
+"""The time that a call has left, for steps far below it that may take longer: the preparation of a scene,
+timing. And whether anybody still waits for it."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,8 +11,17 @@ _left: ContextVar[Callable[[], float] | None] = ContextVar("left", default=None)
 _leave: ContextVar[Callable[[], None] | None] = ContextVar("leave", default=None)
 
 
+PREPARING, TIMING = "to prepare the scene", "for timing"
+"""What a time limit may be too short for."""
+
+
 class OutOfTimeError(Exception):
     """Which step there was no time for, in words."""
+
+    def __init__(self, step: str, what: str = PREPARING) -> None:
+        super().__init__(step)
+        self.what = what
+        """One of PREPARING and TIMING, which the step is part of."""
 
 
 @contextmanager
@@ -46,13 +55,23 @@ def check_left() -> None:
         leave()
 
 
+def check_timing(step: str, seconds: float = 0.0) -> None:
+    """`check_time` for a step of timing. A path in hand is timed until LONG after the end of the time: its
+    planner kept so much back for it as that took of late."""
+    _check(step, seconds, TIMING, LONG)
+
+
 def check_time(step: str, seconds: float = 0.0) -> None:
     """Raises OutOfTimeError where the time of a deadline has run out before a step, or will before the end of
     one that is long: it takes about so many seconds."""
+    _check(step, seconds, PREPARING, 0.0)
+
+
+def _check(step: str, seconds: float, what: str, late: float) -> None:
     check_left()
     left = _left.get()
     remaining = float("inf") if left is None else left()
-    if remaining <= 0:
-        raise OutOfTimeError(step)
+    if remaining <= -late:
+        raise OutOfTimeError(step, what)
     if seconds > max(LONG, remaining):
-        raise OutOfTimeError(f"{step}, which takes about {seconds:.1f} s")
+        raise OutOfTimeError(f"{step}, which takes about {seconds:.1f} s", what)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Annotated
@@ -12,13 +13,21 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.core.bounds import LARGEST
-from robotdiffuse.core.deadline import OutOfTimeError, check_left
+from robotdiffuse.core.deadline import OutOfTimeError, check_left, deadline
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Bound, OneOf, Positive, Settings
+from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.types import SHORT, UNTIL, Path, Status, Trajectory
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.trajectories.speed_limits import DEFAULT, NOTHING, Beside, Pace, TimingSettings
+from robotdiffuse.trajectories.speed_limits import (
+    DEFAULT,
+    NOTHING,
+    Beside,
+    Jerk,
+    Pace,
+    Scaling,
+    TimingSettings,
+)
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import Report, Verifier, Violation, verifier
 
@@ -42,9 +51,9 @@ class Request(Settings):
 
     until: Annotated[str, OneOf(UNTIL)] = SHORT
     clearance: Annotated[float, Bound(least=0.0, most=LARGEST)] | None = None
-    velocity_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
-    acceleration_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
-    jerk: Positive | None = None
+    velocity_scaling: Scaling = 1.0
+    acceleration_scaling: Scaling = 1.0
+    jerk: Jerk | None = None
 
 
 @lru_cache
@@ -86,7 +95,8 @@ class PlanningContext:
         self.notes = list(problem.notes)
         """What the result will say was changed or ignored; planners may add to it."""
         self._progress: list[tuple[float, float]] = []
-        self._refused = self._no_time_for = ""
+        self._refused = ""
+        self._ended: tuple[Status, str] | None = None
 
     @cached_property
     def rng(self) -> np.random.Generator:
@@ -129,7 +139,7 @@ class PlanningContext:
     @property
     def remaining(self) -> float:
         """Wall time left for searching [s]; negative when it has run out, or is too short for the validator."""
-        return -1.0 if self._no_time_for else self.search_until - self.elapsed
+        return -1.0 if self._ended else self.search_until - self.elapsed
 
     def fail(self, status: Status, reason: str) -> PlanResult:
         """A result without a motion."""
@@ -146,8 +156,8 @@ class PlanningContext:
 
     def unsolved(self, reason: str = "") -> PlanResult:
         """A result without a path: TIMEOUT if time has run out, else NO_PATH, for a search that ended."""
-        if self._no_time_for:
-            return self.out_of_time(self._no_time_for)
+        if self._ended:
+            return self.fail(*self._ended)
         if self.remaining <= 0:
             tried = (
                 f"no path was found in {self.elapsed:.2f} s; a longer time limit or another seed may find one"
@@ -156,10 +166,22 @@ class PlanningContext:
         ended = f"the search ended after {self.elapsed:.2f} s without a path; another seed may find one"
         return self.fail(Status.NO_PATH, reason or ended)
 
-    def out_of_time(self, step: str) -> PlanResult:
-        """A result for a scene whose preparation takes longer than the call may."""
-        limit = f"the time limit of {self.time_limit:g} s is too short to prepare the scene"
-        return self.fail(Status.TIMEOUT, f"{limit}: there was no time for {step}")
+    def deadline(self) -> AbstractContextManager[None]:
+        """The call's time holds for steps far below while this lasts: they raise OutOfTimeError."""
+        return deadline(lambda: self.time_limit - self.elapsed)
+
+    def out_of_time(self, error: OutOfTimeError) -> PlanResult:
+        """A result for a scene whose preparation, or a motion whose timing, takes longer than it may."""
+        return self.fail(Status.TIMEOUT, self._too_short(error))
+
+    def _too_short(self, error: OutOfTimeError) -> str:
+        limit = f"the time limit of {self.time_limit:g} s is too short {error.what}"
+        return f"{limit}: there was no time for {error}"
+
+    @property
+    def ended(self) -> bool:
+        """Whether no path can be finished any more; `unsolved` says why."""
+        return self._ended is not None
 
     def finish(
         self,
@@ -177,9 +199,10 @@ class PlanningContext:
         """
         began = self.elapsed
         try:
-            result = self._finished(waypoints, stage, reason, notes, keeps, deviations)
+            with self.deadline():
+                result = self._finished(waypoints, stage, reason, notes, keeps, deviations)
         except OutOfTimeError as error:
-            self._no_time_for = str(error)
+            self._ended = Status.TIMEOUT, self._too_short(error)
             return None
         took = self.elapsed - began
         before = _finishing.get(self.problem.robot.name, took)
@@ -216,6 +239,8 @@ class PlanningContext:
         )
         timed = motion.report(trajectory)
         if timed.violation is not None:
+            if timed.violation.kind == "time":  # too long to be validated, as any other motion here would be
+                self._ended = Status.NO_PATH, timed.violation.message
             return self._refuse(timed.violation)
         scene = _least(report.scene_clearance, timed.scene_clearance)
         itself = _least(report.self_clearance, timed.self_clearance)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motions import finer
-from robotdiffuse.core.deadline import OutOfTimeError, deadline
+from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
@@ -67,8 +67,10 @@ class Planner(ABC, Generic[Own]):
             and passages allow it [m]; where they do not, less, and a note says so. None: what the problem
             says, or 1 cm. The other planners have settings of their own, or keep what their motions have;
             they refuse one that is asked for.
-        velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses.
-        jerk: most jerk of any joint of the timed motion [rad/s³]. None: no limit, the fastest motion.
+        velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses, from
+            0.001 to 1.
+        jerk: most jerk of any joint of the timed motion [rad/s³], at least 0.01. None: no limit, the fastest
+            motion.
 
         Where the problem has waypoints, the motion stops at each or passes within its blend:
         `planning/pipeline/waypoints.py`. Where obstacles move, it waits, goes slower or draws back on its path:
@@ -114,12 +116,12 @@ class Planner(ABC, Generic[Own]):
     def attempt(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
         """`plan` in the problem's scene as it is."""
         context = PlanningContext(self.name, problem, time_limit, seed, request)
-        with deadline(lambda: context.time_limit - context.elapsed):
+        with context.deadline():
             try:
                 start_goal = usable_start_goal(context)
                 return start_goal if isinstance(start_goal, PlanResult) else self.solve(context, start_goal)
             except OutOfTimeError as error:
-                return context.out_of_time(str(error))
+                return context.out_of_time(error)
 
     def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
         """Load the compiled code that calls on such a problem need, or compile it on a new machine, which

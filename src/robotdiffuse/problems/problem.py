@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import LARGEST, numbers, rigid_transform
+from robotdiffuse.core.bounds import LARGEST, SLOWEST, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
@@ -76,7 +76,7 @@ class Problem:
     moving: tuple[MovingObstacle, ...] = ()
     """Obstacles that move, from time 0 of the motion on; `scene` holds those that stand still."""
     start_velocity: Float[ndarray, "dof"] | None = None
-    """Of the joints when the motion begins [rad/s] or [m/s]; None: it begins at rest."""
+    """Of the joints when the motion begins [rad/s] or [m/s]; None, and all below 1e-6: it begins at rest."""
     blend: tuple[float, ...] = ()
     """For each waypoint, within what distance of it the motion may pass without stopping: of configurations
     in joint space [rad, L2], of the position of a pose, or the box that it may be in [m]; 0: it stops there.
@@ -311,7 +311,7 @@ def _moving(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]:
 
 
 def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
-    """A velocity within limits, None for rest."""
+    """A velocity within limits; None for rest, and what is nearly that."""
     if value is None:
         return None
     velocity = numbers(value)
@@ -327,7 +327,7 @@ def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
             f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; its velocity limit is "
             f"{robot.velocity[j]:g}"
         )
-    return velocity if velocity.any() else None
+    return velocity if (np.abs(velocity) >= SLOWEST).any() else None
 
 
 def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:

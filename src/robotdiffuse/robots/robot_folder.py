@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import LARGEST, unit_quaternion, within
+from robotdiffuse.core.bounds import LARGEST, SLOWEST, unit_quaternion, within
 from robotdiffuse.core.errors import InputError, shortened, shown
 from robotdiffuse.core.input_files import read_arrays, read_json
 from robotdiffuse.core.transforms import pose_entry, rotation_from_quaternion, transform
@@ -234,7 +234,7 @@ def _joint_from_json(data: dict) -> Joint:
     axis = _array([data["axis"]], 3, f"joint {name}: axis")[0]
     lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
     rates = (velocity, acceleration, jerk)
-    if not -LARGEST <= lower <= upper <= LARGEST or not min(rates) > 0 or not max(rates) < np.inf:
+    if not -LARGEST <= lower <= upper <= LARGEST or not min(rates) >= SLOWEST or not max(rates) < np.inf:
         raise ValueError(f"joint {name}: limits")
     if not abs(np.linalg.norm(axis) - 1) < AXIS_SLACK:
         raise ValueError(f"joint {name}: an axis of length 1 expected")

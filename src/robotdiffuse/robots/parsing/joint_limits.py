@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from robotdiffuse.core.bounds import FASTEST, LARGEST
+from robotdiffuse.core.bounds import FASTEST, LARGEST, SLOWEST
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.robots.parsing.urdf import ACCELERATION_PER_VELOCITY, JERK_PER_ACCELERATION
@@ -68,11 +68,9 @@ def _fields(file: str, joint: str, entry: object) -> dict[str, float]:
             continue
         most = LARGEST if kind == "position" else FASTEST
         number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or abs(value) > most or (kind != "position" and value <= 0):
-            raise InputError(
-                f"{file}: {key} of {joint} is {shown(value)}; it must be a number within "
-                f"±{most:g}, above 0 for a rate"
-            )
+        if not number or abs(value) > most or (kind != "position" and value < SLOWEST):
+            rule = f"within ±{most:g}" if kind == "position" else f"from {SLOWEST:g} to {most:g}"
+            raise InputError(f"{file}: {key} of {joint} is {shown(value)}; it must be a number {rule}")
         fields[FIELDS[key]] = float(value)
     return fields
 

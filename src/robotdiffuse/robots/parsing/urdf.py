@@ -10,7 +10,7 @@ import trimesh
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import FASTEST, LARGEST, SMALLEST, points, within
+from robotdiffuse.core.bounds import FASTEST, LARGEST, SLOWEST, SMALLEST, points, within
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import parse_xml, read_triangles
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
@@ -306,6 +306,11 @@ class UrdfTree:
         if lower > upper:
             raise InputError(f"{self.path}: joint {joint.name}: lower limit {lower} is above upper {upper}")
         velocity = given.get("velocity", 0.0)
+        if 0 < velocity < SLOWEST:
+            raise InputError(
+                f"{self.path}: joint {joint.name}: velocity limit is {velocity:g}; it must be at least "
+                f"{SLOWEST:g}, or 0 where there is none"
+            )
         if velocity <= 0:
             velocity = DEFAULT_VELOCITY
             self.notes.append(f"joint {joint.name} has no velocity limit; {velocity:g} taken")
