@@ -185,7 +185,10 @@ def test_no_gain_asked_for_is_no_end() -> None:
         ({"clearance": float("nan")}, "clearance is nan"),
         ({"velocity_scaling": 0.0}, r"velocity_scaling is 0\.0; it must be between 0.001 and 1"),
         ({"acceleration_scaling": 1.5}, r"acceleration_scaling is 1\.5"),
+        ({"velocity_scaling": 1e-300}, r"velocity_scaling is 1e-300; it must be between 0.001 and 1"),
+        ({"acceleration_scaling": 1e-6}, r"acceleration_scaling is 1e-06; it must be between 0.001 and 1"),
         ({"jerk": 0.0}, r"jerk is 0\.0; it must be"),
+        ({"jerk": 1e-5}, r"jerk is 1e-05; it must be at least 0\.01"),
     ],
 )
 def test_arguments_are_checked(arguments: dict, message: str) -> None:
