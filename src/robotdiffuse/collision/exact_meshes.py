@@ -27,6 +27,7 @@ from robotdiffuse.collision.convex_geometry import (
     solids_of,
 )
 from robotdiffuse.collision.kernels import mesh_bounds as kernel
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose, coal_surface
@@ -78,7 +79,7 @@ class _Obstacle(NamedTuple):
 def forward_frames(robot: Robot, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n frames 4 4"]:
     """T_base_frame of frames 0 to dof, in float64 and independent of the PyTorch kinematics."""
     slides = np.array(robot.prismatic, np.bool_)
-    return kernel.forward(robot.frame_offsets, robot.branching, slides, np.asarray(q, np.float64))
+    return kernel.forward(for_kernels(robot.frame_offsets), robot.branching, slides, for_kernels(q))
 
 
 def _piece(part: Part) -> _Piece:

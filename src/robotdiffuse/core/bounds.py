@@ -1,4 +1,8 @@
-"""Numbers at the door: arrays of what anybody gave, within bounds that all code behind can work with."""
+"""Numbers at the door: arrays of what anybody gave, within bounds that all code behind can work with, and
+kept where nobody can write to them."""
+
+from dataclasses import fields
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy import ndarray
@@ -15,6 +19,65 @@ FASTEST = 1e6
 RIGID_SLACK = 1e-4
 """How far the rotation of a pose may be from orthonormal and its last row from 0 0 0 1, by entry."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
+
+T = TypeVar("T")
+
+
+class Value:
+    """Base of the dataclasses that are values: the arrays in their fields are read-only.
+
+    What is prepared for a value, and verdicts on it, are kept by its identity. An array that can be written
+    to is copied, so that whoever gave it keeps it as it was. Subclasses with a `__post_init__` of their own
+    call this one at its end.
+    """
+
+    def __post_init__(self) -> None:
+        for name in (field.name for field in fields(self)):  # type: ignore[arg-type]
+            given = getattr(self, name)
+            kept = read_only(given)
+            if kept is not given:
+                object.__setattr__(self, name, kept)
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        # arrays can be written to when they come out of a pickle or a deep copy
+        self.__dict__.update({name: read_only(value) for name, value in state.items()})
+
+
+def read_only(value: T) -> T:
+    """An array, or what tuples and dictionaries hold of arrays, without anyone who can write to it: itself if
+    that is so, else a copy. Anything else is returned as it is."""
+    if isinstance(value, ndarray):
+        if not _writable(value):
+            return value
+        kept = np.array(value)
+        kept.setflags(write=False)
+        return kept  # type: ignore[return-value]
+    if isinstance(value, tuple):
+        kept = [read_only(one) for one in value]
+        if all(a is b for a, b in zip(kept, value, strict=True)):
+            return value
+        return value._make(kept) if hasattr(value, "_make") else tuple(kept)  # type: ignore
+    if isinstance(value, dict):
+        kept = {key: read_only(one) for key, one in value.items()}
+        return value if all(kept[key] is value[key] for key in value) else kept  # type: ignore[return-value]
+    return value
+
+
+def for_kernels(array: ndarray, dtype: type = np.float64) -> ndarray:
+    """The array as compiled code takes it, contiguous and not read-only: to Numba a read-only one is of
+    another type, for which it would compile everything once more."""
+    array = np.ascontiguousarray(array, dtype)
+    return array if array.flags.writeable else array.copy()
+
+
+def _writable(array: ndarray) -> bool:
+    """Whether anyone can write to it, by the array that it is a view of too."""
+    owner: Any = array
+    while isinstance(owner, ndarray):
+        if owner.flags.writeable:
+            return True
+        owner = owner.base
+    return owner is not None and not isinstance(owner, bytes)
 
 
 def numbers(value: object) -> ndarray | None:
@@ -53,6 +116,7 @@ def points(owner: str, name: str, value: object) -> ndarray:
         row, more = array[bad[0]], "" if len(bad) == 1 else f" and {len(bad) - 1} more"
         rule = f"finite numbers within ±{LARGEST:g} m"
         raise InputError(f"{owner}.{name}[{bad[0]}]{more} is {shown(row)}; it must be {rule}")
+    array.setflags(write=False)  # so that large ones are not copied once more
     return array
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
+from robotdiffuse.core.bounds import Value
 from robotdiffuse.core.output_files import check_output, write_atomically
 
 ROWS = ("positions", "velocities", "accelerations")
@@ -41,7 +42,7 @@ FIRST, SHORT, LIMIT = UNTIL = ("first", "short", "limit")
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class Path(Value):
     """Waypoints joined by straight lines in joint space."""
 
     joint_names: tuple[str, ...]
@@ -65,7 +66,7 @@ class Tree(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class Trajectory(Value):
     """A path with a time at each row."""
 
     joint_names: tuple[str, ...]

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import rigid_transform
+from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.perception.assumptions import FINE, fine, voxels_in
@@ -31,7 +31,7 @@ LEAST = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class NextView:
+class NextView(Value):
     """A camera pose, and what it is worth."""
 
     T_base_camera: Float[ndarray, "4 4"]

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import LARGEST, numbers, rigid_transform
+from robotdiffuse.core.bounds import LARGEST, Value, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
@@ -41,7 +41,7 @@ predicts it; occupied. See `planning/pipeline/unknown_space.py`."""
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(Value):
     """`goal` may be given as a configuration, a list of them, a JointGoal, a PoseGoal or a PosesGoal, or a
     list of those, of which any is to be reached; so may each of the waypoints.
 
@@ -151,6 +151,7 @@ class Problem:
             "blend": blend,
         }.items():
             object.__setattr__(self, key, value)
+        super().__post_init__()
 
     if TYPE_CHECKING:
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import LARGEST, numbers, within
+from robotdiffuse.core.bounds import LARGEST, Value, numbers, read_only, within
 from robotdiffuse.core.errors import InputError, shown
 
 SLACK = 1e-6
@@ -42,12 +42,12 @@ def inertia_of(values: ArrayLike) -> Inertia:
     least = float(np.linalg.eigvalsh(moments)[0])
     if not row[0] > 0 or least < -SLACK * np.abs(moments).max():
         raise ValueError("a mass above 0 and moments of inertia of at least 0 expected")
-    return Inertia(float(row[0]), row[1:4], moments)
+    return read_only(Inertia(float(row[0]), row[1:4], moments))
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Payload:
+class Payload(Value):
     """A mass that a link carries, whose torques joints must bear beside those of the arm.
 
     Raises InputError for numbers that are not finite, a negative mass or negative moments of inertia.
@@ -79,6 +79,7 @@ class Payload:
             object.__setattr__(self, name, value)
         if self.link is not None and not isinstance(self.link, str):
             raise InputError(f"payload.link is {shown(self.link)}; it must be the name of a link")
+        super().__post_init__()
 
     if TYPE_CHECKING:
 

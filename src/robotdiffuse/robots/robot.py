@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import LARGEST
+from robotdiffuse.core.bounds import LARGEST, Value, read_only
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
@@ -38,7 +38,7 @@ class Mimic(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Joint:
+class Joint(Value):
     """One joint of the URDF tree. Limits are meaningless for a fixed joint."""
 
     name: str
@@ -71,7 +71,7 @@ class Joint:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Robot:
+class Robot(Value):
     """A serial arm: the joints between base and tip that are not locked are planned. Or a tree of them: those
     between the base and any of several tips, as of two arms on one torso.
 
@@ -133,7 +133,7 @@ class Robot:
         for joint in self.joints:
             if joint.kind == "fixed" and joint.parent in found:
                 found[joint.child] = found[joint.parent] @ joint.T_parent_joint
-        return found
+        return read_only(found)
 
     @property
     def tips(self) -> tuple[str, ...]:
@@ -167,7 +167,7 @@ class Robot:
         return len(self.planned_joints)
 
     def _limit(self, what: str) -> Float[ndarray, "dof"]:
-        return np.array([getattr(joint, what) for joint in self.planned_joints])
+        return read_only(np.array([getattr(joint, what) for joint in self.planned_joints]))
 
     @cached_property
     def lower(self) -> Float[ndarray, "dof"]:
@@ -201,7 +201,7 @@ class Robot:
     @cached_property
     def continuous(self) -> Bool[ndarray, "dof"]:
         """Which joints turn without limits, so that values a turn apart are the same."""
-        return np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool)
+        return read_only(np.array([joint.kind == "continuous" for joint in self.planned_joints], dtype=bool))
 
     def turns(self, q: Float[ndarray, "*n dof"]) -> Float[ndarray, "*n dof"]:
         """The whole turns of continuous joints in configurations [rad]: less these, they are within half a
@@ -238,7 +238,7 @@ class Robot:
 
     @cached_property
     def _turns_twice(self) -> Bool[ndarray, "dof"]:
-        return (self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool)
+        return read_only((self.upper - self.lower > TURN) & ~np.array(self.prismatic, dtype=bool))
 
     @cached_property
     def _frames(self) -> tuple[dict[str, tuple[int, ndarray]], ndarray, ndarray]:
@@ -256,7 +256,7 @@ class Robot:
             else:
                 T_joint_child = joint.motion(self.locked.get(joint.name, 0.0))
                 links[joint.child] = (frame, T_frame_parent @ joint.T_parent_joint @ T_joint_child)
-        return links, offsets, parents
+        return read_only((links, offsets, parents))
 
     @cached_property
     def frame_offsets(self) -> Float[ndarray, "dof 4 4"]:
@@ -269,8 +269,9 @@ class Robot:
 
     @cached_property
     def branching(self) -> Int[ndarray, "dof"] | None:
-        """The same for compiled code: None of a chain, where each planned joint moves all that come after."""
-        return None if (self.parents == np.arange(self.dof)).all() else self.parents
+        """The same for compiled code, which is compiled for arrays that can be written to: None of a chain,
+        where each planned joint moves all that come after."""
+        return None if (self.parents == np.arange(self.dof)).all() else self.parents.copy()
 
     @cached_property
     def moved_by(self) -> Bool[ndarray, "frames dof"]:
@@ -279,7 +280,7 @@ class Robot:
         for j, parent in enumerate(self.parents):
             rows[j + 1] = rows[parent]
             rows[j + 1, j] = True
-        return rows
+        return read_only(rows)
 
     def at_end(self, link: str) -> bool:
         """Whether planned joints move a link and none comes behind it."""

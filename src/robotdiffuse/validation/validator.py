@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import describe_contact
 from robotdiffuse.collision.motions import Contact, ContinuousCollision
-from robotdiffuse.core.bounds import LARGEST, within
+from robotdiffuse.core.bounds import LARGEST, for_kernels, within
 from robotdiffuse.core.errors import InputError, joined
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
@@ -272,7 +272,7 @@ class Verifier:
         settings = self.settings
         if not len(q) > settings.reversals + 2:
             return None
-        kept = _apart(np.ascontiguousarray(q, np.float64), settings.reversal_step)
+        kept = _apart(for_kernels(q), settings.reversal_step)
         steps = np.diff(q[kept], axis=0)
         steps /= np.linalg.norm(steps, axis=1, keepdims=True)
         cosines = (steps[1:] * steps[:-1]).sum(axis=1)

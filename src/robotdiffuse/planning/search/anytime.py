@@ -11,6 +11,7 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
 from robotdiffuse.collision.motions import finer
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, Positive, Settings
 from robotdiffuse.core.types import FIRST, SHORT, Tree
@@ -176,7 +177,7 @@ class AnytimeSearch:
 
     def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
         """Take a path between the ends that is free in `space`, simplified, if it is the shortest so far."""
-        path = np.ascontiguousarray(path, np.float32)
+        path = for_kernels(path, np.float32)
         settings = self.settings
         path = simplify(self.space, path, settings.smoothings)
         length = path_length(path)

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.optimize import linprog
 
+from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 from robotdiffuse.robots.fitting.convex_parts import planes_of
@@ -304,8 +305,8 @@ class Links:
 
     def sphere_distance(self, poses: dict[str, ndarray], a: str, b: str) -> Float[ndarray, "n"]:
         """Signed distance between the covering spheres of two links [m]: at most that of their meshes."""
-        spheres = self.robot.spheres
-        return -deepest_touches(poses[a], poses[b], spheres[a], spheres[b], NEAR, -np.inf)[0]
+        first, second = (for_kernels(self.robot.spheres[link]) for link in (a, b))
+        return -deepest_touches(poses[a], poses[b], first, second, NEAR, -np.inf)[0]
 
     def collide(self, poses: dict[str, ndarray], a: str, b: str, i: int) -> bool:
         """Whether the meshes of two links collide in configuration i."""
