@@ -1,9 +1,9 @@
-"""The kind `socket` of fuzz.py: damaged requests to a running `robotdiffuse serve`, over its socket.
+"""The kind `socket`: damaged requests to a running `robotdiffuse serve`, over its socket.
 
-Each is answered with 2xx, 4xx or 503, errors with one line of JSON, or the connection is closed where a
-request was never whole, within a limit. In between a good request must have the answer that it had at first,
-and the server the memory that it had, and no requests or connections left over. It waits shorter than the
-product for what clients send, so that inputs do not take as long.
+The server must answer each with 2xx, 4xx or 503, errors as one line of JSON, or close the connection if a
+request was never complete, within LIMIT. Now and then a good request must get the answer that it got at
+first, and the server may hold no more memory than before, and no requests or connections. This server waits
+for clients for less time than `robotdiffuse serve` does, so that inputs take less time.
 """
 
 import atexit
@@ -23,18 +23,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-SENDING = 0.5
-"""For a client to send a request, or another one [s]."""
+CLIENT_TIMEOUT = 0.5
+"""The server waits so long for a request, and for the next one of a connection [s]."""
 LIMIT = 12.0
-"""Longest wall time until an answer, or the connection, ends [s]: to send, the time limit, and its grace."""
-STARTING = 60.0
-"""The same for the first ones, which load compiled code [s]."""
-EVERY = 50
-"""Inputs between two checks of the server."""
-GROWTH = 48 * 2**20
-"""Of the server's memory, and its workers', since its first checks [bytes]."""
-SETTLED = 3
-"""Checks until memory is taken for what it stays."""
+"""Most wall time until an answer is there or the connection is closed [s]: sending, the time limit of the
+call, and its grace."""
+START_LIMIT = 60.0
+"""The same for the first requests, which load compiled code [s]."""
+INPUTS_BETWEEN_CHECKS = 50
+"""Of the server itself, on average."""
+MAX_MEMORY_GROWTH = 48 * 2**20
+"""Of the server and its workers since its first checks [bytes]."""
+SETTLING_CHECKS = 3
+"""Checks before memory must stop growing."""
 TOKEN = "open sesame"
 METHODS = [
     *b"GET POST PUT DELETE HEAD OPTIONS TRACE CONNECT PATCH PRI get \0 \xff".split(b" "),
@@ -97,11 +98,11 @@ class Answer(NamedTuple):
 
 
 class WrongError(AssertionError):
-    """What a server may not do."""
+    """The server did what it must not."""
 
 
 def draft(rng: np.random.Generator, what: str, body: bytes, other: bytes) -> Draft:
-    """A whole request, most often to plan or to verify; batches have the other body too."""
+    """A complete request, most often to plan or to verify; batches hold the other body too."""
     which = rng.integers(10)
     if which < 5:
         return Draft(b"POST", b"/" + what.encode(), body)
@@ -165,15 +166,15 @@ def _chunk(rng: np.random.Generator, one: Draft) -> None:
 
 
 class Sent(NamedTuple):
-    """How a request goes out."""
+    """How a request is sent."""
 
     pieces: list[bytes]
     answers: int
-    """That are waited for."""
+    """How many the client waits for."""
     leaves: bool
-    """The client goes without waiting."""
+    """The client closes the connection without waiting."""
     cancels: bytes
-    """The name of the request that another connection cancels meanwhile."""
+    """Name of the request, which another connection cancels meanwhile."""
     head: bool
     """Answers may have no body."""
 
@@ -208,7 +209,7 @@ def sent(rng: np.random.Generator, one: Draft, damaged: Any) -> Sent:
 
 
 def exchange(address: tuple[str, int], sent: Sent) -> str:
-    """The error that the last answer holds; "" for none. Raises WrongError where one is wrong or late."""
+    """The error in the last answer; "" without one. Raises WrongError if an answer is wrong or late."""
     until = time.monotonic() + LIMIT
     with socket.create_connection(address, LIMIT) as client:
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -219,7 +220,7 @@ def exchange(address: tuple[str, int], sent: Sent) -> str:
         except OSError:
             pass  # an answer may have come before all was sent
         if sent.leaves:
-            return "the client went"
+            return "the client closed the connection"
         if sent.cancels:
             cancel = Draft(b"DELETE", b"/requests/" + b"".join(b"%%%02x" % byte for byte in sent.cancels))
             exchange(address, Sent([cancel.written], 1, False, b"", False))
@@ -299,10 +300,10 @@ def _read(client: socket.socket, stream: Any, until: float, head: bool) -> Answe
 
 
 class Server:
-    """`robotdiffuse serve` in a process of its own, which ends with this one."""
+    """`robotdiffuse serve` in a process of its own that ends with this one."""
 
     def __init__(self, plan: dict[str, Any], path: dict[str, Any]) -> None:
-        """`plan`: a good request; `path`: of its problem."""
+        """`plan`: a good request; `path`: a path for its problem."""
         self.log = tempfile.TemporaryFile()  # noqa: SIM115, for as long as the process
         self.process = subprocess.Popen(
             [sys.executable, __file__],
@@ -320,11 +321,11 @@ class Server:
         self.held = self.checks = self.read = 0
         first = {"problem": plan["problem"], "path": path}, {"problem": plan["problem"]}
         for target, body in zip((b"/verify", b"/plan"), first, strict=True):  # to load what is compiled
-            self.answer(Draft(b"POST", target, json.dumps(body).encode()), STARTING)
-        self.expected = json.loads(self.answer(self.good, STARTING))["waypoints"]
+            self.answer(Draft(b"POST", target, json.dumps(body).encode()), START_LIMIT)
+        self.expected = json.loads(self.answer(self.good, START_LIMIT))["waypoints"]
 
     def answer(self, one: Draft, seconds: float = LIMIT) -> bytes:
-        """Of a request that is right."""
+        """Send a good request and return the body of its answer."""
         with socket.create_connection(self.address, seconds) as client:
             client.sendall(one.written)
             answer = _read(client, client.makefile("rb"), time.monotonic() + seconds, False)
@@ -333,7 +334,8 @@ class Server:
         return answer.body
 
     def check(self) -> None:
-        """Alive, right, and no larger than at first."""
+        """Raise WrongError unless the server is alive, answers right and holds no more memory than at
+        first."""
         if self.process.poll() is not None:
             raise WrongError(f"the server ended with {self.process.returncode}")
         if json.loads(self.answer(self.good))["waypoints"] != self.expected:
@@ -355,9 +357,9 @@ class Server:
             raise WrongError(f"the server's log has {written.rstrip().splitlines()[-1]}")
         self.checks += 1
         held = sum(_memory(pid) for pid in (self.process.pid, *_children(self.process.pid)))
-        if self.checks <= SETTLED:
+        if self.checks <= SETTLING_CHECKS:
             self.held = held
-        if held > self.held + GROWTH:
+        if held > self.held + MAX_MEMORY_GROWTH:
             raise WrongError(f"memory grew from {self.held >> 20} to {held >> 20} MB")
 
 
@@ -371,9 +373,9 @@ def _memory(pid: int) -> int:
 
 
 @cache
-def server() -> Server:
-    """Started once, and ended with the process."""
-    from fuzz import JOINTS, PROBLEM
+def running_server() -> Server:
+    """Start it once; it ends with this process."""
+    from helpers.fuzz.examples import JOINTS, PROBLEM
 
     problem = PROBLEM | {"scene": PROBLEM["scene"][:2]}
     path = {"joint_names": JOINTS, "positions": [problem["start"], problem["goal"]["joints"]]}
@@ -383,11 +385,11 @@ def server() -> Server:
 
 
 def main() -> None:
-    """The server: a worker, the shorter time to send, and an end when nobody holds its standard input."""
+    """Serve with one worker and CLIENT_TIMEOUT; exit when standard input closes."""
     from robotdiffuse.cli import main as command
     from robotdiffuse.server import settings
 
-    settings.SENDING = settings.KEPT = SENDING
+    settings.SENDING = settings.KEPT = CLIENT_TIMEOUT
 
     def ended() -> None:
         sys.stdin.read()

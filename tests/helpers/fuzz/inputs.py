@@ -1,325 +1,67 @@
-"""Fuzzing: files that were damaged at random give an answer or a one-line error, in bounded time.
+"""Damaged inputs of seventeen kinds: each must give an answer or a one-line error, in bounded time.
 
-    python benchmarks/fuzz.py [--seconds 600] [--seed 0] [--only problem,urdf]
-
-Prints the report that is kept in benchmarks/results/fuzz.txt. An input is a kind and a seed; `one(kind, seed,
-folder)` does it again. Texts are changed value by value, line by line or byte by byte, all others by bytes.
-Inputs run in a process of their own, which is started anew when one does not end or kills it.
-Run it a minute before where no compiled code is kept yet: compiling counts as slow, and as memory that grows.
+An input is a kind and a seed; `outcome_of(kind, seed, folder)` makes the same one again. Texts are changed
+value by value, line by line or byte by byte, all others by bytes. `campaign` runs as many as there is time
+for.
 """
 
-import argparse
 import copy
 import json
-import multiprocessing
-import os
-import resource
-import shutil
-import tempfile
-import time
 import traceback
-from collections import Counter
 from collections.abc import Callable
 from functools import cache
-from multiprocessing.connection import Connection
 from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
 
-LIMIT = 5.0
-"""Longest processor time of an input [s]; of a request to a server see fuzz_socket.py."""
-PATIENCE = 60.0
-"""Until an input that does not end is given up [s]."""
-MEMORY = 12 * 2**30
-"""Of the process that runs inputs [bytes]."""
-LONGEST = 1000
-"""Characters of a message: names of files and lists of what is known."""
-NASTY: tuple[Any, ...] = (
-    *(
-        None,
-        True,
-        False,
-        0,
-        -1,
-        1,
-        2**31,
-        2**63,
-        10**25,
-        -0.0,
-        0.5,
-        1e-300,
-        1e-9,
-        1e4,
-        1e5,
-        1e20,
-        1e39,
-        1e308,
-    ),
-    *(
-        float("inf"),
-        float("nan"),
-        "",
-        "x",
-        "x" * 5000,
-        "\0",
-        "\ud800",
-        "../..",
-        "/dev/zero",
-        "panda",
-        "a/b.urdf",
-    ),
-    *([], {}, [[]], [[1, 2, 3]], [[1, 2], [3]], {"x": 1}, [None] * 7, [0.0] * 7, [1e200] * 4, [0, 0, 0, 0]),
-    *({"file": "x" * 300}, {"file": "\0.stl"}, {"sphere": None}, [{"a": []}], "2001-13-45", "1_000", "0x"),
+from helpers.fuzz.examples import (
+    CLOUDS,
+    CONSTRAINED,
+    EQUIPPED,
+    HELD,
+    IN_MOTION,
+    JOINTS,
+    LIMITS,
+    MESHES,
+    MOVEIT,
+    MOVING,
+    POSE,
+    PROBLEM,
+    REQUEST,
+    SRDF,
+    URDF,
+    VIEW,
 )
-"""What a value is replaced by."""
-TOKENS = (
-    *(
-        b"[",
-        b"{",
-        b"]" * 3,
-        b"}",
-        b"[" * 3000,
-        b"{a: " * 200,
-        b"- " * 300,
-        b"&a ",
-        b"*a",
-        b"!!int foo",
-        b"!x ",
-    ),
-    *(b"9" * 5000, b"1e400", b"nan", b"-inf", b"\0", b"\xff\xfe", b"'", b'"', b":", b"\n", b"\t", b"%", b"#"),
-    *(
-        b"2001-13-45",
-        b"<<: ",
-        b"|",
-        b"<a>" * 100,
-        b"&lt;",
-        b"<!DOCTYPE a>",
-        b'encoding="utf-7"',
-        b"1e308",
-        b"0",
-    ),
-)
-"""What bytes are replaced by."""
+from helpers.fuzz.mutation import damaged, mutated, nasty, numbers_changed, text_of
+
+MAX_MESSAGE_LENGTH = 1000
+"""Characters of an error message; names of files and lists of known names make some long."""
 
 Make = Callable[[np.random.Generator, FilePath], Callable[[], object]]
+"""Writes the files of an input to a folder and returns the call that reads them."""
 
 
 def outcome(call: Callable[[], object]) -> tuple[str, str]:
-    """answer, error or fault; and what was said."""
+    """`answer`, `error` or `fault`, and the error message."""
     from robotdiffuse.core.errors import InputError
 
     try:
         call()
     except InputError as error:
         text = str(error)
-        good = text and "\n" not in text and len(text) <= LONGEST
-        return ("error" if good else "fault"), text[: 2 * LONGEST]
+        good = text and "\n" not in text and len(text) <= MAX_MESSAGE_LENGTH
+        return ("error" if good else "fault"), text[: 2 * MAX_MESSAGE_LENGTH]
     except BaseException as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         return "fault", f"{type(error).__name__}: {str(error)[:200]} ({place.filename}:{place.lineno})"
     return "answer", ""
 
 
-def one(kind: str, seed: int, folder: FilePath) -> tuple[str, str]:
-    """The outcome of an input; its files are written to the folder."""
+def outcome_of(kind: str, seed: int, folder: FilePath) -> tuple[str, str]:
+    """Make an input, whose files are written to the folder, and return its outcome."""
     rng = np.random.default_rng([seed, *kind.encode()])
     return outcome(KINDS[kind](rng, folder))
-
-
-def mutated(rng: np.random.Generator, value: Any) -> Any:
-    """Plain data with one to three of its values, keys or rows changed."""
-    value = json.loads(json.dumps(value))
-    for _ in range(rng.integers(1, 4)):
-        places = list(_places(value))
-        if not places:
-            return _nasty(rng)
-        owner, key = places[rng.integers(len(places))]
-        action = rng.integers(9)
-        if action < 3:
-            owner[key] = _nasty(rng)
-        elif action == 3:
-            del owner[key]
-        elif action == 4 and isinstance(owner, dict):
-            owner[str(_nasty(rng))[:100]] = owner.pop(key)
-        elif isinstance(owner, list):
-            owner.insert(key, owner[key])
-        elif isinstance(owner[key], int | float):
-            by = rng.normal(scale=0.1) if rng.random() < 0.7 else rng.uniform(-30, 30)
-            owner[key] *= float(10.0**by)
-    return value
-
-
-def _places(value: Any) -> Any:
-    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for key, inner in list(items):
-        yield value, key
-        yield from _places(inner)
-
-
-def _nasty(rng: np.random.Generator) -> Any:
-    return copy.deepcopy(NASTY[rng.integers(len(NASTY))])
-
-
-def damaged(rng: np.random.Generator, content: bytes) -> bytes:
-    """Bytes with one to four changes: flipped, cut, doubled, or replaced by a token."""
-    for _ in range(rng.integers(1, 5)):
-        at, action = int(rng.integers(len(content) + 1)), rng.integers(5)
-        size = int(rng.integers(1, 30))
-        token = TOKENS[rng.integers(len(TOKENS))]
-        if action == 0:
-            content = content[:at] + bytes(rng.integers(0, 256, size, np.uint8)) + content[at + size :]
-        elif action == 1:
-            content = content[:at] + token + content[at + size :]
-        elif action == 2:
-            content = content[:at] + token + content[at:]
-        elif action == 3:
-            content = content[:at] + content[at + int(rng.integers(1, 200)) :]
-        else:
-            content = content[:at] if rng.random() < 0.3 else content[:at] + content[at // 2 :]
-    return content
-
-
-def text_of(rng: np.random.Generator, data: Any, ending: str) -> bytes:
-    """Plain data as JSON or YAML, its values changed, or its bytes."""
-    import yaml
-
-    by_value = rng.random() < 0.6
-    data = mutated(rng, data) if by_value else data
-    if ending in (".yaml", ".yml"):
-        text = yaml.dump(data, Dumper=yaml.SafeDumper, default_flow_style=None, allow_unicode=False)
-    else:
-        text = json.dumps(data)
-    content = text.encode("utf-8", "surrogatepass")
-    return content if by_value else damaged(rng, content)
-
-
-PROBLEM: dict[str, Any] = {
-    "robot": "panda",
-    "locked": {"panda_finger_joint1": 0.04, "panda_finger_joint2": 0.04},
-    "scene": [
-        {"sphere": {"center": [0.5, 0.3, 0.6], "radius": 0.25, "name": "ball"}},
-        {"box": {"center": [0.0, 0.6, 0.4], "size": [0.2, 0.2, 0.2], "wxyz": [1, 0, 0, 0]}},
-        {"cylinder": {"center": [0.4, -0.6, 0.2], "radius": 0.05, "height": 0.4, "wxyz": [1, 0, 0, 0]}},
-        {"capsule": {"center": [0.4, -0.6, 0.9], "radius": 0.05, "height": 0.4}},
-        {"mesh": {"vertices": [[1, 1, 0], [1, 2, 0], [2, 1, 0]], "faces": [[0, 1, 2]], "xyz": [0, 0, 1]}},
-        {"point_cloud": {"points": [[1, 1, 1], [1, 1, 1.1]], "point_radius": 0.01}},
-    ],
-    "start": [0, -0.785, 0, -2.356, 0, 1.571, 0.785],
-    "goal": {"joints": [0.4, -0.785, 0, -2.356, 0, 1.571, 0.785]},
-    "clearance": 0.01,
-}
-POSE = {"frame": "panda_hand", "xyz": [0.5, 0, 0.5], "wxyz": [0, 1, 0, 0]}
-VIEW = {"cloud": [[1, 0, 1], [1, 0.1, 1]], "camera": {"xyz": [0, 0, 1], "wxyz": [0.5, 0.5, 0.5, 0.5]}}
-EQUIPPED: dict[str, Any] = {
-    "base": {"xyz": [0.0, 0.0, 0.7], "wxyz": [1, 0, 0, 0]},
-    "tool": {
-        "link": "panda_hand",
-        "name": "sucker",
-        "xyz": [0, 0, 0.14],
-        "shapes": [{"cylinder": {"center": [0, 0, 0.09], "radius": 0.012, "height": 0.1}}],
-    },
-    "attached": [
-        {"link": "sucker", "box": {"center": [0, 0, 0.06], "size": [0.1, 0.1, 0.1], "name": "parcel"}}
-    ],
-    "goal": {"pose": {"frame": "parcel", "xyz": [0.45, 0.3, 1.0], "wxyz": [0, 1, 0, 0]}},
-    "waypoints": [{"joints": [0.2, -0.785, 0, -2.356, 0, 1.571, 0.785]}],
-}
-CONSTRAINED: dict[str, Any] = {
-    "constraints": [
-        {"axis_cone": {"frame": "panda_hand", "axis": [0, 0, 1], "direction": [0, 0, -1], "angle": 0.17}},
-        {"position_box": {"frame": "panda_hand", "low": [0, -1, 0], "high": [1, 1, 1], "xyz": [0, 0, 0.1]}},
-        {"on_plane": {"frame": "panda_hand", "point": [0, 0, 0.4], "normal": [0, 0, 1], "tolerance": 0.1}},
-        {"on_line": {"frame": "panda_hand", "point": [0.5, 0, 0.4], "direction": [0, 1, 0], "tolerance": 1}},
-        {"cartesian_line": {"frame": "panda_hand", "tolerance": 0.1, "angle": 0.5, "speed": 0.1}},
-    ],
-    "goal": {"pose": POSE | {"xyz_tolerance": [0.1, 0.1, 0], "rpy_tolerance": [0, 0, 3.1]}},
-}
-MOVING: dict[str, Any] = {
-    "moving": [
-        {"sphere": {"center": [0.5, -0.6, 0.5], "radius": 0.1}, "velocity": [0, 0.3, 0]},
-        {
-            "box": {"center": [0.6, 0, 0.3], "size": [0.2, 0.2, 0.2]},
-            "times": [0, 2],
-            "poses": [{"xyz": [0.6, 0, 0.3]}, {"xyz": [0.6, 1, 0.3], "wxyz": [1, 0, 0, 0]}],
-        },
-        {"sphere": {"center": [0.5, 0.6, 0.5], "radius": 0.1, "name": "hand"}, "max_speed": 0.5},
-    ],
-}
-IN_MOTION: dict[str, Any] = {"start_velocity": [0.1, 0, 0, 0, 0, 0, 0]}
-MOVEIT = {
-    "name": "",
-    "robot_model_name": "panda",
-    "fixed_frame_transforms": [
-        {
-            "header": {"frame_id": "world"},
-            "child_frame_id": "table",
-            "transform": {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1]},
-        }
-    ],
-    "world": {
-        "collision_objects": [
-            {
-                "header": {"frame_id": "world"},
-                "id": "Can",
-                "primitives": [
-                    {"type": "cylinder", "dimensions": [0.2, 0.03]},
-                    {"type": 1, "dimensions": [1, 1, 1]},
-                ],
-                "primitive_poses": [{"position": [1, 1, 1], "orientation": [0, 0, 0, 1]}] * 2,
-                "meshes": [{"vertices": [[1, 1, 0], [1, 2, 0], [2, 1, 0]], "triangles": [[0, 1, 2]]}],
-                "mesh_poses": [{"position": {"x": 0, "y": 0, "z": 0}, "orientation": [0, 0, 0, 1]}],
-            }
-        ]
-    },
-}
-JOINTS = [f"panda_joint{i}" for i in range(1, 8)]
-HELD = {
-    "link_name": "panda_hand",
-    "touch_links": ["panda_leftfinger"],
-    "object": {
-        "header": {"frame_id": "panda_hand"},
-        "id": "cup",
-        "primitives": [{"type": 3, "dimensions": [0.2, 0.03]}],
-        "primitive_poses": [{"position": [0, 0, 0.15], "orientation": [0, 0, 0, 1]}],
-    },
-}
-REQUEST: dict[str, Any] = {
-    "start_state": {"joint_state": {"name": JOINTS, "position": PROBLEM["start"]}},
-    "goal_constraints": [
-        {
-            "joint_constraints": [
-                {"joint_name": n, "position": p} for n, p in zip(JOINTS, PROBLEM["start"], strict=True)
-            ]
-        }
-    ],
-}
-URDF = b"""<?xml version="1.0"?>
-<robot name="two">
-<link name="base"><collision><origin xyz="0 0 0" rpy="0 0 0"/>
-<geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
-<link name="upper"><collision><geometry><cylinder radius="0.03" length="0.3"/></geometry></collision></link>
-<link name="lower"><collision><geometry><mesh filename="part.stl" scale="1 1 1"/></geometry>
-</collision></link>
-<link name="finger"><visual><geometry><sphere radius="0.01"/></geometry></visual></link>
-<joint name="shoulder" type="revolute"><parent link="base"/><child link="upper"/>
-<origin xyz="0 0 0.1" rpy="0 0 0"/><axis xyz="0 0 1"/><limit lower="-2" upper="2" velocity="1"/></joint>
-<joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
-<axis xyz="0 1 0"/><limit velocity="1"/></joint>
-<joint name="grip" type="prismatic"><parent link="lower"/><child link="finger"/>
-<limit lower="0" upper="0.1" velocity="1"/><mimic joint="elbow" multiplier="0.5" offset="0"/></joint>
-</robot>"""
-SRDF = b"""<robot name="two">
-<group name="arm"><chain base_link="base" tip_link="lower"/><group name="other"/></group>
-<group name="other"><joint name="grip"/></group>
-<group_state name="home" group="arm"><joint name="elbow" value="0.3"/></group_state>
-<passive_joint name="grip"/><disable_collisions link1="base" link2="upper" reason="Adjacent"/>
-</robot>"""
-LIMITS = {
-    "joint_limits": {"shoulder": {"max_velocity": 2.0, "max_acceleration": 3.0, "has_jerk_limits": False}}
-}
-MESHES = ("stl", "obj", "ply", "off", "glb", "dae")
-CLOUDS = ("ply", "pcd", "xyz", "csv", "npy", "npz")
 
 
 def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
@@ -337,7 +79,7 @@ def _problem(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]
 
 
 def _validated(file: FilePath) -> None:
-    """A problem that is read is validated: its straight line, if it has a goal configuration."""
+    """Read a problem and, if its goal is a configuration, validate the straight line to it."""
     from robotdiffuse.core.types import Path
     from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record
     from robotdiffuse.problems.problem import JointGoal
@@ -448,19 +190,6 @@ def _urdf(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     return read
 
 
-def numbers_changed(rng: np.random.Generator, content: bytes) -> bytes:
-    """XML with bytes damaged or with attributes replaced."""
-    import re
-
-    if rng.random() < 0.4:
-        return damaged(rng, content)
-    values = list(re.finditer(rb'"[^"]*"', content))
-    for match in [values[i] for i in rng.integers(len(values), size=rng.integers(1, 3))]:
-        new = str(_nasty(rng)).encode("utf-8", "surrogatepass")
-        content = content.replace(match.group(), b'"' + new.replace(b'"', b"'").replace(b"<", b"") + b'"', 1)
-    return content
-
-
 def _result(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     from robotdiffuse.core.results import load_result
     from robotdiffuse.problems.files import problem_from_record
@@ -530,7 +259,7 @@ def _bundle(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
-    """What a request over HTTP is for, and its body; as often as `right` says it is not damaged."""
+    """The endpoint of a request over HTTP, and its body; with probability `right` it is not damaged."""
     rows = np.linspace(PROBLEM["start"], PROBLEM["goal"]["joints"], 3).tolist()
     problem = (
         PROBLEM | {"scene": PROBLEM["scene"][: rng.integers(7)]} | (EQUIPPED if rng.random() < 0.1 else {})
@@ -552,7 +281,7 @@ def asked(rng: np.random.Generator, right: float = 0.0) -> tuple[str, bytes]:
 
 
 def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """Bodies of requests, read and answered as a worker of `robotdiffuse serve` does."""
+    """Request bodies, answered as a worker of `robotdiffuse serve` answers them."""
     from robotdiffuse.core.errors import InputError
     from robotdiffuse.robots import load_robot
     from robotdiffuse.server import worker
@@ -570,20 +299,19 @@ def _http(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _socket(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """Requests to a running `robotdiffuse serve`; the server itself is checked now and then."""
-    import fuzz_socket
-
+    """Requests to a running `robotdiffuse serve`, which is itself checked now and then."""
+    from helpers.fuzz import server
     from robotdiffuse.core.errors import InputError
 
     (what, body), (_, other) = asked(rng, 0.5), asked(rng, 0.5)
-    sent = fuzz_socket.sent(rng, fuzz_socket.draft(rng, what, body, other), damaged)
-    looks = rng.random() < 1 / fuzz_socket.EVERY
+    sent = server.sent(rng, server.draft(rng, what, body, other), damaged)
+    looks = rng.random() < 1 / server.INPUTS_BETWEEN_CHECKS
 
     def ask() -> None:
-        server = fuzz_socket.server()
-        said = fuzz_socket.exchange(server.address, sent)
+        running = server.running_server()
+        said = server.exchange(running.address, sent)
         if looks:
-            server.check()
+            running.check()
         if said:
             raise InputError(said)
 
@@ -693,7 +421,7 @@ def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """Heads of requests, at the door of the live page: handed on or not, never an error."""
+    """Heads of requests to the live page, which admits them or not and never raises."""
     from robotdiffuse.visualization.live.access import admitted
 
     token = ("", "abc")[rng.integers(2)]
@@ -704,7 +432,7 @@ def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """What --set says of planners, and settings of trainings."""
+    """Values of `--set` for planners, and settings of training runs."""
     from robotdiffuse.learning.training.config import PlannerTraining
     from robotdiffuse.planning import PLANNERS, planner_settings
 
@@ -714,7 +442,7 @@ def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object
     names = [*PLANNERS]
     name = names[rng.integers(len(names))]
     fields = ("range", "guidance.margin", "search.iterations", "samples", "weights", "", "a.b.c")
-    value = str(_nasty(rng))
+    value = str(nasty(rng))
     said = f"{fields[rng.integers(len(fields))]}={value}" if rng.random() < 0.8 else value
     return lambda: planner_settings(name, [said])
 
@@ -771,77 +499,3 @@ KINDS: dict[str, Make] = {
     "weights": _weights,
     "npz": _npz,
 }
-
-
-def _work(pipe: Connection, seed: int, count: int, kinds: tuple[str, ...]) -> None:
-    """Inputs from a seed on, kinds in turn, one message each."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    quiet = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(quiet, 2)
-    with tempfile.TemporaryDirectory() as folder:
-        for i in range(seed, seed + count):
-            kind = kinds[i % len(kinds)]
-            clock = time.monotonic if kind == "socket" else time.process_time
-            begun = clock()
-            inner = FilePath(folder) / str(i)
-            inner.mkdir()
-            pipe.send((*one(kind, i, inner), clock() - begun))
-            shutil.rmtree(inner)
-
-
-def run(seconds: float, seed: int, kinds: tuple[str, ...]) -> tuple[Counter, list[str], dict[str, float]]:
-    """Numbers by kind and outcome, faults, and the longest times, of as many inputs as there is time for."""
-    counts: Counter[tuple[str, str]] = Counter()
-    faults: list[str] = []
-    slowest = dict.fromkeys(kinds, 0.0)
-    context, until, number = multiprocessing.get_context("spawn"), time.monotonic() + seconds, seed
-    while time.monotonic() < until:
-        ours, theirs = context.Pipe()
-        worker = context.Process(target=_work, args=(theirs, number, 10**9, kinds), daemon=True)
-        worker.start()
-        theirs.close()
-        ended, first = False, True
-        while not ended and time.monotonic() < until:
-            kind, took = kinds[number % len(kinds)], 0.0
-            try:
-                ended = not ours.poll(PATIENCE)
-                result, said, took = ("fault", "it does not end", PATIENCE) if ended else ours.recv()
-            except EOFError:
-                worker.join()
-                ended, result, said = True, "fault", f"the process ended with {worker.exitcode}"
-            took = 0.0 if first else took  # which loads compiled code
-            if took > LIMIT and kind != "socket":
-                result, said = "fault", f"{took:.1f} s"
-            counts[kind, result] += 1
-            slowest[kind] = max(slowest[kind], took)
-            if result == "fault":
-                faults.append(f"{kind} {number}: {said}")
-            number, first = number + 1, False
-        worker.kill()
-        worker.join()
-    return counts, faults, slowest
-
-
-def main() -> None:
-    from report import header, print_table
-
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=600)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default=",".join(KINDS))
-    arguments = parser.parse_args()
-    kinds = tuple(arguments.only.split(","))
-    counts, faults, slowest = run(arguments.seconds, arguments.seed, kinds)
-    rows = []
-    for kind in kinds:
-        found = [counts[kind, what] for what in ("answer", "error", "fault")]
-        rows.append([kind, f"{sum(found):,}", *(f"{n:,}" for n in found), f"{slowest[kind]:.2f}"])
-    print(header("numpy", "trimesh", "coal"), "\n")
-    columns = ["kind", "inputs", "answers", "one-line errors", "anything else", "slowest, s"]
-    print_table(f"{counts.total():,} damaged inputs, from seed {arguments.seed}", columns, rows)
-    for fault in faults[:200]:
-        print(fault)
-
-
-if __name__ == "__main__":
-    main()
