@@ -1,10 +1,11 @@
-"""Compiled code from a cold and from a warm cache, and loaded in another order: are the bits the same?
+"""Compiled code from a cold cache, from a warm one, and loaded in another order: whether results are the same
+bits.
 
-    python benchmarks/cold_cache.py [--seed 0] [--only clearances,gradients]
+    python benchmarks/startup.py [--seed 0] [--only clearances,gradients]
 
-Prints the report that is kept in benchmarks/results/cold_cache.txt. Each part is called in a process of its
-own interpreter: first with an empty cache, which compiles; then twice with what that left, in the same order
-and in the other. Every number of what a part returns is compared.
+Prints benchmarks/results/cold_cache.txt. Each part runs in a process of its own: first with an empty cache,
+which compiles; then twice with the cache that this left, in the same order and in reverse. Every number that
+a part returns is compared.
 """
 
 import argparse
@@ -20,11 +21,11 @@ from numpy import ndarray
 
 RUNS = ("cold", "warm", "warm, in the other order")
 ROWS = 2000
-"""Configurations of which each part is told."""
+"""Configurations that each part gets."""
 
 
 def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
-    """What is called, by name: numbers that compiled code returns."""
+    """Calls of compiled code that return numbers, by name."""
     import robotdiffuse as rd
     from robotdiffuse.collision.batched_clearances import (
         packed_clearances_and_gradients,
@@ -89,7 +90,7 @@ def parts(seed: int) -> dict[str, Callable[[], ndarray]]:
 
 
 def work(file: str, seed: int, names: list[str]) -> None:
-    """Call the parts in this order and keep what they return."""
+    """Call the parts in this order and save what they return."""
     from robotdiffuse.collision.kernels.compiled import compile_seconds
 
     known = parts(seed)
@@ -98,14 +99,15 @@ def work(file: str, seed: int, names: list[str]) -> None:
 
 
 def main() -> None:
-    from report import header, print_table
+    from common import header, parse, parts_of, print_table
 
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default=",".join(parts(0)))
+    known = parts(0)
+    parser = argparse.ArgumentParser(description="The same bits from a cold and from a warm cache.")
+    parser.add_argument("--seed", type=int, default=0, help="(0)")
+    parser.add_argument("--only", default=",".join(known), help="some of the parts (all)")
     parser.add_argument("--work", help=argparse.SUPPRESS)
-    arguments = parser.parse_args()
-    names = arguments.only.split(",")
+    arguments = parse(parser, only="pairs of links")
+    names = parts_of(arguments.only, known)
     if arguments.work:
         work(arguments.work, arguments.seed, names)
         return

@@ -1,13 +1,13 @@
-"""Obstacles that cross an arm's way: the reactive loop, on one core, validated by PyBullet.
+"""Moving obstacles: the reactive loop of `Replanner` among balls that cross its workspace, checked by
+PyBullet.
 
-    python benchmarks/moving.py [--runs 100] [--lattice-runs 5]
+    python benchmarks/moving_obstacles.py [--runs 100] [--lattice-runs 5]
 
-Prints the report that is kept in benchmarks/results/moving.txt. A Panda goes from one side to the other
-while balls of 10 cm radius fly through its workspace on straight lines, each at 50 to 100 % of the greatest
-speed that the loop is told (0.4 m/s), turning round twice. None comes near the shoulder, which cannot give
-way. Runs count where a way is known to exist: `plan`, told where the balls will be, finds a certified
-motion from start to goal. The loop is told only where they are, every 20 ms. PyBullet looks at the meshes
-every 5 ms.
+Prints benchmarks/results/moving.txt. A Panda goes from one side to the other while balls of 10 cm radius fly
+through its workspace on straight lines, each at 50 to 100 % of the speed that the loop assumes at most (0.4
+m/s), turning round twice. None comes near the shoulder, which cannot move out of the way. Runs count if a way
+is known to exist: `plan`, given the balls' trajectories, finds a certified motion from start to goal. The
+loop knows only where the balls are, every 20 ms. PyBullet checks the meshes every 5 ms.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from report import header, print_table, progress
+from common import FIRST, header, parse, print_table, progress
 
 import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
@@ -29,16 +29,16 @@ from robotdiffuse.simulation.validator import PyBulletOracle
 SPEED, RADIUS = 0.4, 0.1
 START, GOAL = [-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8], [1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]
 FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
-PERIOD, LOOK, LONGEST = 0.02, 0.005, 30.0
-"""Of the loop, and between two looks of PyBullet; runs end after this [s]."""
-AWAY, APART = 0.45, 0.2
-"""From the axis of the base, and from the arm at its start [m]."""
-PATIENCE = 1.0
+PERIOD, CHECK_PERIOD, RUN_LIMIT = 0.02, 0.005, 30.0
+"""Of the loop, and of PyBullet's checks; runs end after the last [s]."""
+BASE_DISTANCE, START_DISTANCE = 0.45, 0.2
+"""Least distance of balls from the axis of the base, and from the arm at its start [m]."""
+LATTICE_LIMIT = 1.0
 """For a search of D* Lite [s]."""
 
 
 def scene(robot: Robot, count: int, seed: int) -> tuple[rd.MovingObstacle, ...]:
-    """Balls with their trajectories, which the loop does not know."""
+    """Balls with their trajectories."""
     rng = np.random.default_rng(seed)
     checker = CollisionChecker(robot, rd.Scene())
     balls: list[rd.MovingObstacle] = []
@@ -48,7 +48,7 @@ def scene(robot: Robot, count: int, seed: int) -> tuple[rd.MovingObstacle, ...]:
         way = rng.normal(size=3) * [1, 1, 0.3]
         way /= np.linalg.norm(way)
         flat = way[:2] / np.linalg.norm(way[:2])
-        if np.linalg.norm(through[:2] - flat * (through[:2] @ flat)) < AWAY:
+        if np.linalg.norm(through[:2] - flat * (through[:2] @ flat)) < BASE_DISTANCE:
             continue
         speed, before = SPEED * rng.uniform(0.5, 1.0), rng.uniform(0.8, 3.5)
         ends = [through - speed * before * way, through + speed * rng.uniform(2.0, 4.0) * way]
@@ -58,32 +58,33 @@ def scene(robot: Robot, count: int, seed: int) -> tuple[rd.MovingObstacle, ...]:
             rd.Sphere(ends[0], RADIUS), times=times, poses=[transform(place) for place in places]
         )
         near = CollisionChecker(robot, rd.Scene([rd.Sphere(ends[0], RADIUS)]))
-        if near.link_clearances(np.array([START])).min() > APART and checker.free(np.array([START])).all():
+        q = np.array([START])
+        if near.link_clearances(q).min() > START_DISTANCE and checker.free(q).all():
             balls.append(ball)
     return tuple(balls)
 
 
-def known(robot: Robot, balls: tuple[rd.MovingObstacle, ...]) -> rd.Problem:
-    """The problem with all that will happen."""
+def problem_of(robot: Robot, balls: tuple[rd.MovingObstacle, ...]) -> rd.Problem:
+    """The problem with the trajectories of the balls."""
     return rd.Problem(robot, rd.Scene([FLOOR]), START, GOAL, moving=balls)
 
 
 @dataclass
 class Run:
-    """What became of one."""
+    """The outcome of a run."""
 
     arrived: bool = False
     took: float = 0.0
     """[s] until the arm rests at the goal."""
     moving: bool = False
-    """Whether it touched anything while it moved, ..."""
+    """Whether the arm touched anything while it moved."""
     resting: bool = False
-    """... and while it rested."""
+    """Whether it touched anything while it rested."""
     steps: list[float] = field(default_factory=list)
-    """CPU time of each step but the first, which looks for nothing yet [ms]."""
+    """CPU time of each step but the first, which does not search yet [ms]."""
 
 
-def validated(
+def check(
     run: Run,
     oracle: PyBulletOracle,
     balls: tuple[rd.MovingObstacle, ...],
@@ -91,30 +92,30 @@ def validated(
     at: float,
     moves: bool,
 ) -> None:
-    """Look at one moment."""
+    """Note contacts at one moment."""
     oracle.set_scene(rd.Scene([FLOOR, *(ball.at(at) for ball in balls)]))
     if oracle.check_frames(q[None]) is not None:
         run.moving, run.resting = run.moving or moves, run.resting or not moves
 
 
 def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOracle, int], Run]:
-    """A run of the loop."""
+    """A function that runs the loop."""
 
     def go(problem: rd.Problem, oracle: PyBulletOracle, seed: int) -> Run:
         run, balls = Run(), problem.moving
-        told = tuple(rd.MovingObstacle(ball.shape, max_speed=SPEED) for ball in balls)
-        loop = rd.Replanner(replace(problem, moving=told), settings, seed)
+        tracked = tuple(rd.MovingObstacle(ball.shape, max_speed=SPEED) for ball in balls)
+        loop = rd.Replanner(replace(problem, moving=tracked), settings, seed)
         doing = None
-        for k in range(int(LONGEST / PERIOD)):
+        for k in range(int(RUN_LIMIT / PERIOD)):
             now = k * PERIOD
             began = time.process_time()
             command = loop.step({ball.name: ball.pose(now) for ball in balls}, now)
             if k:
                 run.steps.append(1e3 * (time.process_time() - began))
             if doing is not None:
-                for at in np.arange(now, now + PERIOD - 1e-9, LOOK):
+                for at in np.arange(now, now + PERIOD - 1e-9, CHECK_PERIOD):
                     q, moves = followed(doing.motion, at - doing.begins)
-                    validated(run, oracle, balls, q, at, moves)
+                    check(run, oracle, balls, q, at, moves)
             doing = command
             if command.arrived:
                 run.arrived, run.took = True, command.begins
@@ -125,19 +126,19 @@ def looped(settings: rd.ReplannerSettings) -> Callable[[rd.Problem, PyBulletOrac
 
 
 def played(problem: rd.Problem, oracle: PyBulletOracle, seed: int) -> Run:
-    """A motion that is planned at once, as if nothing moved, and played."""
+    """Plan as if nothing moved, and play the motion."""
     run, still = Run(), replace(problem, moving=())
-    trajectory = rd.load_planner("rrt_connect").plan(still, 5.0, seed, until="first").trajectory
+    trajectory = rd.load_planner("rrt_connect").plan(still, 5.0, seed, until=FIRST).trajectory
     assert trajectory is not None
-    for at in np.arange(0.0, trajectory.duration, LOOK):
+    for at in np.arange(0.0, trajectory.duration, CHECK_PERIOD):
         q, moves = followed(trajectory, at)
-        validated(run, oracle, problem.moving, q, at, moves)
+        check(run, oracle, problem.moving, q, at, moves)
     run.arrived, run.took = True, trajectory.duration
     return run
 
 
 def followed(motion: rd.Trajectory, time: float) -> tuple[np.ndarray, bool]:
-    """Where a motion is, and whether it moves there."""
+    """The configuration of a motion at a time, and whether the arm moves then."""
     time = max(time, 0.0)
     q = np.array([np.interp(time, motion.times, column) for column in motion.positions.T])
     i = min(int(np.searchsorted(motion.times, time, side="right")), len(motion.times) - 1)
@@ -145,12 +146,12 @@ def followed(motion: rd.Trajectory, time: float) -> tuple[np.ndarray, bool]:
 
 
 def late(until: float) -> bool:
-    """Whether so much CPU time is spent."""
+    """Whether this much CPU time has been spent."""
     return time.process_time() > until
 
 
 def repairs(robot: Robot, runs: int) -> Iterator[float]:
-    """CPU time of repairs of D* Lite after one ball has moved for a period [ms]; PATIENCE where it is out."""
+    """CPU times of repairs of D* Lite after one ball has moved for a period, at most LATTICE_LIMIT [ms]."""
     for seed in range(runs):
         [ball] = scene(robot, 1, seed)
         way = np.arange(0.0, ball.track[0][1], PERIOD)
@@ -159,7 +160,7 @@ def repairs(robot: Robot, runs: int) -> Iterator[float]:
         for checker in checkers[:: max(len(way) // 20, 1)]:
             began = time.process_time()
             search.update(checker)
-            search.run(partial(late, began + PATIENCE))
+            search.run(partial(late, began + LATTICE_LIMIT))
             yield 1e3 * (time.process_time() - began)
 
 
@@ -186,7 +187,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=100, help="for each number of balls (100)")
     parser.add_argument("--lattice-runs", type=int, default=5, help="of D* Lite, with one ball (5)")
     parser.add_argument("--balls", type=int, nargs="*", default=[1, 3, 5], help="(1 3 5)")
-    arguments = parser.parse_args()
+    arguments = parse(parser, runs=1, lattice_runs=1, balls=[1])
     print(header("numba", "numpy", "pybullet"))
     robot, planner = rd.load_robot("panda"), rd.load_planner("rrt_connect")
     methods = {
@@ -194,14 +195,13 @@ def main() -> None:
         "searching from scratch": looped(rd.ReplannerSettings(from_scratch=True)),
         "played blindly": played,
     }
-    looped(rd.ReplannerSettings())(known(robot, scene(robot, 3, 10**6)), PyBulletOracle(robot, rd.Scene()), 0)
+    compiling = problem_of(robot, scene(robot, 3, 10**6))
+    methods["the loop"](compiling, PyBulletOracle(robot, rd.Scene()), 0)
     rows, notes = [], []
     with PyBulletOracle(robot, rd.Scene()) as oracle:
         for count in arguments.balls:
-            every = [known(robot, scene(robot, count, seed)) for seed in range(arguments.runs)]
-            ways = [
-                planner.plan(problem, 5.0, until="first") for problem in progress(every, f"{count} balls")
-            ]
+            every = [problem_of(robot, scene(robot, count, seed)) for seed in range(arguments.runs)]
+            ways = [planner.plan(problem, 5.0, until=FIRST) for problem in progress(every, f"{count} balls")]
             kept = [
                 (seed, problem) for seed, problem in enumerate(every) if ways[seed].trajectory is not None
             ]
@@ -229,14 +229,12 @@ def main() -> None:
     lattice = list(repairs(robot, arguments.lattice_runs))
     if lattice:
         p50, p99 = np.percentile(lattice, (50, 99))
-        out = np.mean([ms >= 1e3 * PATIENCE for ms in lattice])
+        out = np.mean([ms >= 1e3 * LATTICE_LIMIT for ms in lattice])
         print(
             f"D* Lite on its lattice, one ball: {p50:.1f} ms for a repair (median), p99 {p99:.0f} ms, "
-            f"{100 * out:.0f} % not done in {PATIENCE:g} s, {len(lattice)} repairs."
+            f"{100 * out:.0f} % not done in {LATTICE_LIMIT:g} s, {len(lattice)} repairs."
         )
-    print(
-        "ms: CPU time of a step, which includes search, certificate and what goes on. Time to goal: median."
-    )
+    print("ms: CPU time of a step, search and certificate included. Time to goal: median.")
 
 
 if __name__ == "__main__":

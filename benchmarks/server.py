@@ -1,12 +1,12 @@
-"""A server under load: nothing lost, nothing mixed up, memory flat, throughput beside the bare planner.
+"""A server under load: answers lost or mixed up, memory, and throughput beside the planner alone.
 
-    python benchmarks/serve.py [--seconds 600] [--clients 8] [--workers 1] [--kills 5]
+    python benchmarks/server.py [--seconds 600] [--clients 8] [--workers 1] [--kills 5]
 
-Prints the report that is kept in benchmarks/results/serve.txt. Held-out problems of four families, a quarter
-of them with a box of their own in the hand, each with two seeds, are planned first by the bare planner in
-this process. Clients then ask the server for them at random, and hold every answer against the bare planner's
-path, bit for bit. At last workers are killed while clients ask. With one core more than workers, the workers
-have their cores for themselves; processor times need no quiet machine.
+Prints benchmarks/results/serve.txt. The planner plans held-out problems of four families in this process, a
+quarter of them with a box of their own in the hand, each with two seeds. Then clients ask the server for them
+at random and compare every answer with the planner's path, bit for bit. At last workers are killed while
+clients ask. With one core more than workers, the workers have their cores to themselves; CPU times need no
+quiet machine.
 """
 
 import argparse
@@ -26,23 +26,23 @@ from typing import Any
 
 import httpx
 import numpy as np
-from report import header, print_table
+from common import CONVERGED, header, parse, print_table
 
 import robotdiffuse as rd
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 
 FAMILIES = ("rop", "shelf", "crate", "table")
-PER_FAMILY, SEEDS = 10, (0, 1)
+SEEDS = (0, 1)
 TIME_LIMIT = 10.0
-"""Ample, so that no answer depends on the clock [s]."""
+"""Long enough that no answer depends on the clock [s]."""
 ROUNDS = 3
-"""Of the bare planner, before and after the load."""
+"""Of the planner alone, before and after the load."""
 
 
 @dataclass
 class Asked:
-    """A request, and what the bare planner answers to it."""
+    """A request, and the answer of the planner alone."""
 
     body: bytes
     problem: rd.Problem
@@ -52,7 +52,7 @@ class Asked:
 
 @dataclass
 class Seen:
-    """By the clients."""
+    """What the clients saw."""
 
     answers: Counter = field(default_factory=Counter)
     wrong: int = 0
@@ -60,9 +60,10 @@ class Seen:
     seconds: list[float] = field(default_factory=list)
 
 
-def requests(planner: str) -> list[Asked]:
+def requests(planner: str, count: int) -> list[Asked]:
+    """Requests for `count` problems of each family."""
     asked, rng = [], np.random.default_rng(SEED)
-    for number in range(PER_FAMILY):
+    for number in range(count):
         for family in FAMILIES:
             record: dict[str, Any] = problem_record(held_out_problem(family, number))
             if number % 4 == 0:
@@ -75,13 +76,13 @@ def requests(planner: str) -> list[Asked]:
 
 
 def bare(asked: list[Asked], planner: str) -> tuple[float, float]:
-    """Wall and processor time of the bare planner for all requests [s]; notes what it answers."""
+    """Wall and CPU time of the planner alone for all requests [s]; keeps its answers in these."""
     loaded = rd.load_planner(planner)
-    loaded.warm_up(asked[0].problem, "short")
+    loaded.warm_up(asked[0].problem, CONVERGED)
     for one in asked:
         result = loaded.plan(one.problem, TIME_LIMIT, one.seed)
         waypoints = None if result.path is None else result.path.positions.tolist()
-        assert one.expected is None or one.expected == waypoints, "the bare planner contradicts itself"
+        assert one.expected is None or one.expected == waypoints, "the planner contradicts itself"
         one.expected = waypoints
     wall, spent = time.perf_counter(), time.process_time()
     for _ in range(ROUNDS):
@@ -90,7 +91,9 @@ def bare(asked: list[Asked], planner: str) -> tuple[float, float]:
     return (time.perf_counter() - wall) / ROUNDS, (time.process_time() - spent) / ROUNDS
 
 
-def client(url: str, asked: list[Asked], seed: int, until: float, seen: Seen, lock: threading.Lock) -> None:
+def run_client(
+    url: str, asked: list[Asked], seed: int, until: float, seen: Seen, lock: threading.Lock
+) -> None:
     import orjson
 
     rng, kind = random.Random(seed), {"Content-Type": "application/json"}
@@ -112,10 +115,10 @@ def client(url: str, asked: list[Asked], seed: int, until: float, seen: Seen, lo
 
 
 def load(url: str, asked: list[Asked], clients: int, seconds: float, meanwhile: Any) -> Seen:
-    """What clients see in this time; `meanwhile` is called once a second with the seconds since."""
+    """What clients see in this time; `meanwhile` is called every second with the seconds since the start."""
     seen, lock, begun = Seen(), threading.Lock(), time.monotonic()
     threads = [
-        threading.Thread(target=client, args=(url, asked, i, begun + seconds, seen, lock))
+        threading.Thread(target=run_client, args=(url, asked, i, begun + seconds, seen, lock))
         for i in range(clients)
     ]
     for thread in threads:
@@ -126,8 +129,8 @@ def load(url: str, asked: list[Asked], clients: int, seconds: float, meanwhile: 
     return seen
 
 
-def memory(process: int) -> float:
-    """That it alone holds [MB]."""
+def private_memory(process: int) -> float:
+    """Private memory of a process [MB]."""
     try:
         rows = Path(f"/proc/{process}/smaps_rollup").read_text()
     except (OSError, ValueError):
@@ -135,29 +138,31 @@ def memory(process: int) -> float:
     return sum(int(row.split()[1]) for row in rows.splitlines() if row.startswith("Private")) / 1024
 
 
-def spent(process: int) -> float:
-    """Processor time of a process [s]."""
+def cpu_time(process: int) -> float:
+    """CPU time of a process [s]."""
     fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def workers_of(process: int) -> list[int]:
-    """Those of its children that plan."""
+    """The server's worker processes."""
     found = subprocess.run(["pgrep", "-P", str(process), "-f", "spawn_main"], capture_output=True, text=True)
     return [int(line) for line in found.stdout.split()]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=600.0)
-    parser.add_argument("--clients", type=int, default=8)
-    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1))
-    parser.add_argument("--kills", type=int, default=5)
-    parser.add_argument("--planner", default="robotdiffuse")
-    arguments = parser.parse_args()
+    parser = argparse.ArgumentParser(description="A server under load.")
+    parser.add_argument("--seconds", type=float, default=600.0, help="of load (600)")
+    parser.add_argument("--clients", type=int, default=8, help="(8)")
+    parser.add_argument("--workers", type=int, default=max(1, (os.cpu_count() or 2) - 1), help="(cores - 1)")
+    parser.add_argument("--kills", type=int, default=5, help="of workers (5)")
+    parser.add_argument("--problems", type=int, default=10, help="of each family (10)")
+    parser.add_argument("--planner", default="robotdiffuse", help="(robotdiffuse)")
+    small = {"seconds": 4.0, "clients": 2, "workers": 1, "kills": 1, "problems": 1, "planner": "rrt_connect"}
+    arguments = parse(parser, **small)
     print(header("numpy", "numba", "fastapi", "uvicorn"), "\n")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    asked = requests(arguments.planner)
+    asked = requests(arguments.planner, arguments.problems)
     before = bare(asked, arguments.planner)
     command = ["serve", "--port", "0", "--workers", str(arguments.workers), "--queue", str(arguments.clients)]
     with subprocess.Popen(
@@ -172,13 +177,13 @@ def main() -> None:
         load(url, asked, arguments.clients, min(20.0, arguments.seconds / 4), lambda _: None)
         workers = workers_of(server.pid)
         rows: list[tuple[float, float, float]] = []
-        at_first = {process: spent(process) for process in (server.pid, *workers)}
+        at_first = {process: cpu_time(process) for process in (server.pid, *workers)}
 
         def watch(since: float) -> None:
-            rows.append((since, memory(server.pid), max(map(memory, workers))))
+            rows.append((since, private_memory(server.pid), max(map(private_memory, workers))))
 
         seen = load(url, asked, arguments.clients, arguments.seconds, watch)
-        used = {process: spent(process) - at_first[process] for process in at_first}
+        used = {process: cpu_time(process) - at_first[process] for process in at_first}
         kills: list[float] = []
 
         def kill(since: float) -> None:
@@ -196,13 +201,13 @@ def main() -> None:
     count = sum(seen.answers.values())
     worked = sum(used[process] for process in workers)
     rates = {
-        "bare planner": alone,
+        "planner alone": alone,
         "served, a worker": (count / arguments.seconds / arguments.workers, count / worked),
         "served, with the process that listens": (None, count / (worked + used[server.pid])),
     }
     print_table(
         f"Plans a second, {arguments.planner}, {arguments.workers} workers, {arguments.clients} clients",
-        ("", "by the clock", "of bare, %", "of processor time", "of bare, %"),
+        ("", "of wall time", "of alone, %", "of CPU time", "of alone, %"),
         [
             (
                 name,
@@ -223,7 +228,7 @@ def main() -> None:
             ("answers", *(str(sum(of.answers.values())) for of in (seen, killed))),
             ("by code", *(_codes(of) for of in (seen, killed))),
             ("lost, without an answer", str(seen.lost), str(killed.lost)),
-            ("not the bare planner's path", str(seen.wrong), str(killed.wrong)),
+            ("not the planner's path", str(seen.wrong), str(killed.wrong)),
             (
                 "seconds to an answer, median / 99 % / most",
                 " / ".join(f"{x / 1e3:.3f}" for x in (*np.percentile(times, (50, 99)), times.max())),
