@@ -35,10 +35,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_processor_time
 from jaxtyping import Float
 from numpy import ndarray
 
+from common import FIRST, TIME_LIMIT, header, parse, print_table, progress, use_processor_time
 from robotdiffuse.core.output_files import JsonLines
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.evaluation.statistics import compare, wilson_interval

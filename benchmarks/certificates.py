@@ -21,12 +21,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from common import dense, header, parse, print_table, progress
 from ompl import base as ob
 from ompl import geometric as og
 from ompl import util as ou
 
 import robotdiffuse as rd
+from common import dense, header, parse, print_table, progress
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError

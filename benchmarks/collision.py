@@ -14,12 +14,12 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-from common import FIRST, draw_hard_cases, header, parse, print_table, progress
 from jaxtyping import Int
 from numba import njit
 from numpy import ndarray
 from numpy.random import Generator
 
+from common import FIRST, draw_hard_cases, header, parse, print_table, progress
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernels.lane_collision import make_workspace, place_frames

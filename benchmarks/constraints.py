@@ -27,6 +27,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pybullet
+from numpy import ndarray
+
+import robotdiffuse as rd
 from common import (
     contacts_on_meshes,
     dense,
@@ -37,9 +40,6 @@ from common import (
     progress,
     use_processor_time,
 )
-from numpy import ndarray
-
-import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import (
     rotation_angle,

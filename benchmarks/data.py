@@ -31,8 +31,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from common import header, parse, print_table, progress
 
+from common import header, parse, print_table, progress
 from robotdiffuse.cli.train_robot import MIX
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state

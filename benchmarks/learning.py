@@ -30,12 +30,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from common import TIME_LIMIT, WIDTH, draw_hard_cases, header, parse, parts_of, print_table
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy import ndarray
 
+from common import TIME_LIMIT, WIDTH, draw_hard_cases, header, parse, parts_of, print_table
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.methods import (
@@ -49,7 +49,7 @@ from robotdiffuse.evaluation.methods import (
     without_network,
 )
 from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial, tried
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
 from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, SOLVED, half_width, summary
 from robotdiffuse.evaluation.tables import show
@@ -88,8 +88,8 @@ Found = dict[Setting, list[Record]]
 def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
     """The network with guidance and without, and with fewer of its inputs."""
 
-    def other(trial: Trial) -> Problem:
-        return cases[(trial.place + 1) % len(cases)].problem
+    def other(run: Run) -> Problem:
+        return cases[(run.place + 1) % len(cases)].problem
 
     unguided = RobotDiffuse(replace(planner.settings, guidance_steps=0))
     model = planner.model(PANDA)
@@ -111,13 +111,13 @@ def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]
 def confirmed(planner: RobotDiffuse) -> Method:
     """The whole planner; `refuted` is 1 if its path or motion collides by PyBullet."""
 
-    def call(trial: Trial) -> Iterator[Fields]:
+    def call(run: Run) -> Iterator[Fields]:
         with Clock() as clock:
-            result = planner.plan(trial.problem, trial.limit, seed=trial.place)
+            result = planner.plan(run.problem, run.limit, seed=run.place)
         hit = False
         if result.path is not None and result.trajectory is not None:
             moved = JointPath(result.trajectory.joint_names, result.trajectory.positions)
-            with PyBulletOracle(PANDA, trial.problem.scene) as oracle:
+            with PyBulletOracle(PANDA, run.problem.scene) as oracle:
                 hit = any(oracle.check_path(path) is not None for path in (result.path, moved))
         yield fields_of(result, measure_of(PANDA)) | {"cpu": clock.cpu, "refuted": float(hit)}
 
@@ -142,7 +142,7 @@ def compare_code(every: dict[str, list[Case]], settings: RobotDiffuseSettings) -
     rows, ratios = [], dict[str, ndarray]()
     own = {name: list[bool]() for name in planners}
     for family, cases in every.items():
-        found = tried(cases, methods, seeds=(1, 2), limit=EQUAL_TIME, title=family)
+        found = run_all(cases, methods, seeds=(1, 2), limit=EQUAL_TIME, title=family)
         lengths = []
         for name, records in found.items():
             own[name] += [record.stage in ("network", "refinement") for record in records if record.solved]
@@ -180,7 +180,7 @@ def report_alone(family: str, cases: list[Case], weights: str | None) -> dict[st
     """Print how the network does alone; its records."""
     planner = RobotDiffuse(replace(NETWORK_ALONE, weights=weights))
     methods = {name: sampled(draw) for name, draw in network_methods(planner, cases).items()}
-    found = tried(cases, methods, seeds=(1,), title=family)
+    found = run_all(cases, methods, seeds=(1,), title=family)
     show(summary("Network alone, 16 samples", found, (SINGLE, BEST, LENGTH, CPU)), width=WIDTH)
     return found
 
@@ -188,7 +188,7 @@ def report_alone(family: str, cases: list[Case], weights: str | None) -> dict[st
 def report_planner(family: str, cases: list[Case], weights: str | None) -> None:
     """Print how the whole planner does."""
     whole = confirmed(RobotDiffuse(RobotDiffuseSettings(weights=weights)))
-    found = tried(cases, {"robotdiffuse": whole}, limit=PLANNER_LIMIT, title=family)
+    found = run_all(cases, {"robotdiffuse": whole}, limit=PLANNER_LIMIT, title=family)
     show(summary("Whole planner", found, (SOLVED, LENGTH, CPU)), width=WIDTH)
     print_stages(found["robotdiffuse"])
 
@@ -216,7 +216,7 @@ def try_settings(loaded: RobotDiffuse, cases: list[Case], settings: Sequence[Set
         planner = RobotDiffuse(replace(loaded.settings, **changed))
         drawn = from_network(planner, guidance_scale=scale)
         methods[name_of((gradient, scale, steps))] = sampled(drawn)
-    found = tried(cases, methods, seeds=(5,), title=title)
+    found = run_all(cases, methods, seeds=(5,), title=title)
     show(summary(f"{title}, {len(cases)} problems", found, (SINGLE, BEST, CPU)), width=WIDTH)
     return {setting: found[name_of(setting)] for setting in settings}
 

@@ -17,9 +17,9 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
-from common import FIRST, header, parse, print_table, progress
 
 import robotdiffuse as rd
+from common import FIRST, header, parse, print_table, progress
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.planning.baselines.lattice.planner import DStarLiteSearch, DStarLiteSettings

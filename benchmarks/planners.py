@@ -21,6 +21,7 @@ from tempfile import TemporaryDirectory
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
+
 from common import (
     FIRST,
     TIME_LIMIT,
@@ -33,13 +34,12 @@ from common import (
     progress,
     use_processor_time,
 )
-
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.evaluation.methods import planned
 from robotdiffuse.evaluation.problem_sets import gather_cases
 from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import Clock, tried
+from robotdiffuse.evaluation.runs import Clock, run_all
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.families import FAMILIES, load_family
@@ -105,7 +105,7 @@ def by_family(cases: Sequence[Case]) -> Iterator[tuple[str, list[Case]]]:
 def first(cases: Sequence[Case]) -> None:
     """Print when aorrtc has its first path, and when its call returns."""
     method = {"aorrtc": planned(warm("aorrtc", cases), until=FIRST, clearance=0.0)}
-    found = {r.name: r for r in tried(cases, method, limit=5.0, title="first")["aorrtc"]}
+    found = {r.name: r for r in run_all(cases, method, limit=5.0, title="first")["aorrtc"]}
     rows = []
     for family, of in by_family(cases):
         records = [found[case.name] for case in of]
@@ -125,7 +125,7 @@ def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: 
     found: dict[tuple[str, float], list[Record]] = {}
     for limit in limits:
         methods = {name: planned(warm(name, cases), until=TIME_LIMIT, clearance=0.0) for name in PLANNERS}
-        for name, records in tried(cases, methods, range(seeds), limit, title=f"{limit:g} s").items():
+        for name, records in run_all(cases, methods, range(seeds), limit, title=f"{limit:g} s").items():
             found[name, limit] = records
     best = best_known(cases, known, [record for records in found.values() for record in records])
     rows = []

@@ -35,6 +35,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pybullet
+from numpy import ndarray
+from scipy.interpolate import CubicHermiteSpline
+
+import robotdiffuse as rd
 from common import (
     TIME_LIMIT,
     contacts_on_meshes,
@@ -46,10 +50,6 @@ from common import (
     progress,
     use_processor_time,
 )
-from numpy import ndarray
-from scipy.interpolate import CubicHermiteSpline
-
-import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.motions import search_space

@@ -20,8 +20,8 @@ from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from common import FIRST, TIME_LIMIT, dense, header, parse, print_table, progress, use_processor_time
 
+from common import FIRST, TIME_LIMIT, dense, header, parse, print_table, progress, use_processor_time
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult

@@ -21,6 +21,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+
 from common import header, parse, parts_of, print_table
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))

@@ -26,9 +26,9 @@ from typing import Any
 
 import httpx
 import numpy as np
-from common import CONVERGED, header, parse, print_table
 
 import robotdiffuse as rd
+from common import CONVERGED, header, parse, print_table
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.held_out import SEED, held_out_problem
 

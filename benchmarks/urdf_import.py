@@ -29,8 +29,8 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import trimesh
-from common import FIRST, header, parse, print_table, progress
 
+from common import FIRST, header, parse, print_table, progress
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError

@@ -19,11 +19,11 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.registry import Entry
 from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation.bench import planner_process
-from robotdiffuse.evaluation.bench.entries import Contestant
-from robotdiffuse.evaluation.bench.runner import BenchSettings, open_trials, run_bench
+from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
+from robotdiffuse.evaluation.bench.runner import BenchSettings, open_runs, run_bench
 from robotdiffuse.evaluation.problem_sets import gather_cases, validator
 from robotdiffuse.evaluation.records import Record, RecordFile, read_records
-from robotdiffuse.evaluation.runs import Trial
+from robotdiffuse.evaluation.runs import Run
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
 from robotdiffuse.planning.search.aorrtc import AORRTCSettings
@@ -113,10 +113,10 @@ def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pyt
     )
     monkeypatch.setattr(planner_process, "FAR_SIDE", (sys.executable, "-c", far_side))
     monkeypatch.setattr(planner_process, "PATIENCE", 5.0)
-    process = planner_process.PlannerProcess(Contestant.of("rrt_connect"), tmp_path / "log")
+    process = planner_process.PlannerProcess(PlannerSpec.parse("rrt_connect"), tmp_path / "log")
     (case,) = gather_cases(["rop"], 1, tmp_path, quiet)
-    trial = Trial(case, 0, "rrt_connect", 0, 1.0)
-    assert [process.plan(trial) for _ in range(2)] == [[{"time": 0.1}]] * 2
+    run = Run(case, 0, "rrt_connect", 0, 1.0)
+    assert [process.plan(run) for _ in range(2)] == [[{"time": 0.1}]] * 2
     process.close()
 
 
@@ -147,7 +147,7 @@ def test_what_ended_by_itself_is_not_asked_again_with_more_time(tmp_path: Path) 
 
     def left(time_limit: float, seeds: int = 1) -> list[tuple[str, int]]:
         asked = replace(settings(tmp_path), time_limit=time_limit, seeds=seeds)
-        return [(t.case.name, t.seed) for t in open_trials({"rrt_connect": records}, cases, asked)]
+        return [(t.case.name, t.seed) for t in open_runs({"rrt_connect": records}, cases, asked)]
 
     assert left(1.0) == []
     assert left(10.0) == [("rop/1", 0), ("rop/2", 0)]
@@ -165,8 +165,8 @@ def test_restarts_are_asked_for_where_time_is_left(tmp_path: Path) -> None:
 
     def left(time_limit: float, restarted: list[Record]) -> list[str]:
         records = {"rrt_connect": plain, "rrt_connect+restarts": restarted}
-        trials = open_trials(records, cases, replace(asked, time_limit=time_limit))
-        return [trial.case.name for trial in trials]
+        runs = open_runs(records, cases, replace(asked, time_limit=time_limit))
+        return [run.case.name for run in runs]
 
     assert left(1.0, []) == ["rop/0"]
     assert left(1.0, again) == []
@@ -196,10 +196,10 @@ def test_planners_take_turns_with_each_problem(tmp_path: Path, monkeypatch: pyte
     """Whatever else the machine does then hits them alike; so many calls are made at once all the time."""
     calls, at_once, most = [], [0], [0]
 
-    def plan(self: planner_process.PlannerProcess, trial: Trial, restarts: bool) -> list[dict]:
+    def plan(self: planner_process.PlannerProcess, run: Run, restarts: bool) -> list[dict]:
         at_once[0] += 1
         most[0] = max(most[0], at_once[0])
-        calls.append((trial.case.name, trial.method))
+        calls.append((run.case.name, run.method))
         time.sleep(0.02)
         at_once[0] -= 1
         return [{"status": "timeout", "time": 2.0}]
@@ -221,15 +221,15 @@ def keys_in_order(folder: Path, planner: str) -> list[tuple[str, int]]:
 
 
 def test_a_planner_with_settings() -> None:
-    planner = Contestant.of("rrt_connect:optimize_time=0.05:tightenings=0").load()
+    planner = PlannerSpec.parse("rrt_connect:optimize_time=0.05:tightenings=0").load()
     assert isinstance(planner, RRTConnect)
     assert (planner.settings.optimize_time, planner.settings.tightenings) == (0.05, 0)
-    calls = Contestant.of("aorrtc:until=limit:gain=0.01:clearance=0")
+    calls = PlannerSpec.parse("aorrtc:until=limit:gain=0.01:clearance=0")
     assert calls.request()["until"] == "limit" and calls.request()["clearance"] == 0
     assert calls.load().settings == AORRTCSettings(gain=0.01)
     with pytest.raises(InputError, match="unknown until 'soon'"):
-        Contestant.of("aorrtc:until=soon")
-    nested = Contestant.of("robotdiffuse:search.range=0.5:samples=4").load()
+        PlannerSpec.parse("aorrtc:until=soon")
+    nested = PlannerSpec.parse("robotdiffuse:search.range=0.5:samples=4").load()
     assert isinstance(nested, RobotDiffuse)
     assert (nested.settings.search.range, nested.settings.samples) == (0.5, 4)
 

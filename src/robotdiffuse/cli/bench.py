@@ -121,7 +121,7 @@ def run_run(arguments: argparse.Namespace) -> int:
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        bars = {name: bar.add_task(name, total=None, start=False) for name in settings.contestants}
+        bars = {name: bar.add_task(name, total=None, start=False) for name in settings.specs}
 
         def done(planner: str, calls: int, all_calls: int) -> None:
             bar.start_task(bars[planner])

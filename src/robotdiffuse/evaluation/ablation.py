@@ -23,7 +23,7 @@ from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled
 from robotdiffuse.evaluation.metrics import Kinematics
 from robotdiffuse.evaluation.problem_sets import hard_cases
 from robotdiffuse.evaluation.records import Record
-from robotdiffuse.evaluation.runs import tried
+from robotdiffuse.evaluation.runs import run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.tables import Column, Table
 from robotdiffuse.learning.checkpoint import load_model
@@ -220,7 +220,11 @@ def _try(
     alone = config is None
     draw = without_network(planner, CONTROL_FRAMES) if alone else from_network(RobotDiffuse(planner))
     method = sampled(draw, Kinematics(robot).link_length)
-    return config, guided, Tried.of(tried(cases, {name: method}, seeds=(1,), folder=folder, bar=False)[name])
+    return (
+        config,
+        guided,
+        Tried.of(run_all(cases, {name: method}, seeds=(1,), folder=folder, bar=False)[name]),
+    )
 
 
 def _planner_settings(settings: AblationSettings, config: str | None, guided: bool) -> RobotDiffuseSettings:

@@ -1,4 +1,4 @@
-"""What can be tried: planners, networks that sample, and searches that go on. Each gives its trials'
+"""What can be tried: planners, networks that sample, and searches that go on. Each gives its runs'
 records, with the verdict of the validator, whose time is not counted unless it is part of a planner's call."""
 
 import time
@@ -19,7 +19,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status
 from robotdiffuse.evaluation.metrics import Measure
 from robotdiffuse.evaluation.records import ENDED, RAISED, RESTARTABLE, SOLVED
-from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial
+from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.planning.diffusion.diffusion import ModelSampler, encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuseSettings, unlearned_starts
@@ -47,8 +47,8 @@ measure_of = lru_cache(maxsize=8)(Measure)
 def planned(planner: Planner, **request: Any) -> Method:
     """A planner in this process; `request` are further arguments of its `plan`."""
 
-    def call(trial: Trial) -> Iterator[Fields]:
-        yield from planner_calls(planner, trial.problem, trial.seed, trial.limit, False, request)
+    def call(run: Run) -> Iterator[Fields]:
+        yield from planner_calls(planner, run.problem, run.seed, run.limit, False, request)
 
     return call
 
@@ -132,8 +132,8 @@ def fields_of(result: PlanResult, measure: Measure) -> Fields:
 # Sampled trajectories
 
 
-Draw = Callable[[Trial, CollisionChecker], ndarray]
-"""A batch of trajectories [count, waypoints, dof] for a trial."""
+Draw = Callable[[Run, CollisionChecker], ndarray]
+"""A batch of trajectories [count, waypoints, dof] for a run."""
 
 
 class Validated(NamedTuple):
@@ -164,11 +164,11 @@ def path_lengths(q: Float[ndarray, "n waypoints dof"]) -> Float[ndarray, "n"]:
 def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) -> Method:
     """A batch of trajectories, all validated as they are; measured is the shortest of those that passed."""
 
-    def call(trial: Trial) -> Iterator[Fields]:
-        problem = trial.problem
+    def call(run: Run) -> Iterator[Fields]:
+        problem = run.problem
         checker = CollisionChecker(problem.robot, problem.scene)
         with Clock() as clock:
-            q = draw(trial, checker)
+            q = draw(run, checker)
         verdict, found = validated(problem, q), {}
         if verdict.passed.any():
             best = int(np.where(verdict.passed, lengths(q), np.inf).argmin())
@@ -187,7 +187,7 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
 
 def from_network(
     sampler: ModelSampler,
-    seen: Callable[[Trial], Problem] | None = None,
+    seen: Callable[[Run], Problem] | None = None,
     hidden: bool = False,
     guidance_scale: float = 1.0,
 ) -> Draw:
@@ -198,11 +198,11 @@ def from_network(
     `MotionModel.denoise_guided`; 0 hides the condition, the code with it.
     """
 
-    def draw(trial: Trial, checker: CollisionChecker) -> ndarray:
-        problem, rng = trial.problem, trial.rng()
+    def draw(run: Run, checker: CollisionChecker) -> ndarray:
+        problem, rng = run.problem, run.rng()
         model = sampler.model(problem.robot)
         assert model is not None
-        other = checker if seen is None else CollisionChecker(problem.robot, seen(trial).scene)
+        other = checker if seen is None else CollisionChecker(problem.robot, seen(run).scene)
         code = encode(model, other, sampler.settings.points, rng)
         ends = problem.start, goal_of(problem)[None]
         told = nothing_near(model) if hidden else None
@@ -230,10 +230,10 @@ def without_network(settings: RobotDiffuseSettings, waypoints: int) -> Draw:
     assert sampling_steps is not None  # as many as a network's would be
     steps = settings.guidance_steps * ceil(settings.guided_share * sampling_steps)
 
-    def draw(trial: Trial, checker: CollisionChecker) -> ndarray:
-        problem = trial.problem
+    def draw(run: Run, checker: CollisionChecker) -> ndarray:
+        problem = run.problem
         ends = problem.start, goal_of(problem)
-        q = unlearned_starts(*ends, settings.samples, waypoints, problem.robot, trial.rng())
+        q = unlearned_starts(*ends, settings.samples, waypoints, problem.robot, run.rng())
         return CollisionGuidance(checker, settings.guidance)(q, steps)[0] if steps else q
 
     return draw
@@ -242,23 +242,23 @@ def without_network(settings: RobotDiffuseSettings, waypoints: int) -> Draw:
 # Searches that go on
 
 
-Search = Callable[[Trial], Iterator[ndarray | None]]
+Search = Callable[[Run], Iterator[ndarray | None]]
 """Yields waypoints as it finds them; None where it only wants to be asked whether there is time left. What it
 does before it returns the iterator is not counted."""
 
 
 def searched(
-    search: Search, marks: Sequence[float], whole: Callable[[Trial], Problem] = lambda trial: trial.problem
+    search: Search, marks: Sequence[float], whole: Callable[[Run], Problem] = lambda run: run.problem
 ) -> Method:
     """A record for each mark, a CPU time [s]: of what a search has by then, the shortest path that passes the
     validator is its answer, and that is solved if it passes for the whole problem too.
 
-    whole: what is true, where the trial's problem is what a planner sees of it. `passed` is 1 with an answer.
+    whole: what is true, where the run's problem is what a planner sees of it. `passed` is 1 with an answer.
     """
 
-    def call(trial: Trial) -> Iterator[Fields]:
+    def call(run: Run) -> Iterator[Fields]:
         found: list[tuple[float, ndarray]] = []
-        paths, began = search(trial), time.process_time()
+        paths, began = search(run), time.process_time()
         for path in paths:
             spent = time.process_time() - began
             if spent > marks[-1]:
@@ -266,11 +266,11 @@ def searched(
             if path is not None:
                 found.append((spent, np.asarray(path, np.float64)))
         found.sort(key=lambda one: path_lengths(one[1][None])[0])
-        names, verdicts = trial.problem.robot.joint_names, dict[int, Report]()
+        names, verdicts = run.problem.robot.joint_names, dict[int, Report]()
 
         def passes(i: int) -> bool:
             if i not in verdicts:
-                verdicts[i] = verifier(trial.problem, VerifySettings()).path(Path(names, found[i][1]))
+                verdicts[i] = verifier(run.problem, VerifySettings()).path(Path(names, found[i][1]))
             return verdicts[i].valid
 
         for mark in marks:
@@ -278,10 +278,10 @@ def searched(
             fields: Fields = {"status": UNSOLVED, "time": mark, "time_limit": mark, "passed": 0.0}
             if answer is not None:
                 at, path = found[answer][0], Path(names, found[answer][1])
-                report = verifier(whole(trial), VerifySettings()).path(path)
+                report = verifier(whole(run), VerifySettings()).path(path)
                 fields |= {"passed": 1.0, "time": at, "cpu": at}
                 if report.valid:
-                    fields |= {"status": SOLVED, **measure_of(trial.problem.robot)(path, None, report)}
+                    fields |= {"status": SOLVED, **measure_of(run.problem.robot)(path, None, report)}
             yield fields
 
     return call

@@ -192,7 +192,7 @@ def _counted(
         return counted
     given = [
         (run["seeds"], run["count"] or len(places))
-        for run in bench.runs
+        for run in bench.sessions
         if plain_name(planner) in run["planners"]
         and problem_set in run["problems"]
         and run["time_limit"] >= limit
@@ -254,8 +254,8 @@ def _comparison(
 
 
 def _timed(bench: Bench, outcomes: Sequence[Outcome]) -> Timed:
-    runs = frozenset[str]().union(*(bench.run_of(o.record) for o in outcomes))
-    workers = {str(bench.runs[int(number) - 1].get("workers", "?")) for number in runs}
+    runs = frozenset[str]().union(*(bench.sessions_of(o.record) for o in outcomes))
+    workers = {str(bench.sessions[int(number) - 1].get("workers", "?")) for number in runs}
     return Timed(runs, frozenset(workers))
 
 

@@ -20,10 +20,10 @@ from typing import TextIO
 from robotdiffuse.core.processes import Companion
 from robotdiffuse.core.registry import Entry, added, take_over
 from robotdiffuse.core.types import SHORT
-from robotdiffuse.evaluation.bench.entries import Contestant
+from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.methods import measure_of, planner_calls
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN
-from robotdiffuse.evaluation.runs import Fields, Trial
+from robotdiffuse.evaluation.runs import Fields, Run
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record, problem_record
 from robotdiffuse.problems.problem import Problem
@@ -43,29 +43,29 @@ END = "end"
 class PlannerProcess:
     """The near side: starts the process when it is first asked, and again after it died."""
 
-    def __init__(self, contestant: Contestant, log: FilePath) -> None:
+    def __init__(self, spec: PlannerSpec, log: FilePath) -> None:
         """`log`: what the process prints is added to this file."""
         entries = {what: {n: astuple(e) for n, e in table.items()} for what, table in added().items()}
-        self._far = Companion([*FAR_SIDE, contestant.text, json.dumps([sys.path, entries])], log)
+        self._far = Companion([*FAR_SIDE, spec.text, json.dumps([sys.path, entries])], log)
 
-    def warm(self, trial: Trial) -> None:
-        """Be ready for a trial's robot. A process that dies of it will say so when it is to plan."""
-        self._tell({"problem": problem_record(trial.problem)})
+    def warm(self, run: Run) -> None:
+        """Be ready for a run's robot. A process that dies of it will say so when it is to plan."""
+        self._tell({"problem": problem_record(run.problem)})
 
-    def plan(self, trial: Trial, restarts: bool = False) -> list[Fields]:
-        """The answers to a trial, as fields of records; a death or an overrun is an answer too."""
-        asked = {"seed": trial.seed, "time_limit": trial.limit, "restarts": restarts}
-        failure = self._tell({"problem": problem_record(trial.problem), **asked})
+    def plan(self, run: Run, restarts: bool = False) -> list[Fields]:
+        """The answers to a run, as fields of records; a death or an overrun is an answer too."""
+        asked = {"seed": run.seed, "time_limit": run.limit, "restarts": restarts}
+        failure = self._tell({"problem": problem_record(run.problem), **asked})
         if failure is not None:
             return [failure]
         answers: list[Fields] = []
-        patience = trial.limit + PATIENCE
+        patience = run.limit + PATIENCE
         while (line := self._far.answer(patience)) is not None:
             answer = json.loads(line)
             if answer == END:
                 return answers
             answers.append(answer)
-            patience = PATIENCE_WITH_RESTARTS * trial.limit + PATIENCE
+            patience = PATIENCE_WITH_RESTARTS * run.limit + PATIENCE
         return [*answers, self._ended(patience)]
 
     def close(self) -> None:
@@ -153,8 +153,8 @@ def main() -> None:
     path, entries = json.loads(sys.argv[2])
     sys.path += [place for place in path if place not in sys.path]
     take_over({what: {n: Entry(*e) for n, e in table.items()} for what, table in entries.items()})
-    contestant = Contestant.of(sys.argv[1])
-    serve(contestant.load(), contestant.request(), sys.stdin, answers)
+    spec = PlannerSpec.parse(sys.argv[1])
+    serve(spec.load(), spec.request(), sys.stdin, answers)
 
 
 if __name__ == "__main__":

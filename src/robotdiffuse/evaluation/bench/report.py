@@ -284,7 +284,7 @@ def missing_line(comparison: Comparison) -> str:
 def about(bench: Bench) -> list[str]:
     """Where, when and with what the runs were made, a line for each difference."""
     lines: dict[str, list[str]] = {}
-    for run in bench.runs:
+    for run in bench.sessions:
         versions = ", ".join(f"{name} {version}" for name, version in run["versions"].items())
         machine = f"{run.get('processor', '?')}, {run.get('cores', '?')} cores"
         text = f"{machine}, {run.get('workers', '?')} at once; Python {run.get('python', '?')}, {versions}"

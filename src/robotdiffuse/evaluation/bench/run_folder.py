@@ -17,8 +17,8 @@ class Bench:
     """What `bench run` left in a folder."""
 
     folder: FilePath
-    runs: tuple[dict[str, Any], ...]
-    """What each run noted of itself."""
+    sessions: tuple[dict[str, Any], ...]
+    """A note on each call of `bench run`: machine, versions, settings."""
     records: dict[str, list[Record]]
     """By planner, in the order of PLANNERS; those that were restarted behind their plain ones."""
 
@@ -28,11 +28,11 @@ class Bench:
         plain = DEFAULT_PLANNER if DEFAULT_PLANNER in self.records else next(iter(self.records))
         return plain + RESTARTED if plain + RESTARTED in self.records else plain
 
-    def run_of(self, record: Record) -> frozenset[str]:
-        """The numbers of the runs, from 1, that a call may be of: one, where the call was noted with it."""
+    def sessions_of(self, record: Record) -> frozenset[str]:
+        """The numbers of the sessions, from 1, that may have made the record: one, if the record names it."""
         return frozenset(
             str(i)
-            for i, run in enumerate(self.runs, start=1)
+            for i, run in enumerate(self.sessions, start=1)
             if (
                 run.get("run") == record.run
                 if record.run
@@ -79,10 +79,10 @@ def read_bench(folder: FilePath, planners: Sequence[str] | None = None) -> Bench
             records[name] = records[name] + [replace(record, planner=name) for record in there]
     if not any(records.values()):
         raise InputError(f"{folder} holds no records yet; go on with `robotdiffuse bench run`")
-    return Bench(folder, _read_runs(folder / "runs.jsonl"), records)
+    return Bench(folder, _read_sessions(folder / "runs.jsonl"), records)
 
 
-def _read_runs(file: FilePath) -> tuple[dict[str, Any], ...]:
+def _read_sessions(file: FilePath) -> tuple[dict[str, Any], ...]:
     try:
         lines = file.read_text().splitlines() if file.is_file() else []
         runs = tuple(json.loads(line) for line in lines)

@@ -12,7 +12,7 @@ from robotdiffuse.planning.planner import Planner
 
 
 @dataclass(frozen=True)
-class Contestant:
+class PlannerSpec:
     """A planner as a bench calls it."""
 
     name: str
@@ -23,7 +23,7 @@ class Contestant:
     """NAME=VALUE, other than the defaults: of the planner, and of what its calls ask for (`Request`)."""
 
     @classmethod
-    def of(cls, text: str) -> "Contestant":
+    def of(cls, text: str) -> "PlannerSpec":
         """From NAME, NAME@WEIGHTS, NAME:SETTING=VALUE:SETTING=VALUE or NAME@WEIGHTS:SETTING=VALUE.
 
         Raises InputError for an unknown planner or setting, listing the known, and a value out of bounds.
