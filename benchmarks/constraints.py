@@ -195,8 +195,8 @@ class _Set:
 
 def peer(problem: Problem, seed: int) -> Answer:
     """The answer of sscbirrt with its default settings."""
-    import sscbirrt
-    from sscbirrt.testing import PlanarIK
+    import sscbirrt  # pyright: ignore[reportMissingImports]
+    from sscbirrt.testing import PlanarIK  # pyright: ignore[reportMissingImports]
 
     arm, goal = _Arm(problem), problem.goal
     assert isinstance(goal, JointGoal)

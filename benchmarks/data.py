@@ -27,7 +27,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -124,7 +124,7 @@ def compare_planners(name: str, count: int) -> None:
         replace(by_paper, search=replace(paper, improvement=0.0)),
         replace(by_fast, search=replace(fast, patience=ENDLESS)),
     )
-    pairs: dict[str, list[tuple[Found, Found, float]]] = {}
+    pairs: dict[str, list[tuple[tuple[Found, Found], float]]] = {}
     for number, drawn in progress([*problems(usual, robot, count)], name):
         checker = CollisionChecker(robot, drawn.scene)
         ends = np.stack([drawn.start, *drawn.goals]).astype(np.float32)
@@ -140,25 +140,27 @@ def compare_planners(name: str, count: int) -> None:
         rows = {f"{1e3 * mark:.0f} ms": i for i, mark in enumerate(MARKS)}
         theirs, ours = (found(settings, *MARKS) for settings in endless)
         for row, i in rows.items():
-            pairs.setdefault(row, []).append((theirs[i], ours[i], closest))
+            pairs.setdefault(row, []).append(((theirs[i], ours[i]), closest))
         same_time = found(endless[1], alone[0].cpu)[0]
-        pairs.setdefault("as the paper's ends", []).append((alone[0], same_time, closest))
-        pairs.setdefault("as each ends", []).append((alone[0], found(by_fast, np.inf)[0], closest))
+        pairs.setdefault("as the paper's ends", []).append(((alone[0], same_time), closest))
+        pairs.setdefault("as each ends", []).append(((alone[0], found(by_fast, np.inf)[0]), closest))
     rows = []
     for row, every in pairs.items():
-        both = [(a, b, end) for a, b, end in every if max(a.length, b.length) < np.inf]
+        both = [(pair, end) for pair, end in every if max(found.length for found in pair) < np.inf]
         ratios = np.array(
-            [b.length / a.length for a, b, _ in both if abs(b.safety - a.safety) <= SAME_DISTANCE]
+            [b.length / a.length for (a, b), _ in both if abs(b.safety - a.safety) <= SAME_DISTANCE]
         )
         half = 1.96 * ratios.std(ddof=1) / np.sqrt(len(ratios))
-        kept = (np.mean([f[i].least >= min(0.05, f[2]) - SAME_DISTANCE for f in both]) for i in (0, 1))
+        kept = (
+            np.mean([pair[i].least >= min(0.05, end) - SAME_DISTANCE for pair, end in both]) for i in (0, 1)
+        )
         rows.append(
             [
                 row,
-                " / ".join(f"{1e3 * np.mean([f[i].cpu for f in every]):.0f}" for i in (0, 1)),
-                " / ".join(f"{sum(f[i].length < np.inf for f in every)}" for i in (0, 1)),
+                " / ".join(f"{1e3 * np.mean([pair[i].cpu for pair, _ in every]):.0f}" for i in (0, 1)),
+                " / ".join(f"{sum(pair[i].length < np.inf for pair, _ in every)}" for i in (0, 1)),
                 f"{ratios.mean():.4f} ± {half:.4f}, {np.median(ratios):.4f} ({len(ratios)})",
-                " / ".join(f"{100 * np.mean([f[i].safety for f in both]):.2f}" for i in (0, 1)),
+                " / ".join(f"{100 * np.mean([pair[i].safety for pair, _ in both]):.2f}" for i in (0, 1)),
                 " / ".join(f"{100 * share:.0f} %" for share in kept),
             ]
         )
@@ -193,7 +195,7 @@ def cost(count: int) -> None:
     for i in range(min(count, 300)):
         solve(settings, robot, i)
     profile.disable()
-    stats = pstats.Stats(profile)
+    stats: Any = pstats.Stats(profile)  # its fields are not in the type stubs
     whole = stats.total_tt
     shares = {
         name: max(

@@ -89,7 +89,7 @@ def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]
     """The network with guidance and without, and with fewer of its inputs."""
 
     def other(run: Run) -> Problem:
-        return cases[(run.place + 1) % len(cases)].problem
+        return cases[(run.index + 1) % len(cases)].problem
 
     unguided = RobotDiffuse(replace(planner.settings, guidance_steps=0))
     model = planner.model(PANDA)
@@ -113,7 +113,7 @@ def confirmed(planner: RobotDiffuse) -> Method:
 
     def call(run: Run) -> Iterator[Fields]:
         with Clock() as clock:
-            result = planner.plan(run.problem, run.limit, seed=run.place)
+            result = planner.plan(run.problem, run.limit, seed=run.index)
         hit = False
         if result.path is not None and result.trajectory is not None:
             moved = JointPath(result.trajectory.joint_names, result.trajectory.positions)

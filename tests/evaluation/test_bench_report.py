@@ -12,7 +12,7 @@ from robotdiffuse.cli import main
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path as Motion
 from robotdiffuse.evaluation.bench import figures, page, plots, report
-from robotdiffuse.evaluation.bench.outcomes import GAVE_UP, LATER, RAN_OUT, counting, outcome
+from robotdiffuse.evaluation.bench.outcomes import GAVE_UP, LATER, RAN_OUT, deciding_record, outcome
 from robotdiffuse.evaluation.bench.run_folder import Bench, read_bench
 from robotdiffuse.evaluation.metrics import METRICS, Measure, Metric
 from robotdiffuse.evaluation.problem_sets import case_file
@@ -136,12 +136,12 @@ def test_a_call_counts_for_shorter_limits_and_for_longer_ones_if_it_ended_by_its
     short = failed("mpnet", "a", 0.1, 0.1)
     middle = failed("mpnet", "a", 1.0, 0.5)
     long = failed("mpnet", "a", 10.0, 10.0)
-    assert counting([short, middle, long], 0.05) is short
-    assert counting([short, middle, long], 0.5) is middle
-    assert counting([short, middle, long], 5.0) is long
-    assert counting([short, middle, long], 60.0) is middle
-    assert counting([short], 1.0) is None
-    assert counting([failed("mpnet", "a", 1.0, 0.0, status="crashed")], 2.0) is None
+    assert deciding_record([short, middle, long], 0.05) is short
+    assert deciding_record([short, middle, long], 0.5) is middle
+    assert deciding_record([short, middle, long], 5.0) is long
+    assert deciding_record([short, middle, long], 60.0) is middle
+    assert deciding_record([short], 1.0) is None
+    assert deciding_record([failed("mpnet", "a", 1.0, 0.0, status="crashed")], 2.0) is None
 
 
 def test_an_outcome_is_what_was_found_by_then() -> None:
@@ -285,7 +285,9 @@ def test_lengths_are_compared_at_equal_time(tmp_path: Path) -> None:
     assert cells(tenth, "ratio to robotdiffuse: hybrid, restarted")["rrt_connect, restarted"] == "1.200"
     plain = read_bench(bench.folder, ["robotdiffuse", "rrt_connect"])
     assert len(plain.records) == 4
-    alone = Bench(plain.folder, plain.runs, {n: r for n, r in plain.records.items() if RESTARTED not in n})
+    alone = Bench(
+        plain.folder, plain.sessions, {n: r for n, r in plain.records.items() if RESTARTED not in n}
+    )
     section = figures.sections(alone)[-1]
     table = report.main_table(section, section.main, alone.reference)
     assert cells(table, "ratio to robotdiffuse: hybrid") == {
@@ -487,7 +489,7 @@ def test_names_beside_a_plot_keep_apart_and_inside(count: int) -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         wanted = np.sort(rng.choice([rng.uniform(0.3, 1.0, count), np.full(count, 0.99)]))
-        heights = plots._spread(wanted, gap)
+        heights = plots.spread_apart(wanted, gap)
         assert len(heights) == count
         assert (np.diff(heights) >= gap - 1e-9).all()
         assert count == 0 or (heights[0] >= 0.01 and heights[-1] <= 0.99)

@@ -81,7 +81,7 @@ def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -
 
 @pytest.fixture
 def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(planner_process, "PATIENCE", 6.0)
+    monkeypatch.setattr(planner_process, "GRACE", 6.0)
     monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
 
 
@@ -111,8 +111,8 @@ def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pyt
     far_side = (
         'import sys\nprint(flush=True)\nfor _ in sys.stdin: print(\'\\n{"time": 0.1}\\n"end"\', flush=True)'
     )
-    monkeypatch.setattr(planner_process, "FAR_SIDE", (sys.executable, "-c", far_side))
-    monkeypatch.setattr(planner_process, "PATIENCE", 5.0)
+    monkeypatch.setattr(planner_process, "COMMAND", (sys.executable, "-c", far_side))
+    monkeypatch.setattr(planner_process, "GRACE", 5.0)
     process = planner_process.PlannerProcess(PlannerSpec.parse("rrt_connect"), tmp_path / "log")
     (case,) = gather_cases(["rop"], 1, tmp_path, quiet)
     run = Run(case, 0, "rrt_connect", 0, 1.0)

@@ -1,4 +1,4 @@
-"""The one loop: methods take turns, what is kept is not made again; planners, networks, searches validated."""
+"""Runs: methods take turns, kept records are not made again, planners and networks are validated."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.evaluation.methods import planned, sampled, searched
+from robotdiffuse.evaluation.methods import planned, sampled
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.runs import Fields, Run, run_all
 from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, summary
@@ -58,7 +58,7 @@ def test_what_is_kept_is_not_made_again(tmp_path: Path) -> None:
     assert len(calls) == 4 and [record.name for record in backwards["x"]] == ["b", "a"]
 
 
-def test_a_trial_that_is_stopped_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_interrupted_runs_continue(tmp_path: Path) -> None:
     calls: list[tuple[str, str, int]] = []
 
     def stopping(run: Run) -> Iterator[Fields]:
@@ -86,27 +86,6 @@ def test_samples_are_validated_as_they_are_and_the_shortest_that_passes_is_measu
     assert blocked.status == "no_path" and blocked.passed == 0.0 and blocked.collided == 1.0
     table = summary("", {"x": [free, blocked]}, (SINGLE, BEST, LENGTH, CPU))
     assert table.texts[0][1].startswith("33.3 ±") and table.texts[0][2].startswith("50.0 % (9.5 to 90.5)")
-
-
-def test_a_search_answers_at_each_mark_with_the_shortest_that_passes() -> None:
-    """For what it sees, and is right if it passes for what is true."""
-
-    def search(run: Run) -> Iterator[np.ndarray | None]:
-        yield np.stack([START, (START + GOAL) / 2 + np.array([0, 0, 0.4, 0, 0, 0, 0]), GOAL])
-        yield None
-        yield np.stack([START, GOAL + 10.0])
-        yield np.stack([START, GOAL])
-
-    seen = [Case(case.name, "free", FREE, True, None, "mine") for case in CASES]
-
-    def whole(run: Run) -> Problem:
-        return CASES[run.place].problem
-
-    records = run_all(seen, {"x": searched(search, (1e-9, np.inf), whole)}, bar=False)["x"]
-    of = {(record.name, record.time_limit): record for record in records}
-    assert [of[name, 1e-9].passed for name in "ab"] == [0.0, 0.0]
-    assert of["a", np.inf].solved and of["a", np.inf].joint_length == pytest.approx(LENGTH_OF_LINE)
-    assert not of["b", np.inf].solved and of["b", np.inf].passed == 1.0
 
 
 def test_a_planner_in_this_process_gives_the_bench_records() -> None:

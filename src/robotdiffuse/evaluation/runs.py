@@ -1,8 +1,8 @@
-"""The one loop of all that is measured: every case by every method with every seed, validated, and kept.
+"""Runs: every case by every method with every seed, each validated and kept as a record.
 
-A method is called with a run and gives the fields of a record, with the validator's verdict; `methods` has
-those for planners, networks and searches. An executor calls them: in this process, one after the other
-(`in_this_process`), or in the processes of a bench. What is kept is not made again.
+A method takes a run and yields the fields of its records, with the validator's verdict; `methods` has those
+of planners and networks. An executor calls methods: in this process, one after the other (`in_this_process`),
+or in the processes of a bench. Runs whose records are kept are not made again.
 """
 
 import os
@@ -24,13 +24,13 @@ from robotdiffuse.problems.problem import Problem
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A call that is to be made."""
+    """One call of a method, to be made."""
 
     case: Case
-    place: int
+    index: int
     """Of the case among all."""
     method: str
-    """What it is called in records."""
+    """Its name in records."""
     seed: int
     limit: float = np.inf
     """Time limit [s]."""
@@ -40,10 +40,11 @@ class Run:
         return self.case.problem
 
     def rng(self) -> np.random.Generator:
-        """The same for all methods."""
-        return np.random.default_rng([SEED, self.seed, self.place])
+        """Random numbers, the same ones for all methods."""
+        return np.random.default_rng([SEED, self.seed, self.index])
 
     def record(self, found: "Fields") -> Record:
+        """The record of this run with these fields."""
         about = {
             "planner": self.method,
             "problem_set": self.case.problem_set,
@@ -59,17 +60,17 @@ class Run:
 
 
 Fields = dict[str, Any]
-"""Of a record; what they do not say, the run does."""
+"""Fields of a record; the run provides the others."""
 Method = Callable[[Run], Iterable[Fields]]
-"""Mostly gives one record; more where one call answers for several time limits, say."""
-Made = Generator[tuple[Run, list[Record]], None, None]
-Executor = Callable[[Sequence[Run]], Made]
-Done = Callable[[str, int], None]
-"""Told a method, and how many of its runs are left."""
+"""Yields the fields of one record, or of several if one call answers for several time limits."""
+Results = Generator[tuple[Run, list[Record]], None, None]
+Executor = Callable[[Sequence[Run]], Results]
+OnProgress = Callable[[str, int], None]
+"""Called with a method and the number of its runs that are left."""
 
 
 class Clock:
-    """Wall time, and CPU time of this process, of a `with` block [s]."""
+    """Measures wall time and CPU time of this process in a `with` block [s]."""
 
     wall = cpu = 0.0
 
@@ -88,37 +89,37 @@ class Clock:
 def runs_of(
     cases: Sequence[Case], methods: Iterable[str], seeds: Iterable[int] = (0,), limit: float = np.inf
 ) -> list[Run]:
-    """All, in the order that they are made in: methods take turns on each case, so that what else the machine
-    does hits them alike."""
-    names, places = list(methods), list(enumerate(cases))
-    return [Run(case, i, name, seed, limit) for seed in seeds for i, case in places for name in names]
+    """All runs in their order: methods take turns on each case, so that other work on the machine affects
+    them alike."""
+    names, numbered = list(methods), list(enumerate(cases))
+    return [Run(case, i, name, seed, limit) for seed in seeds for i, case in numbered for name in names]
 
 
 def execute_runs(
     runs: Sequence[Run],
     execute: Executor,
     files: Mapping[str, RecordFile],
-    done: Done = lambda method, left: None,
+    on_progress: OnProgress = lambda method, left: None,
 ) -> int:
-    """Make the runs and keep their records, each as soon as it is there; returns how many were made."""
+    """Make the runs, keeping each record at once; returns how many were made."""
     left = {run.method: 0 for run in runs}
     for run in runs:
         left[run.method] += 1
     made = 0
-    with closing(execute(runs)) as found:  # a Ctrl-C here ends what makes them too
+    with closing(execute(runs)) as found:  # Ctrl-C ends the executor's processes too
         for run, records in found:
             for record in records:
                 files[record.planner].append(record)
             made += 1
             left[run.method] -= 1
-            done(run.method, left[run.method])
+            on_progress(run.method, left[run.method])
     return made
 
 
 def in_this_process(methods: Mapping[str, Method]) -> Executor:
-    """Calls in this process, one after the other."""
+    """An executor that calls methods in this process, one after the other."""
 
-    def execute(runs: Sequence[Run]) -> Made:
+    def execute(runs: Sequence[Run]) -> Results:
         for run in runs:
             found = list(methods[run.method](run))
             load = {"workers": 1, "load": round(os.getloadavg()[0], 2)}
@@ -136,10 +137,10 @@ def run_all(
     title: str = "runs",
     bar: bool = True,
 ) -> dict[str, list[Record]]:
-    """The records of each method in the order of the cases, made in this process.
+    """Make all runs in this process; the records of each method in the order of the cases.
 
-    folder: keeps them; the names of methods must say all that they depend on. title: of a bar on the
-        terminal, unless there is to be none.
+    folder: keeps the records; the names of methods must then say all that these depend on.
+    title: of the progress bar, which `bar` switches off.
     """
     files = {name: RecordFile(None if folder is None else record_path(folder, name)) for name in methods}
     there = {(name, record.case) for name, file in files.items() for record in file.records}

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.bench.curves import Curve, curves
-from robotdiffuse.evaluation.bench.outcomes import Calls, Key, Outcome, calls_on, counting, outcome
+from robotdiffuse.evaluation.bench.outcomes import Calls, Key, Outcome, calls_on, deciding_record, outcome
 from robotdiffuse.evaluation.bench.run_folder import Bench, plain_name
 from robotdiffuse.evaluation.comscore import Indicators, comscores
 from robotdiffuse.evaluation.metrics import METRICS, Metric
@@ -187,7 +187,7 @@ def _counted(
     Where a planner has been given this time on the first problems alone, only those count: of the others,
     the ones that ended by themselves before are known, which are easy ones.
     """
-    counted = {key: record for key, of in calls.items() if (record := counting(of, limit)) is not None}
+    counted = {key: record for key, of in calls.items() if (record := deciding_record(of, limit)) is not None}
     if len(counted) == len(calls):
         return counted
     given = [

@@ -15,7 +15,7 @@ from robotdiffuse.core.output_files import check_output, write_atomically
 from robotdiffuse.evaluation import style
 from robotdiffuse.evaluation.bench import plots, report
 from robotdiffuse.evaluation.bench.figures import Comparison, Section
-from robotdiffuse.evaluation.bench.outcomes import Outcome, calls_on, counting, outcome
+from robotdiffuse.evaluation.bench.outcomes import Outcome, calls_on, deciding_record, outcome
 from robotdiffuse.evaluation.bench.run_folder import Bench
 from robotdiffuse.evaluation.problem_sets import read_cases
 from robotdiffuse.evaluation.records import Record
@@ -181,7 +181,7 @@ def _section(bench: Bench, section: Section, planners: list[str]) -> str:
         curves = card(
             "Success over time",
             6,
-            f"{name}: share of {ran} calls. Learned planners solid, sampling dashed, search dotted",
+            f"{name}: share of {ran} calls. Planners with a network solid, search dashed",
             f'<div class="wide">{plots.success_over_time(section, planners)}</div>',
         ) + card(
             "Length over time",
@@ -249,7 +249,8 @@ def worth_showing(bench: Bench, parts: Sequence[Section]) -> list[Shown]:
         for name, seed in section.main.keys:
             if seed == section.main.keys[0][1] and name in cases:
                 found = {
-                    planner: counting(calls[planner][name, seed], section.main.limit) for planner in compared
+                    planner: deciding_record(calls[planner][name, seed], section.main.limit)
+                    for planner in compared
                 }
                 outcomes = {k: outcome(r, section.main.limit) for k, r in found.items() if r is not None}
                 tries.append(_Tries(cases[name], outcomes))

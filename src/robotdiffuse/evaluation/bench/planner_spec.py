@@ -1,4 +1,4 @@
-"""Who takes part in a bench: a planner, maybe with weights or settings of its own."""
+"""A planner under test: its name, and weights and settings other than the defaults."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path as FilePath
@@ -13,20 +13,21 @@ from robotdiffuse.planning.planner import Planner
 
 @dataclass(frozen=True)
 class PlannerSpec:
-    """A planner as a bench calls it."""
+    """A planner as the bench loads and calls it."""
 
     name: str
     """In `planning.PLANNERS`."""
     weights: str | None = None
     """A folder; None: those that come with the package."""
     settings: tuple[str, ...] = ()
-    """NAME=VALUE, other than the defaults: of the planner, and of what its calls ask for (`Request`)."""
+    """NAME=VALUE of the planner's settings and of its calls' arguments (`Request`)."""
 
     @classmethod
-    def of(cls, text: str) -> "PlannerSpec":
-        """From NAME, NAME@WEIGHTS, NAME:SETTING=VALUE:SETTING=VALUE or NAME@WEIGHTS:SETTING=VALUE.
+    def parse(cls, text: str) -> "PlannerSpec":
+        """Parse NAME, NAME@WEIGHTS, NAME:SETTING=VALUE:SETTING=VALUE or NAME@WEIGHTS:SETTING=VALUE.
 
-        Raises InputError for an unknown planner or setting, listing the known, and a value out of bounds.
+        Raises InputError for an unknown planner or setting, listing the known ones, and for a value out of
+        bounds.
         """
         whole, *settings = text.split(":")
         name, at, folder = whole.partition("@")
@@ -39,23 +40,24 @@ class PlannerSpec:
 
     @property
     def text(self) -> str:
-        """What `of` makes this from, anywhere."""
+        """The text that `parse` makes this from, with an absolute folder."""
         return ":".join(
             [self.name if self.weights is None else f"{self.name}@{self.weights}", *self.settings]
         )
 
     @property
     def label(self) -> str:
-        """What it is called in results."""
+        """Its name in results."""
         name = self.name if self.weights is None else f"{self.name}@{FilePath(self.weights).name}"
         return ":".join([name, *self.settings])
 
     def request(self) -> dict[str, Any]:
-        """What its calls ask for: until, clearance, ..."""
+        """Arguments of its calls: until, clearance, ..."""
         return vars(Request().changed(text for text in self.settings if _of_call(text)))
 
     def load(self) -> Planner:
-        """Raises InputError as `load_planner`, and for a planner that a process of its own cannot import."""
+        """Load the planner. Raises InputError as `load_planner` does, and for a planner that another process
+        cannot import."""
         if PLANNERS.entry(self.name).location.startswith("__main__:"):
             raise InputError(
                 f"planner {self.name} is in the program that was started, which the processes of a bench do "

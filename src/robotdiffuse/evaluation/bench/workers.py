@@ -1,4 +1,4 @@
-"""Who makes a bench's calls: processes of this machine, or a Ray cluster."""
+"""Executors of a bench: processes of this machine, or a Ray cluster."""
 
 import threading
 from collections import deque
@@ -11,10 +11,10 @@ from robotdiffuse.core import processes
 from robotdiffuse.evaluation.bench.planner_process import PlannerProcess
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.records import RESTARTED, Record
-from robotdiffuse.evaluation.runs import Executor, Fields, Made, Run
+from robotdiffuse.evaluation.runs import Executor, Fields, Results, Run
 
-CHUNK = 20
-"""Calls of one planner that a node of a cluster makes in one go, with one start of the process."""
+RUNS_PER_TASK = 20
+"""Runs of one planner that a node of a cluster makes with one start of the process."""
 PlannerSpecs = Mapping[str, PlannerSpec]
 """By their labels, which are the methods of runs."""
 
@@ -22,14 +22,15 @@ PlannerSpecs = Mapping[str, PlannerSpec]
 def on_this_machine(
     specs: PlannerSpecs, workers: int, restarts: bool, session: str, logs: FilePath
 ) -> Executor:
-    """A process for each spec, so many calls at a time; what they print goes to `logs`.
+    """An executor with a process for each planner, of which `workers` run at a time; `logs` gets what they
+    print.
 
-    All processes are warmed up before the first call is timed, and take turns: all planners are timed while
-    as much else goes on.
+    All processes are warmed up before the first call is timed. They take turns, so that other work on the
+    machine affects all planners alike.
     """
     about = {"run": session, "workers": workers}
 
-    def execute(runs: Sequence[Run]) -> Made:
+    def execute(runs: Sequence[Run]) -> Results:
         stop, news, ready = threading.Event(), threading.Condition(), deque[tuple[Run, list[Record]]]()
         todo: deque[Run] = deque(runs)
         first = {run.method: run for run in reversed(runs)}
@@ -39,7 +40,7 @@ def on_this_machine(
         idle = set(planners)
 
         def next_run() -> Run | None:
-            """The first one whose planner is idle; None when there is nothing left to do."""
+            """The first run whose planner is idle; None when none is left."""
             with news:
                 while todo and not stop.is_set():
                     for i, run in enumerate(todo):
@@ -54,7 +55,7 @@ def on_this_machine(
             while (run := next_run()) is not None:
                 answers = planners[run.method].plan(run, restarts)
                 with news:
-                    if not stop.is_set():  # else it is the stop that ended the call
+                    if not stop.is_set():  # otherwise the stop ended the call
                         ready.append((run, records_of(run, answers, about)))
                     idle.add(run.method)
                     news.notify_all()
@@ -86,37 +87,41 @@ def on_this_machine(
 
 
 def records_of(run: Run, answers: Sequence[Fields], about: Fields) -> list[Record]:
-    """Those after the first are of restarts."""
+    """The records of a run; the second is that of restarts."""
     labels = (run.method, run.method + RESTARTED)
     found = zip(labels, answers, strict=False)
     return [run.record({"planner": label, **about, **answer}) for label, answer in found]
 
 
 def on_ray(specs: PlannerSpecs, restarts: bool, session: str, logs: FilePath) -> Executor:
-    """Calls in portions, each by a process of its own on a node of a Ray cluster; see `processes.on_ray`.
+    """An executor on a Ray cluster, where each task starts a process for some runs; see `processes.on_ray`.
 
-    The nodes need this package, and weights and files at the same places.
+    The nodes need this package, and weights and files at the same paths.
     """
     about = {"run": session, "workers": "ray"}
 
-    def execute(runs: Sequence[Run]) -> Made:
+    def execute(runs: Sequence[Run]) -> Results:
         of = {label: [run for run in runs if run.method == label] for label in specs}
-        portions = [(label, t[i : i + CHUNK]) for label, t in of.items() for i in range(0, len(t), CHUNK)]
-        calls = [(specs[label], portion, restarts) for label, portion in portions]
-        for number, (answers, said) in processes.on_ray(_portion, calls):
-            label, portion = portions[number]
+        tasks = [
+            (label, t[i : i + RUNS_PER_TASK])
+            for label, t in of.items()
+            for i in range(0, len(t), RUNS_PER_TASK)
+        ]
+        calls = [(specs[label], task, restarts) for label, task in tasks]
+        for number, (answers, said) in processes.on_ray(_run_task, calls):
+            label, task = tasks[number]
             if said:
                 logs.mkdir(parents=True, exist_ok=True)
                 with (logs / f"{label.replace('/', '_')}.log").open("a") as log:
                     log.write(said)
-            for run, answer in zip(portion, answers, strict=True):
+            for run, answer in zip(task, answers, strict=True):
                 yield run, records_of(run, answer, about)
 
     return execute
 
 
-def _portion(spec: PlannerSpec, runs: list[Run], restarts: bool) -> tuple[list[list[Fields]], str]:
-    """The answers to the runs, and what the planner printed."""
+def _run_task(spec: PlannerSpec, runs: list[Run], restarts: bool) -> tuple[list[list[Fields]], str]:
+    """The answers to the runs, and the planner's output."""
     with TemporaryDirectory() as folder:
         log = FilePath(folder) / "log"
         process = PlannerProcess(spec, log)
