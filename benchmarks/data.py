@@ -187,6 +187,7 @@ def cost(count: int) -> None:
         ]
         for name, chosen in (("all", trivial | True), ("the line is free", trivial), ("it is not", ~trivial))
         for part in (spent[chosen],)
+        if len(part)
     ]
     print_table("CPU time of a problem, ms", ["problems", "number", "mean", "5 %", "median", "95 %"], rows)
 

@@ -445,7 +445,7 @@ def test_the_command_writes_everything(
 def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
     keep_problems(small, [f"rop/{i}" for i in range(4)])
     bench = read_bench(small)
-    shown = page.worth_showing(bench, figures.sections(bench, [1.0]))
+    shown = page.motions_to_replay(bench, figures.sections(bench, [1.0]))
     titles = [motion.title for motion in shown]
     assert titles[0] == "robotdiffuse · rop/0"  # solved by all; made up as one and the same
     assert "ompl_rrt_star · rop/0" in titles
@@ -454,8 +454,8 @@ def test_what_is_shown_is_hard_or_failed(small: Path) -> None:
         "ompl_rrt_star fails · rop/3",
     }
     captions = {motion.title: motion.caption for motion in shown}
-    assert captions["mpnet fails · rop/2"].startswith("gave up before; here: robotdiffuse")
-    assert len(shown) <= page.MOST_REPLAYS
+    assert captions["mpnet fails · rop/2"].startswith("gave up before; shown: robotdiffuse")
+    assert len(shown) <= page.MAX_REPLAYS
 
 
 def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[str]) -> None:

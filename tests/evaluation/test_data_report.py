@@ -13,7 +13,7 @@ from helpers.motion_stores import random_motions, write_motions
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.datasets import report
 from robotdiffuse.evaluation.datasets.page import write_page
-from robotdiffuse.evaluation.datasets.report import FRAMES_KEPT, facts, read_figures, size_in_words, tables
+from robotdiffuse.evaluation.datasets.report import SAMPLED_WAYPOINTS, facts, read_figures, size_in_words, tables
 from robotdiffuse.robots import load_robot
 
 ARM = box_arm()
@@ -45,14 +45,14 @@ def test_figures(tmp_path, rows):
 
 
 def test_large_sets_are_sampled_evenly(tmp_path, rows, monkeypatch):
-    monkeypatch.setattr(report, "SAMPLE", 4)
+    monkeypatch.setattr(report, "SAMPLED_MOTIONS", 4)
     write_motions(tmp_path, ARM, rows, shard=3)
     found = read_figures(tmp_path)
     assert len(found.all["cost"]) == 11
     chosen = [rows[i] for i in (0, 2, 4, 6, 8, 10)]
     assert np.array_equal(found.sample["start"], [row["start"] for row in chosen])
     kept = found.sample["trajectories"]
-    assert kept.shape == (6, min(FRAMES_KEPT, 20), 3)
+    assert kept.shape == (6, min(SAMPLED_WAYPOINTS, 20), 3)
     assert np.array_equal(kept[:, [0, -1]], [row["trajectories"][[0, -1]] for row in chosen])
 
 

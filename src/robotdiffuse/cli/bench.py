@@ -35,8 +35,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     run.add_argument(
         "--problems",
         metavar="SET,...",
-        help=f"{', '.join(FAMILIES)}, each also with _nontrivial; files or folders of problems; with a preset, "
-        "sets beside its own",
+        help=f"{', '.join(FAMILIES)}, each also with _nontrivial; files or folders of problems; with "
+        "--preset, sets beside its own",
     )
     run.add_argument(
         "--preset",
@@ -202,10 +202,10 @@ def run_report(arguments: argparse.Namespace) -> int:
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
     """The name of the file; None if there is nothing to replay."""
     from robotdiffuse.core.types import Path as Waypoints
-    from robotdiffuse.evaluation.bench.page import worth_showing
+    from robotdiffuse.evaluation.bench.page import motions_to_replay
     from robotdiffuse.visualization.gallery import Exhibit, write_gallery
 
-    shown = worth_showing(bench, parts)
+    shown = motions_to_replay(bench, parts)
     if not shown:
         return None
     robot = shown[0].case.problem.robot

@@ -1,4 +1,4 @@
-"""The bench: planners on problems, each call a record that is kept; what is done is not done again."""
+"""The bench: calls planners on problems and keeps a record of each call; kept calls are not repeated."""
 
 import json
 import os
@@ -21,13 +21,13 @@ from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.held_out import Case
 
 PACKAGES = ("numpy", "numba", "torch", "ompl")
-"""Whose versions are kept with the results, beside our own."""
+"""Packages whose versions are kept with the results."""
 
 
 @dataclass(frozen=True)
 class BenchSettings:
     planners: tuple[str, ...]
-    """Names, each maybe with weights and settings of its own, see `PlannerSpec.of`; or `all` alone."""
+    """Texts of planners, see `PlannerSpec.parse`; or `all` alone."""
     problems: tuple[str, ...]
     """Families (rop, rop_dense, ..., each also with _nontrivial), files or folders."""
     out: FilePath
@@ -43,8 +43,8 @@ class BenchSettings:
     cluster: str | None = None
     """ray: on the cluster that RAY_ADDRESS names; None: this machine."""
     equal_time: bool = False
-    """Whether a planner that ends early is called again with other seeds until the limit, in rows of its own,
-    so that lengths can be compared at equal time."""
+    """Whether planners that end early are called again with other seeds until the limit, in rows of their
+    own, so that lengths can be compared at equal time."""
 
     def __post_init__(self) -> None:
         if self.planners == ("all",):
@@ -66,7 +66,8 @@ class BenchSettings:
 
     @property
     def specs(self) -> dict[str, PlannerSpec]:
-        """By their names in results. Raises InputError for an unknown planner, or two of one name."""
+        """The planners by their names in results. Raises InputError for an unknown planner or two of one
+        name."""
         found = [PlannerSpec.parse(text) for text in self.planners]
         labels = [spec.label for spec in found]
         if len(set(labels)) < len(labels):
@@ -76,15 +77,15 @@ class BenchSettings:
 
 Report = Callable[[str], None]
 Done = Callable[[str, int, int], None]
-"""Told a planner, its calls that are done and all its calls."""
+"""Called with a planner, the number of its calls that are done, and that of all its calls."""
 
 
 def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
-    """Make the calls that are not in the folder yet; returns how many were made.
+    """Make the calls that are missing in the folder; returns how many were made.
 
-    A call need not be made if a shorter time limit did: where the planner ended by itself then, more time
-    gives the same. Raises InputError for bad settings or a planner that cannot be loaded, before any call,
-    and KeyboardInterrupt on Ctrl-C; the same settings go on.
+    A call that ended by itself with a shorter time limit is not repeated: more time gives the same. Raises
+    InputError, before any call, for bad settings or a planner that cannot be loaded, and KeyboardInterrupt on
+    Ctrl-C; another call with the same settings continues.
     """
     with alone_in(settings.out):
         specs = settings.specs
@@ -109,7 +110,7 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
 def open_runs(
     records: Mapping[str, Sequence[Record]], cases: Sequence[Case], settings: BenchSettings
 ) -> list[Run]:
-    """The calls that the records, by planner, do not answer."""
+    """The runs that the records, by planner, do not answer."""
     answered: set[tuple[str, str, str, int]] = set()
     for label in settings.specs:
         again = {record.key for record in records.get(label + RESTARTED, ())}
