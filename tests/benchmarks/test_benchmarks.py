@@ -46,3 +46,12 @@ def test_every_report_is_of_a_script(report: Path) -> None:
     first = report.read_text().partition("\n")[0]
     made_by = [name for name in SCRIPTS if f"benchmarks/{name}.py" in first]
     assert made_by or NO_SCRIPT in first, first
+
+
+def test_the_list_names_every_script_and_every_report() -> None:
+    listed = (FOLDER / "README.md").read_text()
+    assert not [name for name in SCRIPTS if f"`{name}.py`" not in listed]
+    ends = (".csv", ".png", ".txt", ".md")
+    names = [file.name for file in REPORTS.iterdir() if file.suffix in ends]
+    missing = [n for n in names if n not in listed and Path(n).stem not in listed and "baseline_" not in n]
+    assert not missing
