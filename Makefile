@@ -47,9 +47,7 @@ lint: .venv/dev.stamp
 docs: .venv/dev.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
-# not benchmarks but parts of them, curves of runs that are to be named, and a comparison on data that are to be made
-NOT_RUN := %/report.py %/problems.py %/searches.py %/curves.py %/encoders_on_views.py
-BENCHMARKS := $(filter-out $(NOT_RUN),$(wildcard benchmarks/*.py))
+BENCHMARKS := $(filter-out %/common.py,$(wildcard benchmarks/*.py))
 
 bench: .venv/dev.stamp
 	set -e; for file in $(BENCHMARKS); do echo "== $$file"; $(BIN)/python "$$file"; done
@@ -69,14 +67,9 @@ baselines: .venv/dev.stamp
 		--samples 1800000
 
 MBM ?=
-comma := ,
-SETS = rop,rop_dense$(if $(MBM),$(comma)$(MBM))
-RUN = $(BIN)/robotdiffuse bench run --out runs/table1 --problems $(SETS)
 
 table1: .venv/dev.stamp
-	$(RUN) --planners all --count 300 --time-limit 1 --equal-time
-	$(RUN) --planners all --count 60 --time-limit 10
-	$(RUN) --planners ompl_rrt_star,ompl_informed_rrt_star,ompl_bit_star --count 5 --time-limit 60
+	$(BIN)/robotdiffuse bench run --preset table1 --out runs/table1 $(if $(MBM),--problems $(MBM))
 	$(BIN)/robotdiffuse bench confirm runs/table1
 	$(BIN)/robotdiffuse bench report runs/table1
 

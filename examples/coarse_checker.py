@@ -31,15 +31,16 @@ def plan(seed: int) -> rd.Path:
     free = lambda state: not exact.collides(np.array([[state[j] for j in range(robot.dof)]]))[0]  # noqa: E731
     setup.setStateValidityChecker(free)
     setup.getSpaceInformation().setStateValidityCheckingResolution(0.03)
-    ends = [space.allocState(), space.allocState()]
-    for state, q in zip(ends, (problem.start, problem.goal.positions[0]), strict=True):
+    start, goal = space.allocState(), space.allocState()
+    assert isinstance(problem.goal, rd.JointGoal)
+    for state, q in ((start, problem.start), (goal, problem.goal.positions[0])):
         for j in range(robot.dof):
-            state[j] = q[j]
-    setup.setStartAndGoalStates(*ends)
+            state[j] = q[j]  # pyright: ignore[reportIndexIssue]
+    setup.setStartAndGoalStates(start, goal)
     setup.setPlanner(og.RRTConnect(setup.getSpaceInformation()))
     assert setup.solve(5.0)
     states = setup.getSolutionPath().getStates()
-    return rd.Path(robot.joint_names, np.array([[s[j] for j in range(robot.dof)] for s in states]))
+    return rd.Path(robot.joint_names, np.array([[s[j] for j in range(robot.dof)] for s in states]))  # pyright: ignore
 
 
 for seed in range(10):

@@ -271,30 +271,6 @@ def test_manifest(tmp_path):
         read_manifest(tmp_path)
 
 
-@pytest.mark.parametrize(
-    ("families", "size"),
-    [
-        ({"rop": {}, "shelf": {}}, [[2.0, 2.0, 0.1], [3.0, 3.0, 0.1]]),
-        ({"rop": {"floor": True, "floor_size": 4.0, "floor_thickness": 0.2}}, [[4.0, 4.0, 0.2]]),
-        ({"rop": {"floor": False}}, [None]),
-    ],
-)
-def test_old_manifests_have_the_floors_of_their_families(tmp_path, families, size):
-    """Those that were written before floors were kept in them."""
-    write_manifest(tmp_path, manifest_of(ARM))
-    data = json.loads((tmp_path / "manifest.json").read_text()) | {"families": families}
-    del data["floors"]
-    (tmp_path / "manifest.json").write_text(json.dumps(data))
-    manifest = read_manifest(tmp_path)
-    floors = [manifest.floor(i) for i in range(len(families))]
-    assert [floor and floor.size.tolist() for floor in floors] == size
-    assert all(floor is None or floor.bounds[1, 2] == pytest.approx(0, abs=1e-12) for floor in floors)
-    data["families"] = {"rap": {}}
-    (tmp_path / "manifest.json").write_text(json.dumps(data))
-    with pytest.raises(InputError, match=r"manifest\.json is damaged: .*'rap'"):
-        read_manifest(tmp_path)
-
-
 def test_the_robot_must_be_that_of_the_data():
     manifest = manifest_of(ARM)
     manifest.check_robot(replace(ARM, name="renamed"))

@@ -1,4 +1,4 @@
-"""Clients that speak no HTTP, send or take too slowly, or go: each found by benchmarks/fuzz_socket.py."""
+"""Clients that speak no HTTP, send or take too slowly, or go: each found by tests/helpers/fuzz/server.py."""
 
 import asyncio
 import json

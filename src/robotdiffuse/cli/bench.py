@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
     from robotdiffuse.evaluation.bench.figures import Section
     from robotdiffuse.evaluation.bench.run_folder import Bench
+    from robotdiffuse.evaluation.bench.runner import BenchSettings
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -27,16 +28,21 @@ def add(commands: argparse._SubParsersAction) -> None:
     )
     run.add_argument(
         "--planners",
-        required=True,
         metavar="NAME,...",
         help="see `robotdiffuse planners`, or all; with settings, NAME:SETTING=VALUE:SETTING=VALUE, among "
         "them until=first|short|limit and clearance=M of its calls, or with weights of its own, NAME@FOLDER",
     )
     run.add_argument(
         "--problems",
-        required=True,
         metavar="SET,...",
-        help=f"{', '.join(FAMILIES)}, each also with _nontrivial; files or folders of problems",
+        help=f"{', '.join(FAMILIES)}, each also with _nontrivial; files or folders of problems; with "
+        "--preset, sets beside its own",
+    )
+    run.add_argument(
+        "--preset",
+        metavar="NAME",
+        help="a comparison of docs/results.md, in place of planners, limits and seeds: table1, equal_time, "
+        "learning, anytime or restarts",
     )
     run.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems and results")
     run.add_argument("--time-limit", type=positive, default=1.0, metavar="S", help="of a call [s] (1)")
@@ -98,38 +104,74 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run_run(arguments: argparse.Namespace) -> int:
     import sys
-    from pathlib import Path
 
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TaskID,
+        TextColumn,
+        TimeElapsedColumn,
+    )
 
-    from robotdiffuse.evaluation.bench.runner import BenchSettings, run_bench
+    from robotdiffuse.evaluation.bench.runner import run_bench
+
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    made = 0
+    for settings in _bench_settings(arguments):
+        with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
+            bars = {name: bar.add_task(name, total=None, start=False) for name in settings.specs}
+
+            def done(
+                planner: str,
+                calls: int,
+                all_calls: int,
+                bar: Progress = bar,
+                bars: dict[str, TaskID] = bars,
+            ) -> None:
+                bar.start_task(bars[planner])
+                bar.update(bars[planner], completed=calls, total=all_calls)
+
+            made += run_bench(settings, lambda text: print(text, file=sys.stderr, flush=True), done)
+    print(f"{made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}")
+    return 0
+
+
+def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
+    """The settings of each pass: of the preset, or one from the options."""
+    from pathlib import Path
+
+    from robotdiffuse.evaluation.bench.presets import preset_settings
+    from robotdiffuse.evaluation.bench.runner import BenchSettings
 
     if arguments.cluster is not None and arguments.workers is not None:
         raise InputError("--workers is for this machine's processes; --cluster uses all cores that it has")
-    settings = BenchSettings(
-        planners=tuple(arguments.planners.split(",")),
-        problems=tuple(arguments.problems.split(",")),
-        out=Path(arguments.out),
-        time_limit=arguments.time_limit,
-        seeds=arguments.seeds,
-        count=arguments.count,
-        workers=arguments.workers or max(1, (os.cpu_count() or 1) // 2),
-        cluster=arguments.cluster,
-        equal_time=arguments.equal_time,
-    )
-    console = Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bar:
-        bars = {name: bar.add_task(name, total=None, start=False) for name in settings.contestants}
-
-        def done(planner: str, calls: int, all_calls: int) -> None:
-            bar.start_task(bars[planner])
-            bar.update(bars[planner], completed=calls, total=all_calls)
-
-        made = run_bench(settings, lambda text: print(text, file=sys.stderr, flush=True), done)
-    print(f"{made} calls made; for tables, plots and replays: robotdiffuse bench report {arguments.out}")
-    return 0
+    out, workers = Path(arguments.out), arguments.workers or max(1, (os.cpu_count() or 1) // 2)
+    problems = () if arguments.problems is None else tuple(arguments.problems.split(","))
+    if arguments.preset is not None:
+        if arguments.planners is not None or arguments.cluster is not None or arguments.equal_time:
+            raise InputError(
+                "--preset says which planners and limits; of --planners, --cluster and "
+                "--equal-time it takes none"
+            )
+        return preset_settings(arguments.preset, out, problems, arguments.count, workers)
+    if arguments.planners is None or arguments.problems is None:
+        raise InputError("name --planners and --problems, or a --preset")
+    return [
+        BenchSettings(
+            planners=tuple(arguments.planners.split(",")),
+            problems=problems,
+            out=out,
+            time_limit=arguments.time_limit,
+            seeds=arguments.seeds,
+            count=arguments.count,
+            workers=workers,
+            cluster=arguments.cluster,
+            equal_time=arguments.equal_time,
+        )
+    ]
 
 
 def run_report(arguments: argparse.Namespace) -> int:
@@ -160,10 +202,10 @@ def run_report(arguments: argparse.Namespace) -> int:
 def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str | None:
     """The name of the file; None if there is nothing to replay."""
     from robotdiffuse.core.types import Path as Waypoints
-    from robotdiffuse.evaluation.bench.page import worth_showing
+    from robotdiffuse.evaluation.bench.page import motions_to_replay
     from robotdiffuse.visualization.gallery import Exhibit, write_gallery
 
-    shown = worth_showing(bench, parts)
+    shown = motions_to_replay(bench, parts)
     if not shown:
         return None
     robot = shown[0].case.problem.robot

@@ -1,4 +1,4 @@
-"""What a data set is of: `manifest.json` in its folder."""
+"""The manifest of a data set: robot, scenes, settings and versions, in `manifest.json` in its folder."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -7,7 +7,6 @@ from typing import Any
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.output_files import write_atomically
-from robotdiffuse.problems.families import load_family
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box
@@ -18,7 +17,7 @@ MANIFEST = "manifest.json"
 
 @dataclass(frozen=True)
 class Manifest:
-    """What a data set is of."""
+    """Robot, scenes, settings and versions of a data set."""
 
     robot: str
     """A bundled name, or the path of a URDF."""
@@ -31,19 +30,19 @@ class Manifest:
     timing: str
     """How waypoints are spaced: "arc", evenly in joint-space length, or "time"."""
     families: dict[str, dict[str, Any]]
-    """Settings of the scenes by name, in the order of the numbers in `family`."""
+    """Settings of each family of scenes; their order gives the numbers of the array `family`."""
     floors: dict[str, dict[str, list[float]] | None]
-    """`center` and `size` of the box that the scenes of each family stand on [m]; None: of nothing."""
+    """`center` and `size` of the box that the scenes of each family stand on [m]; None without one."""
     slots: int
     """Most obstacles of a scene."""
     goals: int
     """Most goal configurations of a problem."""
     trajectories: int
-    """Planned in all."""
+    """Number of trajectories of the whole set."""
     shard: int
     """Rows per shard."""
     settings: dict[str, Any]
-    """All of the generation's."""
+    """Settings of the generation."""
     versions: dict[str, str]
 
     def __post_init__(self) -> None:
@@ -64,12 +63,12 @@ class Manifest:
         return len(self.joint_names)
 
     def floor(self, family: int) -> Box | None:
-        """What the scenes of a family stand on."""
+        """The box that the scenes of a family stand on; None without one."""
         floor = list(self.floors.values())[family]
         return None if floor is None else Box(**floor, name="floor")
 
     def check_robot(self, robot: Robot) -> None:
-        """Raises InputError if the data were made with another robot."""
+        """Raise InputError if the data were made with another robot."""
         found = robot_fingerprint(robot)
         if found != self.robot_fingerprint:
             raise InputError(
@@ -79,18 +78,18 @@ class Manifest:
 
 
 def floor_record(floor: Box | None) -> dict[str, list[float]] | None:
-    """A floor as `Manifest.floors` keeps it."""
+    """A floor in the form of `Manifest.floors`."""
     return None if floor is None else {"center": floor.center.tolist(), "size": floor.size.tolist()}
 
 
 def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
-    """Write manifest.json, whole or not at all; makes the folder. Raises InputError if it cannot."""
+    """Write manifest.json atomically, making the folder. Raises InputError if it cannot be written."""
     data = {"format": FORMAT, "dof": manifest.dof} | asdict(manifest)
     write_atomically(FilePath(folder) / MANIFEST, json.dumps(data, indent=1) + "\n", make_folder=True)
 
 
 def read_manifest(folder: str | FilePath) -> Manifest:
-    """Raises InputError if there is none, or it is damaged or of another version of the format."""
+    """Read manifest.json. Raises InputError if it is missing, damaged or of another version of the format."""
     file = FilePath(folder) / MANIFEST
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
@@ -109,33 +108,12 @@ def read_manifest(folder: str | FilePath) -> Manifest:
         data.pop("dof")
         for name in ("joint_names", "lower", "upper"):
             data[name] = tuple(data[name])
-        if "frames" in data:  # as waypoints were called once
-            data["waypoints"] = data.pop("frames")
-            data["settings"] = {"waypoints": data["waypoints"]} | data["settings"]
-        return Manifest(**_with_floors(data))
+        return Manifest(**data)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{file} is damaged: {error}") from None
 
 
-def _with_floors(data: dict[str, Any]) -> dict[str, Any]:
-    """Manifests once had no floors: they are those of the families in the table, unless settings say more."""
-    if "floors" in data:
-        return data
-    floors = {name: floor_record(_old_floor(name, of)) for name, of in data["families"].items()}
-    return data | {"floors": floors}
-
-
-def _old_floor(name: str, settings: dict[str, Any]) -> Box | None:
-    """ROP's floors had settings of their own once."""
-    if not settings.get("floor", True):
-        return None
-    if "floor_size" in settings:
-        size, thickness = settings["floor_size"], settings["floor_thickness"]
-        return Box((0.0, 0.0, -thickness / 2), (size, size, thickness))
-    return load_family(name).floor
-
-
 def check_format(file: FilePath, found: object) -> None:
-    """Raises InputError for another version of the format than this one's."""
+    """Raise InputError for another version of the format."""
     if found != FORMAT:
         raise InputError(f"{file}: format is {found}; this version reads {FORMAT}")
