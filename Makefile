@@ -48,7 +48,7 @@ docs: .venv/dev.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 # not benchmarks but parts of them, curves of runs that are to be named, and a comparison on data that are to be made
-NOT_RUN := %/report.py %/problems.py %/searches.py %/curves.py %/encoders_on_views.py
+NOT_RUN := %/report.py %/problems.py %/searches.py %/curves.py
 BENCHMARKS := $(filter-out $(NOT_RUN),$(wildcard benchmarks/*.py))
 
 bench: .venv/dev.stamp

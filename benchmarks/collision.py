@@ -18,7 +18,6 @@ from pathlib import Path
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numpy as np
-import torch
 from jaxtyping import Int
 from numba import njit
 from numpy import ndarray
@@ -31,7 +30,6 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import Space, motion_free
 from robotdiffuse.collision.motions import search_space
-from robotdiffuse.collision.signed_distance import SignedDistance
 from robotdiffuse.planning.search.rrt_connect import RRTConnectSettings
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP
@@ -142,34 +140,6 @@ def kernel_speed(title: str, places: list[Place]) -> list[str]:
     return [title, *(f"{x:.0f}" if x >= 20 else f"{x:.1f}" for x in figures), f"{1e3 * np.median(build):.1f}"]
 
 
-# -- signed distance in PyTorch ------------------------------------------------------------------------------
-
-
-def torch_speed(title: str, places: list[Place]) -> list[str]:
-    """Wall time of distances and gradient for 64 x 32 configurations [ms], one and two threads."""
-    row = [title]
-    for own in (False, True):
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            times = []
-            for robot, scene in places[:3]:
-                distance = SignedDistance(robot, scene)
-                rng = np.random.default_rng(SEED)
-                q = torch.tensor(
-                    rng.uniform(robot.lower, robot.upper, (64, 32, robot.dof)), dtype=torch.float32
-                )
-                q.requires_grad_()
-                for _ in range(8):
-                    start = time.perf_counter()
-                    cost = torch.relu(0.04 - distance(q)).square().sum()
-                    if own:
-                        cost = cost + torch.relu(0.01 - distance.self_distance(q)).square().sum()
-                    torch.autograd.grad(cost, q)
-                    times.append(time.perf_counter() - start)
-            row.append(f"{1e3 * np.median(times):.1f}")
-    return row
-
-
 # -- soundness and tightness ---------------------------------------------------------------------------------
 
 
@@ -220,7 +190,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     robot = load_robot("panda")
-    print(header("numpy", "numba", "torch", "coal"))
+    print(header("numpy", "numba", "coal"))
     sizes = sum(map(len, robot.spheres.values()))
     print(f"Panda: {sizes} spheres, {len(CollisionChecker(robot, Scene()).pairs)} checked pairs of links")
 
@@ -241,10 +211,6 @@ def main() -> None:
         columns,
         rows,
     )
-
-    columns = ["", "scene, 1 thread", "2 threads", "and self, 1 thread", "2 threads"]
-    rows = [torch_speed(title, places) for title, places in (solid | clouds).items()]
-    print_table("PyTorch signed distance and gradient, 64 x 32 configurations, median ms", columns, rows)
 
     if arguments.configurations > 0:
         sampled = {

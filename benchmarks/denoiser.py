@@ -33,6 +33,7 @@ from robotdiffuse.learning import motion_model
 from robotdiffuse.learning.clearance_features import link_clearances
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.planning.diffusion.diffusion import encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse
 from robotdiffuse.problems.problem import Problem
@@ -108,13 +109,12 @@ class Batch:
 
     def sample(self, guided: bool = True, count: int = SAMPLES, code: ndarray | None = None) -> ndarray:
         return self.model.sample(
-            self.code if code is None else code,
             self.problem.start,
             goal_of(self.problem),
-            count,
-            np.random.default_rng(SEED),
+            self.code if code is None else code,
             self.clearances,
-            STEPS,
+            np.random.default_rng(SEED),
+            SamplingSettings(samples=count, sampling_steps=STEPS),
             self.guide if guided else None,
         )
 
@@ -187,9 +187,10 @@ Inputs = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 def inputs(model: MotionModel) -> Inputs:
     """Of one pass of the denoiser, by its own shapes."""
     settings, generator = model.settings, torch.Generator().manual_seed(SEED)
-    features = model.dof * (2 + settings.sees_gradients) + settings.sees_clearances * len(model.robot.links)
+    features = model.dof * (2 + settings.clearance_gradients)
+    features += settings.clearance_features * len(model.robot.links)
     condition = settings.code + 2 * model.dof
-    shapes = ((SAMPLES, model.rows, features), (SAMPLES,), (SAMPLES, condition))
+    shapes = ((SAMPLES, model.waypoints, features), (SAMPLES,), (SAMPLES, condition))
     first, level, last = (torch.rand(shape, generator=generator) for shape in shapes)
     return first, level, last
 

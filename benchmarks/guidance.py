@@ -58,10 +58,10 @@ def try_all(loaded: RobotDiffuse, cases: list[Case], settings: Sequence[Setting]
     """One batch for each problem; the same random numbers for all settings."""
     methods = {}
     for gradient, scale, steps in settings:
-        changed = {"guidance_steps": gradient, "sampling_steps": steps}
-        planner = RobotDiffuse(replace(loaded.settings, **changed))
-        drawn = from_network(planner, guidance_scale=scale)
-        methods[name_of((gradient, scale, steps))] = sampled(drawn)
+        changed = replace(
+            loaded.settings, guidance_steps=gradient, sampling_steps=steps, guidance_scale=scale
+        )
+        methods[name_of((gradient, scale, steps))] = sampled(from_network(RobotDiffuse(changed)))
     found = tried(cases, methods, seeds=(5,), title=title)
     show(summary(f"{title}, {len(cases)} problems", found, (SINGLE, BEST, CPU)), width=WIDTH)
     return {setting: found[name_of(setting)] for setting in settings}

@@ -21,13 +21,11 @@ from dataclasses import replace
 from pathlib import Path as File
 
 import numpy as np
-from jaxtyping import Float
 from numpy import ndarray
 from report import WIDTH, header, print_table
 from searches import bumps, network, search
 
 from problems import PANDA, SEARCH_TIME, Case, Drawn, draw_cases, families_of
-from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.types import Path
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
@@ -45,8 +43,6 @@ from robotdiffuse.evaluation.runs import Clock, Fields, Method, Trial, tried
 from robotdiffuse.evaluation.statistics import bootstrap_interval
 from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, SOLVED, summary
 from robotdiffuse.evaluation.tables import show
-from robotdiffuse.learning.motion_model import MotionModel
-from robotdiffuse.planning.diffusion.diffusion import encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.problem import Problem
@@ -76,7 +72,8 @@ def alone(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]:
             f"{name}, both": from_network(of, other, hidden=True),
         }
         if model.settings.null_condition:
-            found[f"{name}, condition hidden"] = from_network(of, guidance_scale=0.0)
+            unconditional = RobotDiffuse(replace(of.settings, guidance_scale=0.0))
+            found[f"{name}, condition hidden"] = from_network(unconditional)
     control = without_network(planner.settings, model.settings.waypoints)
     return found | {"control: guidance of line and bumps": control}
 
@@ -97,17 +94,9 @@ def confirmed(planner: RobotDiffuse) -> Method:
     return call
 
 
-class Told(RobotDiffuse):
-    """With the code of the scene."""
-
-    def code(
-        self, model: MotionModel, checker: CollisionChecker, rng: np.random.Generator
-    ) -> Float[ndarray, "code"]:
-        return encode(model, checker, self.settings.points, rng)
-
-
 def equal_time(every: dict[str, list[Case]], settings: RobotDiffuseSettings) -> None:
-    planners = {"as it ships": RobotDiffuse(settings), "with the code": Told(settings)}
+    with_code = RobotDiffuse(replace(settings, guidance_scale=1.0))
+    planners = {"as it ships": RobotDiffuse(settings), "with the code": with_code}
     for planner in planners.values():
         planner.warm_up(next(iter(every.values()))[0].problem, "short")  # loads the network
     methods = {name: planned(planner, until="limit", clearance=0.0) for name, planner in planners.items()}

@@ -51,7 +51,9 @@ class Arena:
     def __init__(self, trial: Trial, planner: RobotDiffuse) -> None:
         problem = trial.problem
         assert isinstance(problem.goal, JointGoal)
-        self.planner, self.rng, self.robot = planner, trial.rng(), problem.robot
+        # like the planner that ships, without the code of the scene
+        self.planner = RobotDiffuse(replace(planner.settings, guidance_scale=0.0))
+        self.rng, self.robot = trial.rng(), problem.robot
         self.state = random_state(SEED, trial.place)
         self.checker = CollisionChecker(problem.robot, problem.scene)
         self.start_goal = StartGoal(self.checker, problem.start, problem.goal.positions)

@@ -31,7 +31,7 @@ from robotdiffuse.validation.validator import Report, VerifySettings, verifier
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
 
-NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4)
+NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4, guidance_scale=1.0)
 """How networks are sampled where they are looked at alone: without guidance, the planner's steps are few."""
 UNSOLVED = Status.NO_PATH.value
 SHORTEST = 1 + 1e-6
@@ -189,13 +189,11 @@ def from_network(
     sampler: ModelSampler,
     seen: Callable[[Trial], Problem] | None = None,
     hidden: bool = False,
-    guidance_scale: float = 1.0,
 ) -> Draw:
     """Straight from the network: no refinement, no search, no shortcuts.
 
     seen: whose obstacles are encoded, in place of the problem's own. hidden: the denoiser is told that no
-    link is anywhere near an obstacle. Guidance knows the obstacles in any case. guidance_scale: see
-    `MotionModel.denoise_guided`; 0 hides the condition, the code with it.
+    link is anywhere near an obstacle. Guidance knows the obstacles in any case.
     """
 
     def draw(trial: Trial, checker: CollisionChecker) -> ndarray:
@@ -206,14 +204,14 @@ def from_network(
         code = encode(model, other, sampler.settings.points, rng)
         ends = problem.start, goal_of(problem)[None]
         told = nothing_near(model) if hidden else None
-        return sampler.draw(model, checker, code, *ends, rng, told, guidance_scale=guidance_scale)
+        return sampler.draw(model, checker, code, *ends, rng, told)
 
     return draw
 
 
 def nothing_near(model: "MotionModel") -> "ClearanceFn":
     """What a model is told of the obstacles where there are none."""
-    links, width = len(model.robot.links), model.dof if model.settings.sees_gradients else 0
+    links, width = len(model.robot.links), model.dof if model.settings.clearance_gradients else 0
 
     def clearances(q: ndarray) -> ndarray:
         told = np.zeros((*q.shape[:2], links + width), np.float32)

@@ -28,14 +28,13 @@ from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tens
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
 from robotdiffuse.learning.denoisers.unet import UNetSettings
-from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.encoders.point_autoencoder import PointAutoencoder, PointAutoencoderSettings
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.learning.objectives import OBJECTIVES
 from robotdiffuse.learning.robot_identity import RobotIdentity
+from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.training import loop as training_run
 from robotdiffuse.learning.training import planner as training
-from robotdiffuse.learning.training import task
 from robotdiffuse.learning.training.batches import (
     Batch,
     Batches,
@@ -103,7 +102,7 @@ def planner_settings(data, **changes) -> PlannerTraining:
         batch=16,
         warmup_steps=3,
         learning_rate=3e-3,
-        turns=0,
+        turned_copies=0,
         denoiser_settings=SMALL_DENOISER,
         validation_problems=1,
     )
@@ -155,7 +154,7 @@ def start(kind, settings, out, *launcher):
     """A training of training_processes.py, in a process group of its own."""
     file = out.parent / f"{out.name}.json"
     file.write_text(json.dumps(settings.to_json()))
-    script = str(Path(__file__).parents[1] / "helpers" / "training_processes.py")
+    script = str(Path(__file__).parents[2] / "helpers" / "training_processes.py")
     return subprocess.Popen(
         [sys.executable, *launcher, script, kind, str(file), str(out)],
         stdout=subprocess.PIPE,
@@ -229,33 +228,6 @@ def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
     assert (found - wanted).norm() < (0.01 if fast_bf16() else 1e-5) * wanted.norm()
 
 
-def test_takes_in_data_that_are_still_being_made(tmp_path, data, monkeypatch, capsys):
-    """Shards that appear are drawn from after the next checkpoint; a whole folder is read once."""
-    shard_path(data, 1).rename(tmp_path / "later")
-    known = []
-    original = TrainingRun.step
-
-    def step(self, loss):
-        original(self, loss)
-        if self.at.step == 3:
-            (tmp_path / "later").rename(shard_path(data, 1))
-
-    read = task.load_data
-
-    def count_reading(*given):
-        known.append(read(*given))
-        return known[-1]
-
-    monkeypatch.setattr(TrainingRun, "step", step)
-    monkeypatch.setattr(task, "load_data", count_reading)
-    settings = planner_settings(data, checkpoint_seconds=0.0, samples=96)
-    train_planner(settings, str(tmp_path / "out"))
-    assert len(known) == 2 and len(known[0]) < len(known[1])
-    assert f"grown to {len(known[1]):,} trajectories" in capsys.readouterr().err
-    about = json.loads((tmp_path / "out" / "model.json").read_text())["training"]
-    assert about["trajectories"] == len(known[1]) and about["data"] == known[1].digest
-
-
 @pytest.mark.parametrize("denoiser", DENOISERS)
 def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
     """On the meta device, which has no numbers, but refuses tensors of other devices as a GPU does."""
@@ -264,7 +236,7 @@ def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
         data, denoiser=denoiser, denoiser_settings=None, losses=losses, condition_drop=0.5
     )
     encoder = load_encoder(data.parent / "encoder")
-    model = MotionModel(RobotIdentity.of(arm), training._model_settings(settings, encoder))
+    model = MotionModel(RobotIdentity.of(arm), training.model_settings(settings, encoder))
     loaded = load_data(str(data), arm, encoder, WAYPOINTS, lambda text: None)
 
     def far(scenes, q):
@@ -275,7 +247,7 @@ def test_losses_are_computed_where_the_model_is(denoiser, data, arm):
     elsewhere = Processes("cpu")
     elsewhere.device = torch.device("meta")
     model = model.to("meta")
-    loss = training._Loss(model, arm, settings, elsewhere)(batch, 1.0, rng, torch.arange(4) > 1)
+    loss = training.PlannerLoss(model, arm, settings, elsewhere)(batch, 1.0, rng, torch.arange(4) > 1)
     loss.backward()
     assert loss.device.type == "meta"
     assert all(p.grad is not None for p in model.denoiser.parameters())
@@ -323,11 +295,8 @@ def test_interrupted_training_ends_the_same(kind, tmp_path, data, monkeypatch):
     "changes",
     [
         {"target": "absolute", "smooth_noise": False},
-        {"parametrization": "b_spline", "rows": 8},
-        {"parametrization": "b_spline", "rows": 8, "target": "absolute"},
         {"objective": "noise"},
-        {"objective": "velocity", "schedule": ScheduleSettings(kind="flow"), "sampler": "euler"},
-        {"sees_clearances": False, "sampler": "dpm_solver"},
+        {"clearance_features": False, "sampler": "ddpm"},
         {"losses": LossSettings(point=0.1, collision=0.1, waypoints=4)},
     ],
     ids=lambda changes: "-".join(map(str, changes)),
@@ -346,7 +315,8 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
     def clearances(q):
         return np.full((*q.shape[:2], 3), 0.3, np.float32)
 
-    q = model.sample(z, start, goal, 3, np.random.default_rng(0), clearances, steps=8)
+    settings = SamplingSettings(samples=3, sampling_steps=8)
+    q = model.sample(start, goal, z, clearances, np.random.default_rng(0), settings)
     assert q.shape == (3, WAYPOINTS, 3) and np.isfinite(q).all()
     assert (q[:, 0] == start).all() and (q[:, -1] == goal).all()
     assert (q >= arm.lower).all() and (q <= arm.upper).all()
@@ -359,12 +329,12 @@ def test_two_trainings_do_not_share_a_folder(tmp_path, data):
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES)
-def test_errors_in_space_weigh_the_same_whatever_is_predicted(data, arm, objective):
+def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, arm, objective):
     """They once had the weight of the output's error: 10,000 times too much for noise at the last level."""
     encoder = load_encoder(data.parent / "encoder")
     loaded = load_data(str(data), arm, None, WAYPOINTS, print)
     settings = planner_settings(data, objective=objective)
-    model = MotionModel(RobotIdentity.of(arm), training._model_settings(settings, encoder))
+    model = MotionModel(RobotIdentity.of(arm), training.model_settings(settings, encoder))
     batches = Batches(loaded, model, lambda _, q: np.zeros((*q.shape[:2], 3), np.float32), 0.1, 5.0)
     levels = np.arange(1, model.schedule.steps + 1)
     batch = batches.at(np.zeros(len(levels), np.int64), levels, np.random.default_rng(0))
@@ -400,7 +370,7 @@ def test_planner_learns_which_side(tmp_path, data, arm):
         def clearances(q, checker=checker):
             return checker.link_clearances(q.reshape(-1, 3)).reshape(*q.shape[:2], 3)
 
-        q = model.sample(z, start, goal, 4, rng, clearances)
+        q = model.sample(start, goal, z, clearances, rng, SamplingSettings(samples=4))
         bow = q[:, WAYPOINTS // 2] - (start + goal) / 2
         assert (bow * side > 0.1).all()
         np.testing.assert_allclose(bow.mean(), 0.5 * side, atol=0.2)
@@ -422,7 +392,7 @@ def test_codes_are_kept_beside_the_data(data, arm):
 def test_turned_copies_are_for_training_alone(data, arm):
     encoder, said = load_encoder(data.parent / "encoder"), []
     plain = load_data(str(data), arm, encoder, WAYPOINTS, said.append)
-    turned = load_data(str(data), arm, encoder, WAYPOINTS, said.append, turns=2)
+    turned = load_data(str(data), arm, encoder, WAYPOINTS, said.append, turned_copies=2)
     assert turned.validation == plain.validation and len(turned) > len(plain)
     for split, more in zip(plain.split(10**6), turned.split(10**6), strict=True):
         apart = np.abs(split.q[:, None, :, 1:] - more.q[None, :, :, 1:]).max((2, 3))
@@ -486,7 +456,7 @@ def test_damaged_checkpoint_is_named(tmp_path, data):
         train_planner(planner_settings(data), str(tmp_path / "out"))
 
 
-def test_splits_and_frames(data, arm):
+def test_splits_and_waypoints(data, arm):
     """Training and validation share no scene, the test split stays out, and waypoints are even again."""
     loaded = load_data(str(data), arm, load_encoder(data.parent / "encoder"), WAYPOINTS, print)
     kept, held_out = loaded.split(1000)
@@ -534,8 +504,12 @@ def test_trains_without_some_conditions(data, tmp_path):
 
     plain, pushed = (
         model.sample(
-            model.encode(np.zeros((0, 3))), *ends, 2, np.random.default_rng(0), far, guidance_scale=w
+            *ends,
+            model.encode(np.zeros((0, 3))),
+            far,
+            np.random.default_rng(0),
+            SamplingSettings(samples=2, guidance_scale=scale),
         )
-        for w in (1.0, 3.0)
+        for scale in (1.0, 3.0)
     )
     assert not np.array_equal(plain, pushed)
