@@ -127,7 +127,7 @@ def test_what_is_predicted_is_where_it_was_learnt(monkeypatch: pytest.MonkeyPatc
     assert p.shape == tuple(2 * n for n in SHAPE) and p.dtype == np.float32
     free = volume.free.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     assert (p[free] == 0).all()
-    reach = task._reachable.repeat(2, 0).repeat(2, 1).repeat(2, 2)
+    reach = reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
     asked = ~free & reach
     assert average_precision(p[asked], fine[asked]) > 2 * fine[asked].mean()
 

@@ -216,7 +216,7 @@ def test_a_sampler_by_name_is_that_of_a_checkpoint() -> None:
 
 
 def test_sampling_settings_are_checked() -> None:
-    with pytest.raises(InputError, match="unknown sampling.sampler 'heun'; known: ddim, ddpm"):
+    with pytest.raises(InputError, match=r"unknown sampling\.sampler 'heun'; known: ddim, ddpm"):
         SamplingSettings(sampler="heun")
     with pytest.raises(InputError, match=r"guided_share is 1.5"):
         SamplingSettings(guided_share=1.5)
