@@ -14,6 +14,7 @@ from robotdiffuse.learning.completion.network import (
     CompletionNetwork,
     CompletionSettings,
     folded,
+    reachable,
     unfolded,
     voxel_centers,
 )
