@@ -54,7 +54,7 @@ def test_wrong_robot_is_refused(tmp_path):
 
 
 def test_other_links_with_spheres_are_refused(tmp_path):
-    """Of the same joints and measures; the model was once asked about clearances that mean other links."""
+    """A robot with the same joints and dimensions: its clearances would belong to other links."""
     arm = box_arm()
     save_network("model", small_model(), tmp_path, {})
     bare = replace(arm, spheres={link: arm.spheres[link] for link in ("l1", "l2")})

@@ -57,8 +57,8 @@ def few_held_out(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_samples_tell_the_truth(family: str) -> None:
-    """Next to nothing of what is seen free is occupied, and most of what is seen occupied is."""
+def test_samples_agree_with_the_scene(family: str) -> None:
+    """Almost none of the voxels seen free are occupied, and most of those seen occupied are."""
     samples = draw_samples((family,), PANDA, range(4))
     truth = unpack_fine(samples.truth)
     free, occupied = (samples.seen & FREE) > 0, (samples.seen & OCCUPIED) > 0
@@ -102,8 +102,8 @@ def test_the_network_s_inputs() -> None:
     np.testing.assert_allclose(planes[6], np.hypot(*np.moveaxis(voxel_centers()[..., :2], -1, 0)), atol=1e-6)
 
 
-def test_what_is_predicted_is_where_it_was_learnt(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small network learns one sample by heart: the voxels of its answer are those of the truth."""
+def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small network that has memorised one sample predicts the true voxels."""
     settings = replace(TINY, learning_rate=1e-2)
     task = training.CompletionTask(settings, training.Processes("cpu"))
     rng = np.random.default_rng(1)
@@ -129,8 +129,8 @@ def test_what_is_predicted_is_where_it_was_learnt(monkeypatch: pytest.MonkeyPatc
     free = volume.free.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     assert (p[free] == 0).all()
     reach = reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
-    asked = ~free & reach
-    assert average_precision(p[asked], fine[asked]) > 2 * fine[asked].mean()
+    counted = ~free & reach
+    assert average_precision(p[counted], fine[counted]) > 2 * fine[counted].mean()
 
 
 def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path) -> None:
@@ -183,8 +183,8 @@ def test_temperature_and_calibration() -> None:
     )
 
 
-def test_nothing_is_predicted_where_nothing_was_learned() -> None:
-    """Walls of the network's fancy stood a metre around the arm."""
+def test_nothing_is_predicted_beyond_reach() -> None:
+    """Training covers no voxels there, so the network would predict walls a metre around the arm."""
     unknown = np.zeros((1, *SHAPE), np.uint8)
     p = load_completion().probabilities(*(torch.from_numpy(unknown) for _ in range(2))).detach().numpy()
     reachable = training.reachable().repeat(2, 0).repeat(2, 1).repeat(2, 2)
@@ -192,15 +192,16 @@ def test_nothing_is_predicted_where_nothing_was_learned() -> None:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_bundled_weights_know_more_than_how_much_is_occupied(family: str) -> None:
-    """Average precision over unknown voxels of 2 cm above ground: of a guess, the share that is occupied."""
+def test_bundled_weights_are_better_than_a_constant(family: str) -> None:
+    """Average precision over unknown voxels of 2 cm above the ground; a constant has the share of occupied
+    ones."""
     samples = draw_samples((family,), PANDA, [11, 12, 13, 14])
     network, above = load_completion(), training.voxel_centers()[..., 2] > 0.02
     with torch.no_grad():
         p = network.probabilities(*(torch.from_numpy(a) for a in (samples.seen, samples.behind))).numpy()
     truth = unpack_fine(samples.truth)
-    asked = ((samples.seen & (FREE | OCCUPIED)) == 0) & training.reachable() & above
+    counted = ((samples.seen & (FREE | OCCUPIED)) == 0) & training.reachable() & above
     stated = np.stack([unpack_fine(pack_fine(one > 0.1)) for one in p])
-    called, true = stated[asked], truth[asked]
+    called, true = stated[counted], truth[counted]
     assert called[true].mean() > 0.4, "recall"
     assert true[called].mean() > 3 * true.mean(), "precision"

@@ -188,7 +188,8 @@ def test_fused_and_unfused_attention_agree(monkeypatch, causal):
 
 
 def test_unet_pads_and_crops():
-    """Nothing is added to a length that can be halved often enough; others are extended by the last waypoint."""
+    """Nothing is added to a length that can be halved often enough; others are extended by the last
+    waypoint."""
     for waypoints, padding in ((12, 0), (13, 3), (254, 2), (1, 3)):
         network = denoiser("unet", waypoints)
         assert network.padding == padding

@@ -108,7 +108,7 @@ def test_order_does_not_matter(name, n, seed):
 @pytest.mark.parametrize("name", [name for name in ENCODERS if name != "dgcnn"])
 @pytest.mark.parametrize("n", [1, 2, 20])
 def test_repetition_does_not_matter(name, n):
-    """Not so for DGCNN: repeated points are each other's nearest neighbours."""
+    """DGCNN is left out: repeated points are each other's nearest neighbours."""
     encoder, points = small(name), cloud(n)
     torch.testing.assert_close(encoder(points.repeat(1, 3, 1)), encoder(points), atol=1e-5, rtol=1e-5)
 
@@ -201,7 +201,7 @@ def test_compression_autoencoder_has_the_papers_layers():
 
 
 def test_arranged_clouds():
-    """Sorted as the ordered clouds of `surface_clouds` are already, and thinned or repeated evenly."""
+    """Points are sorted like the ordered clouds of `surface_clouds`, and thinned or repeated evenly."""
     encoder = CompressionAutoencoder(SMALL_CAE)
     scenes = random_scenes(20, 12, np.random.default_rng(0))
     clouds = partial(surface_clouds, scenes, region=encoder.settings.region)
@@ -236,7 +236,7 @@ def test_compression_autoencoder_reconstructs_a_small_set():
 
 
 def test_edge_convolution_is_the_maximum_over_edges():
-    """The layer as it is written in the paper, edge by edge."""
+    """Against the layer as in the paper, edge by edge."""
     torch.manual_seed(0)
     layer, x = EdgeConvolution(5, 7, 4), torch.randn(2, 12, 5)
     near = torch.ones(2, 12, dtype=torch.bool)
@@ -335,7 +335,7 @@ def planner(data, encoder, **changes) -> PlannerTraining:
 
 @every_encoder
 def test_joint_training_changes_the_encoder(name, data, tmp_path):
-    """And the planner's file holds it."""
+    """The planner's file holds the trained encoder."""
     planned = planner(data, name, encoder_settings=SMALL[name], learning_rate=1e-2)
     fresh = small(name)
     train_planner(planned, str(tmp_path / "out"))

@@ -65,8 +65,8 @@ def flow_errors(name: str, schedule: NoiseSchedule, steps: list[int]) -> np.ndar
 def exact_moments(
     name: str, schedule: NoiseSchedule, steps: int, eta: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Exact mean and covariance of the samples. A sample is affine in the noises that are drawn, so one sample
-    without noise and one with a unit in each component of each draw determine both."""
+    """Exact mean and covariance of the samples. A sample is affine in the noises that are drawn, so one
+    sample without noise and one with a unit in each component of each draw determine both."""
     draws = 0
     impulses = np.zeros((1 + 2 * (steps + 1), steps + 1, 2))
     impulses[1:] = np.eye(2 * (steps + 1)).reshape(-1, steps + 1, 2)
@@ -93,8 +93,8 @@ def test_order_of_ddim() -> None:
 
 
 def test_order_of_ddim_on_the_schedule() -> None:
-    """Levels are evenly spaced in t: at the ends of the schedule the steps in log-SNR do not shrink, which costs a
-    little of the order."""
+    """Levels are evenly spaced in t: at the ends of the schedule the steps in log-SNR do not shrink, which
+    costs a little of the order."""
     steps = [32, 64, 128, 256]
     errors = flow_errors("ddim", cosine_schedule(8192), steps)
     assert (np.diff(errors) < 0).all()
@@ -141,8 +141,8 @@ def test_ddpm_is_ddim_with_all_noise_afresh(steps):
 @pytest.mark.parametrize("name", SAMPLERS)
 @pytest.mark.parametrize("steps", [1, 2, 3, 199, 200])
 def test_calls_of_the_predictor(name, steps):
-    """One call per step, from the last level downwards. All values are finite, also between levels of equal noise,
-    whatever the predictor returns. The result is the last prediction."""
+    """One call per step, from the last level downwards. All values are finite, also between levels of equal
+    noise, whatever the predictor returns. The result is the last prediction."""
     schedule, rng, levels, predictions = cosine_schedule(), np.random.default_rng(0), [], []
 
     def predict(x, level):
@@ -291,7 +291,8 @@ def test_objective_round_trip(name, tensors):
 @pytest.mark.parametrize("limit", [5.0, 100.0])
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_objectives_weigh_levels_alike(name, limit):
-    """The weighted error of the output is that of the clean trajectory wherever the weight is below the limit."""
+    """The weighted error of the output is that of the clean trajectory wherever the weight is below the
+    limit."""
     schedule, objective = cosine_schedule(), OBJECTIVES.make(name)
     t = np.arange(1, 200)
     a, s = schedule.signal[t], schedule.noise[t]
