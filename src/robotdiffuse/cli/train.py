@@ -9,7 +9,7 @@ from robotdiffuse.cli.arguments import count, names, natural, positive, share
 from robotdiffuse.core.errors import InputError, shown
 
 SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
-PARTS = (*("denoiser", "objective", "sampler", "sampling_steps", "target", "condition_drop", "waypoints"),)
+PARTS = ("denoiser", "objective", "sampler", "sampling_steps", "target", "condition_drop", "waypoints")
 """Of the planner's config."""
 
 

@@ -3,10 +3,10 @@
 The straight line if it is free. Else a search for a first path, within milliseconds, then ever shorter ones;
 and, for a share of the work, batches of trajectories sampled by the diffusion model under collision guidance,
 or, where none of them is free, the same after more gradient steps (refinement). The model's inputs are
-clearances and, by default, no code of the scene (see the setting `guidance_scale`). For an arm without weights the batches are smooth
-noise after as many such steps (see smooth_noise.py). What the batches propose is simplified by the same code
-as what search finds, and the shortest path of either bounds the next search. Everything goes through the
-validator, and the result names the stage that its path comes from.
+clearances and, by default, no code of the scene (see the setting `guidance_scale`). For an arm without
+weights the batches are smooth noise after as many such steps (see smooth_noise.py). What the batches propose
+is simplified by the same code as what search finds, and the shortest path of either bounds the next search.
+Everything goes through the validator, and the result names the stage that its path comes from.
 
 Under path constraints it is search alone: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
 shorter (the mean of 20 upright cups and of 20 lines; median: the same).
@@ -61,8 +61,8 @@ class RobotDiffuseSettings(GuidedSamplingSettings, name="robotdiffuse"):
     """Calls of the denoiser per batch. With guidance, more bring no more solved problems, see
     benchmarks/results/guidance.txt."""
     guidance_scale: float = 0.0
-    """Scale of classifier-free guidance. At 0 the condition is hidden, and the scene's code is not computed: with
-    it paths are as long, see benchmarks/results/network_inputs.txt. Weights that cannot do without their
+    """Scale of classifier-free guidance. At 0 the condition is hidden, and the scene's code is not computed:
+    with it paths are as long, see benchmarks/results/network_inputs.txt. Weights that cannot do without their
     condition are then sampled with 1."""
     refinement_steps: Natural = 40
     """Most gradient steps on the sampled trajectories that still collide."""
@@ -92,8 +92,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         """What they took of late [s]: the last one, or more if those before did."""
 
     def prepare(self, robot: Robot) -> None:
-        """See `planning.planner.Planner`: given weights. Those of the package are loaded in a call's own time,
-        if it has LOAD_SECONDS left for that, else by `warm_up` and `load_wanted`."""
+        """See `planning.planner.Planner`: given weights. Those of the package are loaded in a call's own
+        time, if it has LOAD_SECONDS left for that, else by `warm_up` and `load_wanted`."""
         if self.settings.weights is not None:
             self._load(robot)
 
