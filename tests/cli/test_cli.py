@@ -1,11 +1,9 @@
 """The command line, run as a user would: exit status, one line for bad input, files that come out."""
 
 import json
-import multiprocessing
 import runpy
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,15 +13,9 @@ import pytest
 from helpers.made_arms import chain, row, written
 from helpers.quick_preparation import QUICK
 from robotdiffuse.cli import main
-from robotdiffuse.cli.background_factory import filled_meanwhile
 from robotdiffuse.core.results import PlanResult, load_result
 from robotdiffuse.core.types import Status
-from robotdiffuse.datasets.manifest import read_manifest, write_manifest
-from robotdiffuse.datasets.shards import check_shard, shard_indices
-from robotdiffuse.generation import GenerationSettings
-from robotdiffuse.generation.factory import manifest_of
 from robotdiffuse.learning.denoisers.unet import UNetSettings
-from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
 from robotdiffuse.planning import PLANNERS, planner_settings
@@ -188,17 +180,15 @@ BAD_CALL = {
     "train twice as long": (
         ["train", "encoder", "--out", "e", "--minutes", "1", "--samples", "9"], "not allowed with"
     ),
-    "unknown sampler": ([*TRAIN, "--sampler", "heun"], "known: ddim, ddpm, dpm_solver, euler"),
-    "unknown schedule": ([*TRAIN, "--schedule", "sine"], "known: cosine, flow, linear"),
-    "unknown objective": ([*TRAIN, "--objective", "score"], "known: clean, noise, velocity"),
+    "unknown sampler": ([*TRAIN, "--sampler", "heun"], "known: ddim, ddpm"),
+    "unknown objective": ([*TRAIN, "--objective", "score"], "known: clean, noise"),
     "unknown denoiser": ([*TRAIN, "--denoiser", "net"], "known: decoder_only, encoder_decoder, transformer"),
-    "unknown parametrization": ([*TRAIN, "--parametrization", "spline"], "known: b_spline, waypoints"),
     "unknown target": ([*TRAIN, "--target", "line"], "known: absolute, limits, residual"),
-    "rows of waypoints": ([*TRAIN, "--rows", "20"], "rows is 20"),
     "too few waypoints": ([*TRAIN, "--waypoints", "2"], "waypoints is 2"),
     "no condition at all": ([*TRAIN, "--condition-drop", "1"], "condition_drop is 1.0"),
     "unknown device": ([*TRAIN, "--device", "tpu"], "known: cpu, cuda"),
-    "no factory": ([*TRAIN, "--generate", "0"], "'0' is not an integer of at least 1"),
+    "no data workers": ([*TRAIN, "--workers", "0"], "'0' is not an integer of at least 1"),
+    "workers for existing data": ([*TRAIN, "--workers", "2"], "--workers is for data that are made"),
 }  # fmt: skip
 
 
@@ -229,10 +219,9 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         return {}
 
     monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
-    parts = ["--objective", "velocity", "--sampler", "euler", "--schedule", "flow", "--waypoints", "64"]
-    spline = ["--parametrization", "b_spline", "--rows", "12", "--condition-drop", "0.2"]
-    spline += ["--target", "residual"]
-    assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, *spline, "--device", "cpu") == 0
+    parts = ["--objective", "noise", "--sampler", "ddim", "--waypoints", "64", "--condition-drop", "0.2"]
+    parts += ["--target", "residual"]
+    assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, "--device", "cpu") == 0
     assert run(*TRAIN, "--config", "paper") == 0
     assert run(*TRAIN, "--config", "table2_unet", "--denoiser", "decoder_only") == 0
     changed, paper, row = trained
@@ -240,50 +229,14 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         paper,
         denoiser="unet",
         denoiser_settings=UNetSettings.paper_size(),
-        objective="velocity",
-        sampler="euler",
-        schedule=ScheduleSettings(kind="flow"),
+        objective="noise",
+        sampler="ddim",
         target="residual",
         waypoints=64,
-        parametrization="b_spline",
-        rows=12,
         condition_drop=0.2,
         device="cpu",
     )
     assert row.denoiser == "decoder_only" and row.denoiser_settings is None
-
-
-def test_data_are_made_meanwhile(tmp_path: Path) -> None:
-    """The factory goes on by the manifest while the folder is used; it leaves whole shards and no process."""
-    out = tmp_path / "data"
-    settings = GenerationSettings(trajectories=10_000, shard=2, waypoints=16)
-    out.mkdir()
-    write_manifest(out, manifest_of(settings))
-    with filled_meanwhile(str(out), 1, "panda"):
-        first = len(shard_indices(out))
-        assert first > 0
-        end = time.monotonic() + 300
-        while len(shard_indices(out)) == first:
-            assert time.monotonic() < end
-            time.sleep(0.05)
-        assert len(multiprocessing.active_children()) == 1
-    assert not multiprocessing.active_children()
-    made = shard_indices(out)
-    assert not list(out.glob(".shard*")) and len(made) < settings.shards
-    for index in made:
-        check_shard(out, index, read_manifest(out))
-
-
-def test_data_that_cannot_be_made_meanwhile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One line, before training begins."""
-    out = tmp_path / "data"
-    out.mkdir()
-    manifest = manifest_of(GenerationSettings())
-    write_manifest(out, replace(manifest, versions=manifest.versions | {"numpy": "0"}))
-    assert run(*TRAIN, "--data", out, "--generate", 1) == 2
-    error = capsys.readouterr().err
-    assert "was begun with numpy 0" in error and error.count("\n") == 1
-    assert not multiprocessing.active_children()
 
 
 def test_problem_of_a_jsonl_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

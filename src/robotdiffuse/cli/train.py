@@ -2,7 +2,6 @@
 
 import argparse
 import os
-from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -10,10 +9,7 @@ from robotdiffuse.cli.arguments import count, names, natural, positive, share
 from robotdiffuse.core.errors import InputError, shown
 
 SHARED = ("minutes", "samples", "seed", "batch", "learning_rate", "threads")
-PARTS = (
-    *("denoiser", "objective", "sampler", "sampling_steps", "parametrization", "rows", "target"),
-    *("condition_drop", "waypoints", "views"),
-)
+PARTS = ("denoiser", "objective", "sampler", "sampling_steps", "target", "condition_drop", "waypoints")
 """Of the planner's config."""
 
 
@@ -69,20 +65,15 @@ def add(commands: argparse._SubParsersAction) -> None:
     planner.add_argument(
         "--encoder",
         metavar="FOLDER",
-        help="folder with a trained encoder, or the name of one to train along, pointnet or dgcnn, or "
-        "completing_autoencoder, which comes trained; needed for --data unless the config names one "
-        "(default: the one that comes with the package)",
+        help="folder with a trained encoder, or the name of one to train jointly, pointnet or dgcnn; needed "
+        "for --data unless the config names one (default: the one that comes with the package)",
     )
     planner.add_argument("--robot", metavar="NAME", help="bundled name or URDF of the robot (panda)")
     planner.add_argument(
         "--trajectories", type=count, metavar="N", help="motions to make, without --data (60,000)"
     )
     planner.add_argument(
-        "--generate",
-        type=count,
-        metavar="N",
-        help="meanwhile fill the data folder with N processes; training begins with the first shard, and "
-        "takes in the others. Without --data: make them first, with N processes (all cores)",
+        "--workers", type=count, metavar="N", help="processes that make motions, without --data (all cores)"
     )
     _add_shared(planner, out_required=False)
     _add_device(planner)
@@ -90,25 +81,20 @@ def add(commands: argparse._SubParsersAction) -> None:
     parts.add_argument(
         "--denoiser", metavar="NAME", help="transformer, encoder_decoder, decoder_only or unet"
     )
-    parts.add_argument("--objective", metavar="NAME", help="what is predicted: clean, noise or velocity")
-    parts.add_argument("--schedule", metavar="NAME", help="of the noise: cosine, linear or flow")
-    parts.add_argument("--sampler", metavar="NAME", help="for planning: ddim, ddpm, dpm_solver or euler")
+    parts.add_argument("--objective", metavar="NAME", help="what is predicted: clean or noise")
+    parts.add_argument("--sampler", metavar="NAME", help="for planning: ddim or ddpm")
     parts.add_argument(
         "--sampling-steps", type=count, metavar="N", help="for planning: calls of the denoiser for a batch"
     )
-    parts.add_argument("--parametrization", metavar="NAME", help="of motions: waypoints or b_spline")
-    parts.add_argument("--rows", type=count, metavar="N", help="control points of b_spline")
-    parts.add_argument("--target", metavar="NAME", help="residual, to the straight line, or absolute")
+    parts.add_argument(
+        "--target",
+        metavar="NAME",
+        help="what motions are relative to: residual (the straight line), absolute or limits",
+    )
     parts.add_argument(
         "--condition-drop", type=share, metavar="P", help="share without condition, for its guidance"
     )
-    parts.add_argument(
-        "--views",
-        action="store_const",
-        const=True,
-        help="tell the encoder what one camera sees of each scene, not of all its surfaces",
-    )
-    parts.add_argument("--waypoints", "--frames", type=count, metavar="N", help="waypoints of a motion")
+    parts.add_argument("--waypoints", type=count, metavar="N", help="waypoints of a motion")
     planner.set_defaults(run=run_planner)
 
     baseline = kinds.add_parser(
@@ -174,9 +160,7 @@ def run_completion(arguments: argparse.Namespace) -> int:
 
 
 def run_planner(arguments: argparse.Namespace) -> int:
-    from robotdiffuse.cli.background_factory import filled_meanwhile
     from robotdiffuse.learning.denoisers import DENOISERS
-    from robotdiffuse.learning.diffusion import ScheduleSettings
     from robotdiffuse.learning.training.configs import CONFIGS, planner_training
     from robotdiffuse.learning.training.planner import train_planner
 
@@ -187,21 +171,14 @@ def run_planner(arguments: argparse.Namespace) -> int:
     if "denoiser" in given and CONFIGS[arguments.config].changes.get("denoiser_settings") is not None:
         # the config's are of its own denoiser; those of another of the same size
         given["denoiser_settings"] = DENOISERS.defaults(arguments.denoiser).paper_size()
-    if arguments.schedule is not None:
-        given["schedule"] = ScheduleSettings(kind=arguments.schedule)
     if arguments.data is None:
         return _run_for_robot(arguments, given)
     if arguments.out is None:
         raise InputError("--data is given, and no --out: name a folder for the weights")
-    if arguments.trajectories is not None:
-        raise InputError("--trajectories is for data that are made; --data names a folder that has some")
-    settings = planner_training(arguments.config, given)
-    meanwhile = nullcontext()
-    if arguments.generate is not None:
-        meanwhile = filled_meanwhile(settings.data, arguments.generate, settings.robot)
-    with meanwhile:
-        report = train_planner(settings, arguments.out)
-    _report(report, arguments.out)
+    for option in ("trajectories", "workers"):
+        if getattr(arguments, option) is not None:
+            raise InputError(f"--{option} is for data that are made; --data names a folder that has some")
+    _report(train_planner(planner_training(arguments.config, given), arguments.out), arguments.out)
     return 0
 
 
@@ -217,7 +194,7 @@ def _run_for_robot(arguments: argparse.Namespace, given: dict[str, Any]) -> int:
         partial(planner_training, arguments.config),
         arguments.out,
         arguments.trajectories,
-        arguments.generate,
+        arguments.workers,
     )
     _report(report, str(kept))
     return 0

@@ -57,7 +57,6 @@ class Row(NamedTuple):
 ROWS: dict[str, Row] = {
     "PointNet": Row("table2_pointnet", True, (69.4, 26.7, 17.154, 42)),
     "DGCNN": Row("table2_dgcnn", True, (73.4, 22.5, 16.864, 64)),
-    "Completing": Row("table2_completing", True, (None,) * 4),
     "U-Net": Row("table2_unet", True, (59.3, 29.7, 17.358, 27)),
     "Transformer": Row("table2_transformer", True, (69.0, 16.5, 17.137, 32)),
     "Decoder-only": Row("table2_decoder_only", True, (62.8, 23.8, 16.195, 23)),

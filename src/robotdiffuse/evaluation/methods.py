@@ -34,7 +34,7 @@ from robotdiffuse.validation.validator import Report, VerifySettings, verifier
 if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import ClearanceFn, MotionModel
 
-NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4)
+NETWORK_ALONE = RobotDiffuseSettings(sampling_steps=6, guidance_steps=4, guidance_scale=1.0)
 """Settings of networks that are measured alone; the planner's own number of steps is too small without
 guidance."""
 UNSOLVED = Status.NO_PATH.value
@@ -193,14 +193,12 @@ def from_network(
     sampler: ModelSampler,
     seen: Callable[[Run], Problem] | None = None,
     hidden: bool = False,
-    guidance_scale: float = 1.0,
 ) -> Draw:
     """Samples of the network: no refinement, no search, no shortcuts.
 
     seen: the problem whose obstacles are encoded, in place of the run's own. hidden: whether the clearances
     given to the denoiser are those without obstacles. Guidance knows the obstacles in
         any case.
-    guidance_scale: see `MotionModel.denoise_guided`; 0 hides the condition and so the code.
     """
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:
@@ -211,14 +209,14 @@ def from_network(
         code = encode(model, other, sampler.settings.points, rng)
         ends = problem.start, goal_of(problem)[None]
         clearances = clearances_without_obstacles(model) if hidden else None
-        return sampler.draw(model, checker, code, *ends, rng, clearances, guidance_scale=guidance_scale)
+        return sampler.draw(model, checker, code, *ends, rng, clearances)
 
     return draw
 
 
 def clearances_without_obstacles(model: "MotionModel") -> "ClearanceFn":
     """The clearance inputs of a model in a scene without obstacles."""
-    links, width = len(model.robot.links), model.dof if model.settings.sees_gradients else 0
+    links, width = len(model.robot.links), model.dof if model.settings.clearance_gradients else 0
 
     def clearances(q: ndarray) -> ndarray:
         inputs = np.zeros((*q.shape[:2], links + width), np.float32)

@@ -287,8 +287,8 @@ def test_the_guidance_scale_reaches_the_network():
     assert model is not None
     code = encode(model, checker, 320, np.random.default_rng(0))
     plain, same, strong = (
-        RobotDiffuse(RobotDiffuseSettings(samples=2, guidance_steps=0)).draw(
-            model, checker, code, LEFT, RIGHT[None], np.random.default_rng(1), guidance_scale=scale
+        RobotDiffuse(RobotDiffuseSettings(samples=2, guidance_steps=0, guidance_scale=scale)).draw(
+            model, checker, code, LEFT, RIGHT[None], np.random.default_rng(1)
         )
         for scale in (1.0, 1.0, 3.0)
     )

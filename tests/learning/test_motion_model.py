@@ -1,6 +1,5 @@
-"""The parts of the learned planner: encoder, noise, sampler, assembled model and its files."""
+"""The diffusion model and its parts: encoder, noise, samplers."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -8,25 +7,18 @@ import pytest
 import torch
 
 from helpers.box_arm import box_arm
-from helpers.example_robots import planar_arm
 from helpers.small_model import SMALL_ENCODER, small_model
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.learning.checkpoint import (
-    fingerprint,
-    load_encoder,
-    load_model,
-    save_encoder,
-    save_network,
-)
 from robotdiffuse.learning.diffusion import NoiseSchedule, ScheduleSettings, noise_factor
 from robotdiffuse.learning.encoders.point_autoencoder import (
     PointAutoencoder,
     chamfer,
     nearest,
 )
-from robotdiffuse.learning.motion_model import MotionModelSettings
+from robotdiffuse.learning.motion_model import GuideFn, MotionModel, MotionModelSettings
 from robotdiffuse.learning.samplers import SAMPLERS
-from robotdiffuse.learning.training.config import EncoderTraining, PlannerTraining
+from robotdiffuse.learning.sampling import SamplingSettings
+from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.robots.normalizer import JointNormalizer
 from robotdiffuse.scenes.surface_points import PANDA_REGION
 
@@ -147,15 +139,13 @@ def test_samples_hold_start_and_goal(guided):
 
     def sample(seed):
         return model.sample(
-            np.zeros(8, np.float32),
             start,
             goal,
-            count=5,
-            rng=np.random.default_rng(seed),
+            np.zeros(8, np.float32),
             clearances=lambda q: np.full((*q.shape[:2], 3), 0.2, np.float32),
-            steps=6,
+            rng=np.random.default_rng(seed),
+            settings=SamplingSettings(samples=5, sampling_steps=6, eta=0.5),
             guide=guide if guided else None,
-            eta=0.5,
         )
 
     q = sample(0)
@@ -170,11 +160,13 @@ def test_samples_hold_start_and_goal(guided):
     np.testing.assert_array_equal(sample(0), q)
 
 
-def test_denoiser_sees_the_clearances():
+def test_clearances_are_inputs_of_the_denoiser():
     model = small_model()
-    between = model.between(np.zeros((2, 3)), np.ones((2, 3)))
+    reference = model.reference(np.zeros((2, 3)), np.ones((2, 3)))
     x = np.zeros((2, 16, 3), np.float32)
-    features = model.features(x, between, lambda q: np.stack([q[..., 0] * 0 + d for d in (-5, 0.15, 9)], -1))
+    features = model.features(
+        x, reference, lambda q: np.stack([q[..., 0] * 0 + d for d in (-5, 0.15, 9)], -1)
+    )
     assert features.shape == (2, 16, 9)
     np.testing.assert_allclose(features[0, 0, 6:], [-1, 0, 1], atol=1e-6)
 
@@ -183,140 +175,67 @@ def test_residual_and_joints_are_inverse():
     model = small_model()
     q = np.random.default_rng(0).uniform(-2, 2, (4, 16, 3)).astype(np.float32)
     model.fit_statistics(q, smooth_noise=True)
-    between = model.between(q[:, 0], q[:, -1])
-    rows = model.to_rows(q, between)
-    np.testing.assert_allclose(model.joints(rows, between), q, atol=1e-5)
-    assert np.sqrt((rows[:, 1:-1] ** 2).mean((0, 1))) == pytest.approx([1, 1, 1], abs=1e-4)
-
-
-def test_checkpoint_round_trip(tmp_path):
-    model = small_model()
-    model.fit_statistics(np.random.default_rng(0).uniform(-2, 2, (9, 16, 3)).astype(np.float32), True)
-    save_network("model", model, tmp_path, {"samples": 3})
-    loaded = load_model(tmp_path, box_arm())
-    assert loaded.settings == model.settings
-    torch.testing.assert_close(loaded.noise_factor, model.noise_factor, atol=0, rtol=0)
-    weights, kept = loaded.denoiser.state_dict(), model.denoiser.state_dict()
-    for name, weight in kept.items():
-        torch.testing.assert_close(weights[name].float(), weight, atol=1e-3, rtol=1e-2)
-    z = [m.encode(cloud(50)[0].numpy()) for m in (model.requires_grad_(False), loaded)]
-    np.testing.assert_allclose(z[1], z[0], atol=5e-3)
-    assert fingerprint(load_model(tmp_path)) == fingerprint(loaded)
-    assert fingerprint(loaded) != fingerprint(small_model(1))
-
-
-def test_wrong_robot_is_refused(tmp_path):
-    save_network("model", small_model(), tmp_path, {})
-    with pytest.raises(InputError, match=r"model\.json was trained for .* other dimensions"):
-        load_model(tmp_path, planar_arm(0.5, 0.5, 0.5))
-    with pytest.raises(InputError, match=r"model\.json was trained for .* with joints"):
-        load_model(tmp_path, planar_arm(0.5, 0.4))
-
-
-def test_other_links_with_spheres_are_refused(tmp_path):
-    """Of the same joints and measures; the model was once asked about clearances that mean other links."""
-    arm = box_arm()
-    save_network("model", small_model(), tmp_path, {})
-    bare = replace(arm, spheres={link: arm.spheres[link] for link in ("l1", "l2")})
-    with pytest.raises(InputError, match="has spheres on the links l1, l2, not l1, l2, l3"):
-        load_model(tmp_path, bare)
-
-
-def test_files_of_format_1_are_read(tmp_path):
-    model = small_model()
-    save_network("model", model, tmp_path, {})
-    file = tmp_path / "model.json"
-    about = json.loads(file.read_text())
-    robot = about.pop("robot")
-    about["model"] = about.pop("settings") | robot | {"robot": robot.pop("source")}
-    del about["network"], about["model"]["source"]
-    file.write_text(json.dumps(about | {"format": 1}))
-    loaded = load_model(tmp_path, box_arm())
-    assert loaded.settings == model.settings and loaded.robot == model.robot
-
-
-def damage(folder, case):
-    weights, about = folder / "model.safetensors", folder / "model.json"
-    if case == "truncated":
-        weights.write_bytes(weights.read_bytes()[:-100])
-    elif case == "bit":
-        data = bytearray(weights.read_bytes())
-        data[-50] ^= 1
-        weights.write_bytes(data)
-    elif case == "no weights":
-        weights.unlink()
-    elif case == "no description":
-        about.unlink()
-    elif case == "broken description":
-        about.write_text(about.read_text()[:-30])
-    elif case == "unknown setting":
-        values = json.loads(about.read_text())
-        values["settings"]["wings"] = 2
-        about.write_text(json.dumps(values))
-    elif case == "other size":
-        values = json.loads(about.read_text())
-        values["settings"]["denoiser_settings"]["width"] = 32
-        about.write_text(json.dumps(values))
-    elif case == "beyond all memory":
-        values = json.loads(about.read_text())
-        values["settings"]["denoiser_settings"]["hidden"] = 2**63
-        about.write_text(json.dumps(values))
-    elif case in ("joint too few", "ragged frames"):
-        values = json.loads(about.read_text())
-        rows = values["robot"]["lower" if case == "joint too few" else "frame_offsets"]
-        (rows if case == "joint too few" else rows[0][0]).pop()
-        about.write_text(json.dumps(values))
+    reference = model.reference(q[:, 0], q[:, -1])
+    x = model.normalize(q, reference)
+    np.testing.assert_allclose(model.joints(x, reference), q, atol=1e-5)
+    assert np.sqrt((x[:, 1:-1] ** 2).mean((0, 1))) == pytest.approx([1, 1, 1], abs=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("case", "file"),
+    ("steps", "share", "guided"),
     [
-        ("beyond all memory", "model.json"),
-        ("joint too few", "robot.lower has 2 entries for 3 joints"),
-        ("ragged frames", "not 4 x 4"),
-        ("truncated", "model.safetensors"),
-        ("bit", "model.safetensors"),
-        ("no weights", "model.safetensors"),
-        ("no description", "model.json"),
-        ("broken description", "model.json"),
-        ("unknown setting", "model.json"),
-        ("other size", "model.safetensors"),
+        (6, 0.5, 3),
+        (5, 0.5, 3),
+        (1, 0.5, 1),
+        (6, 0.0, 0),
+        (6, 1.0, 6),
+        (10, 0.3, 3),
+        (30, 0.1, 3),
+        (50, 0.02, 1),
     ],
 )
-def test_damaged_weights_give_one_line(tmp_path, case, file):
-    save_network("model", small_model(), tmp_path, {})
-    damage(tmp_path, case)
-    with pytest.raises(InputError, match=file) as caught:
-        load_model(tmp_path)
-    assert "\n" not in str(caught.value)
+def test_the_last_share_of_the_steps_is_guided(steps: int, share: float, guided: int) -> None:
+    model, levels = small_model(), []
+
+    def guide(q: np.ndarray, level: float) -> np.ndarray:
+        levels.append(level)
+        return q
+
+    sample_with(model, SamplingSettings(samples=1, sampling_steps=steps, guided_share=share), guide)
+    expected = model.schedule.sampling_levels(steps)[:-1] / model.schedule.steps
+    np.testing.assert_allclose(levels, expected[steps - guided :])
+
+
+def test_a_sampler_by_name_is_that_of_a_checkpoint() -> None:
+    for name in SAMPLERS:
+        model = small_model()
+        by_setting = sample_with(model, SamplingSettings(samples=2, sampling_steps=4, sampler=name))
+        model.settings = replace(model.settings, sampler=name)
+        by_default = sample_with(model, SamplingSettings(samples=2, sampling_steps=4))
+        np.testing.assert_array_equal(by_setting, by_default)
+
+
+def test_sampling_settings_are_checked() -> None:
+    with pytest.raises(InputError, match=r"unknown sampling\.sampler 'heun'; known: ddim, ddpm"):
+        SamplingSettings(sampler="heun")
+    with pytest.raises(InputError, match=r"guided_share is 1.5"):
+        SamplingSettings(guided_share=1.5)
+    with pytest.raises(InputError, match="sampling steps is 201; it must be between 1 and 200"):
+        sample_with(small_model(), SamplingSettings(sampling_steps=201))
+
+
+def sample_with(model: MotionModel, settings: SamplingSettings, guide: GuideFn | None = None) -> np.ndarray:
+    def far(q: np.ndarray) -> np.ndarray:
+        return np.full((*q.shape[:2], 3), 0.4, np.float32)
+
+    start, goal = np.array([-1.0, 0.5, 2.0]), np.array([1.5, -0.5, 0.1])
+    code = np.zeros(8, np.float32)
+    return model.sample(start, goal, code, far, np.random.default_rng(0), settings, guide)
 
 
 def test_numbers_of_waypoints_are_bounded():
     """Matrices of 10**25 rows were asked for; found by fuzzing."""
-    for field in ("waypoints", "rows"):
-        with pytest.raises(InputError, match=rf"{field} is 1000+; it must be between . and 4096"):
-            MotionModelSettings.from_json({field: 10**25}, "model")
+    with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
+        MotionModelSettings.from_json({"waypoints": 10**25}, "model")
     with pytest.raises(InputError, match=r"waypoints is 1000+; it must be between 3 and 4096"):
         PlannerTraining.from_json({"data": "d", "encoder": "e", "waypoints": 10**25}, "training")
-
-
-def test_encoder_files(tmp_path):
-    encoder = PointAutoencoder(SMALL_ENCODER)
-    save_encoder(encoder, tmp_path, {})
-    loaded = load_encoder(tmp_path)
-    torch.testing.assert_close(loaded(cloud(9)), encoder(cloud(9)), atol=5e-3, rtol=0)
-    with pytest.raises(InputError, match=r"no trained model: encoder\.json"):
-        load_encoder(tmp_path / "nothing")
-
-
-def test_settings_as_json():
-    settings = EncoderTraining(seed=3, encoder=SMALL_ENCODER)
-    text = json.dumps(settings.to_json())
-    assert EncoderTraining.from_json(json.loads(text), "x") == settings
-    for bad, message in [
-        ({"seeed": 1}, "x.seeed"),
-        ({"seed": 1.5}, "x.seed"),
-        ({"encoder": {"code": "a"}}, "code"),
-    ]:
-        with pytest.raises(InputError, match=message):
-            EncoderTraining.from_json(bad, "x")

@@ -1,4 +1,4 @@
-"""What a network trained for the bare arm is told of an arm that holds something."""
+"""The inputs of a network trained for the bare arm, when the arm holds something."""
 
 import numpy as np
 import pytest
@@ -23,10 +23,10 @@ HELD = {
 
 
 @pytest.mark.parametrize("carrier", HELD)
-@pytest.mark.parametrize("sees_gradients", [False, True])
-def test_a_held_object_counts_as_a_part_of_what_carries_it(carrier: str, sees_gradients: bool) -> None:
+@pytest.mark.parametrize("clearance_gradients", [False, True])
+def test_a_held_object_counts_as_a_part_of_what_carries_it(carrier: str, clearance_gradients: bool) -> None:
     held = HELD[carrier]
-    settings = MotionModelSettings(sees_gradients=sees_gradients)
+    settings = MotionModelSettings(clearance_gradients=clearance_gradients)
     scene = Scene([Sphere([0.5, 0.0, 0.1], 0.1)])
     q = np.random.default_rng(0).uniform(PANDA.lower, PANDA.upper, (4, 5, 7)).astype(np.float32)
     checkers = CollisionChecker(PANDA, scene), CollisionChecker(held, scene)

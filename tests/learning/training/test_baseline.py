@@ -1,4 +1,4 @@
-"""Training of baselines: one trainer for all networks, checkpoints, weights that fit, the command."""
+"""Training of baselines: learning, checkpoints, weights of other robots, the command."""
 
 import os
 import signal
@@ -37,7 +37,7 @@ class ReversalSettings(Settings):
 
 
 class Reversal(BaselineNetwork):
-    """Learns that a motion's middle lies halfway."""
+    """A network that learns the middle waypoint of motions."""
 
     training_defaults: ClassVar[dict] = {"batch": 16, "learning_rate": 0.05}
 

@@ -1,4 +1,4 @@
-"""The paper's losses: distances as the kernel's, points by kinematics, gradients by differences."""
+"""The paper's losses: distances against the kernel, points against kinematics, gradients by differences."""
 
 import numpy as np
 import pytest
@@ -78,7 +78,7 @@ def test_surface_points_move_with_their_links() -> None:
         assert (locals_[0] >= corners.min(0) - 1e-9).all() and (locals_[0] <= corners.max(0) + 1e-9).all()
 
 
-def test_the_collision_loss_sets_in_as_scheduled() -> None:
+def test_the_collision_loss_begins_as_scheduled() -> None:
     settings = LossSettings(collision=2.0, begin=0.5)
     assert [settings.collision_weight(f) for f in (0.0, 0.5, 0.55, 0.6, 1.0)] == pytest.approx(
         [0, 0, 1, 2, 2]
