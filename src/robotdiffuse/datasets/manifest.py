@@ -5,8 +5,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.settings import Count, Natural, Settings
 from robotdiffuse.problems.families import load_family
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
@@ -17,7 +19,7 @@ MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True)
-class Manifest:
+class Manifest(Settings):
     """What a data set is of."""
 
     robot: str
@@ -27,26 +29,27 @@ class Manifest:
     lower: tuple[float, ...]
     """Limits [rad]."""
     upper: tuple[float, ...]
-    waypoints: int
+    waypoints: Count
     timing: str
     """How waypoints are spaced: "arc", evenly in joint-space length, or "time"."""
     families: dict[str, dict[str, Any]]
     """Settings of the scenes by name, in the order of the numbers in `family`."""
     floors: dict[str, dict[str, list[float]] | None]
     """`center` and `size` of the box that the scenes of each family stand on [m]; None: of nothing."""
-    slots: int
+    slots: Natural
     """Most obstacles of a scene."""
-    goals: int
+    goals: Count
     """Most goal configurations of a problem."""
-    trajectories: int
+    trajectories: Natural
     """Planned in all."""
-    shard: int
+    shard: Count
     """Rows per shard."""
     settings: dict[str, Any]
     """All of the generation's."""
     versions: dict[str, str]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not len(self.joint_names) == len(self.lower) == len(self.upper) > 0:
             raise InputError(
                 f"joint_names, lower and upper have {len(self.joint_names)}, {len(self.lower)} and "
@@ -91,7 +94,7 @@ def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
 
 def read_manifest(folder: str | FilePath) -> Manifest:
     """Raises InputError if there is none, or it is damaged or of another version of the format."""
-    file = FilePath(folder) / MANIFEST
+    file = file_name(folder, "folder") / MANIFEST
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -107,13 +110,11 @@ def read_manifest(folder: str | FilePath) -> Manifest:
     check_format(file, data.pop("format"))
     try:
         data.pop("dof")
-        for name in ("joint_names", "lower", "upper"):
-            data[name] = tuple(data[name])
         if "frames" in data:  # as waypoints were called once
             data["waypoints"] = data.pop("frames")
             data["settings"] = {"waypoints": data["waypoints"]} | data["settings"]
-        return Manifest(**_with_floors(data))
-    except (KeyError, TypeError, ValueError) as error:
+        return Manifest.from_json(_with_floors(data), MANIFEST)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{file} is damaged: {error}") from None
 
 
@@ -138,4 +139,4 @@ def _old_floor(name: str, settings: dict[str, Any]) -> Box | None:
 def check_format(file: FilePath, found: object) -> None:
     """Raises InputError for another version of the format than this one's."""
     if found != FORMAT:
-        raise InputError(f"{file}: format is {found}; this version reads {FORMAT}")
+        raise InputError(f"{file}: format is {shown(found)}; this version reads {FORMAT}")
