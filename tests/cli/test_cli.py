@@ -160,6 +160,13 @@ BAD_CALL = {
         ["plan", "problem.json", "--planner", "rrt_connect", "--weights", "w"],
         "planner rrt_connect has no weights",
     ),
+    "weights of a name that no file has": (
+        ["plan", "problem.json", "--weights", "w" * 5000], "error: there are no weights wwwwwwww"
+    ),
+    "motion of a name that no file has": (
+        ["verify", "--problem", "problem.json", "w" * 5000], "wwww... File name too long"
+    ),
+    "option of 5,000 characters": (["plan", "problem.json", "w" * 5000], "unrecognized arguments: wwwwwwww"),
     "weights that are none": (["plan", "problem.json", "--weights", "."], "holds no model"),
     "unknown planner": (["plan", "problem.json", "--planner", "rrt"], "known: a_star, aorrtc, d_star_lite"),
     "no time": (["plan", "problem.json", "--time-limit", "0"], "'0' is not a positive number"),

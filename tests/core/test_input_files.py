@@ -7,9 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from trimesh.exchange.gltf import export_gltf
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.ply import export_ply
 
 from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
 from robotdiffuse.core.input_files import (
@@ -27,6 +31,15 @@ DEEP = 100_000
 BOMB = "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
     f"{b}: &{b} [{', '.join([f'*{a}'] * 9)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
 )
+
+
+SOLID = trimesh.creation.box((1.0, 1.0, 1.0))
+NAMED = {
+    "gltf": {name: bytes(part) for name, part in export_gltf(trimesh.Scene([SOLID])).items()},
+    "obj": {"model.obj": b"mtllib beside.bin\nusemtl x\n" + export_obj(SOLID).encode()},
+    "ply": {"model.ply": export_ply(SOLID).replace(b"format", b"comment TextureFile beside.bin\nformat", 1)},
+}
+"""Mesh files that name another, which glTF cannot do without."""
 
 
 def one_line(call: Callable[[], object]) -> str:
@@ -181,3 +194,19 @@ def test_messages_quote_sixty_characters() -> None:
     spaced = "{a: " * 1000  # no word of it is long
     assert joined([spaced, "b"]) == f"{spaced[:57]}..., b"
     assert len(str(InputError("x" * 10**4))) == 60
+
+
+@pytest.mark.parametrize("kind", sorted(NAMED))
+def test_a_pipe_that_a_mesh_file_names_is_not_waited_for(kind: str, tmp_path: Path) -> None:
+    """A .gltf whose buffer is a named pipe hung."""
+    for name, content in NAMED[kind].items():
+        (tmp_path / name).write_bytes(content)
+    assert len(read_triangles(tmp_path / f"model.{kind}")[1]) == 12
+    beside = [*tmp_path.glob("*.bin"), tmp_path / "beside.bin"]
+    for file in beside:
+        file.unlink(missing_ok=True)
+        os.mkfifo(file)
+    if kind == "gltf":
+        assert "it is a device or a pipe" in one_line(lambda: read_triangles(tmp_path / "model.gltf"))
+    else:
+        assert len(read_triangles(tmp_path / f"model.{kind}")[1]) == 12

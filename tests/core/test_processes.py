@@ -80,6 +80,31 @@ def test_a_worker_in_compiled_code_does_not_outlive_a_parent_that_is_killed() ->
             time.sleep(0.02)
 
 
+CHECKS = """
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.processes import on_this_machine
+try:
+    print(sorted(on_this_machine(abs, [(-1,), (-2,)], 2)))
+except InputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("by", ["file", "stdin", "text"])
+def test_shared_calls_of_a_script_that_processes_cannot_import_say_what_to_do(
+    by: str, tmp_path: Path
+) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(CHECKS)
+    arguments = {"file": [str(script)], "stdin": ["-"], "text": ["-c", CHECKS]}[by]
+    command = [sys.executable, *arguments]
+    ended = subprocess.run(command, input=CHECKS, capture_output=True, text=True, timeout=60, check=True)
+    if by == "text":
+        assert ended.stdout == "[(0, 1), (1, 2)]\n"
+    else:
+        assert ended.stdout.endswith('below the line: if __name__ == "__main__":\n')
+
+
 SWALLOWING = """
 import ctypes, signal, time
 from robotdiffuse.core.processes import interrupts_at_once

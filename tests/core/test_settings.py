@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
+import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
@@ -64,6 +65,25 @@ def test_bounds(values: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError) as error:
         Search(**values)
     assert str(error.value) == message
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"step": "1"}, "search.step is '1'; it takes float positive"),
+        ({"step": None}, "search.step is None; it takes float positive"),
+        ({"step": True}, "search.step is True; it takes float positive"),
+        ({"range": []}, r"search.range is \[\]; it takes float positive or none"),
+        ({"order": 1}, "search.order is 1; it takes first, best"),
+        ({"inner": 3}, "search.inner is 3; it takes Coarse"),
+        ({"levels": 0.1}, "search.levels is 0.1; it takes tuple"),
+    ],
+)
+def test_values_of_another_type_are_refused(values: dict[str, Any], message: str) -> None:
+    """They were taken, and ended later with a traceback."""
+    with pytest.raises(InputError, match=f"^{message}"):
+        Search(**values)
+    assert Search(step=np.float32(0.5), range=2).step == 0.5  # type: ignore[arg-type]
 
 
 def test_json_and_back() -> None:

@@ -212,6 +212,21 @@ def damage(store, case):
         zarr.open_group(shard, mode="a").attrs["format"] = 2
     elif case == "moved":
         zarr.open_group(shard, mode="a").attrs["index"] = 4
+    elif case == "attributes":
+        describe(shard / "seed", attributes=[])
+    elif case == "huge":
+        describe(shard / "seed", shape=[10**30])
+    elif case == "endless":
+        describe(shard / "seed", shape=[10**15])
+    elif case == "one endless chunk":
+        grid = {"name": "regular", "configuration": {"chunk_shape": [10**15]}}
+        describe(shard / "seed", shape=[10**15], chunk_grid=grid)
+
+
+def describe(array, **values):
+    """Replace values in the description of an array."""
+    file = array / "zarr.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | values))
 
 
 @pytest.mark.parametrize(
@@ -230,6 +245,10 @@ def damage(store, case):
         ("bit", r"array trajectories is damaged: its fingerprint is not the one that was written"),
         ("version", r"shard_00000\.zarr: format is 2; this version reads 1"),
         ("moved", r"shard_00000\.zarr is damaged: its attributes are not those of shard 0"),
+        ("attributes", r"array seed is damaged: its fingerprint is not the one that was written"),
+        ("huge", r"array seed is damaged: "),
+        ("endless", r"array seed is damaged: a chunk is missing"),
+        ("one endless chunk", r"array seed is damaged: "),
     ],
 )
 def test_damage_gives_one_line(store, case, message):
@@ -269,6 +288,21 @@ def test_manifest(tmp_path):
     (tmp_path / "manifest.json").write_text("{")
     with pytest.raises(InputError, match=r"manifest\.json is damaged"):
         read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("value", [None, [], {}, [[]], {"a": 1}, "", 1.5, -1, 10**30])
+def test_values_of_the_wrong_type_in_a_manifest_are_damage(tmp_path, value):
+    """The name of the robot as a list, and families as a list, ended `data check` with a traceback."""
+    write_manifest(tmp_path, manifest_of(ARM))
+    file = tmp_path / "manifest.json"
+    data = json.loads(file.read_text())
+    fits = {"dof"}  # which is told from the names of the joints
+    fits |= {name for name in data if type(value) is type(data[name]) and value in (10**30, "", {"a": 1}, {})}
+    for name in data.keys() - fits:
+        file.write_text(json.dumps(data | {name: value}))
+        with pytest.raises(InputError, match=r"manifest\.json( is damaged)?: ") as caught:
+            read_manifest(tmp_path)
+        assert "\n" not in str(caught.value)
 
 
 def test_the_robot_must_be_that_of_the_data():

@@ -1,6 +1,8 @@
 """What is exported is read again and validated the same; what others write is read, or refused in one line."""
 
 import json
+import os
+import resource
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +17,7 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.interop import READERS, WRITERS, read_motion, write_motion
+from robotdiffuse.interop import OWN, READERS, WRITERS, read_motion, write_motion
 from robotdiffuse.interop.plain_messages import joint_trajectory, motion_of
 from robotdiffuse.interop.recorded_motion import fitted, own_problem, recorded
 from robotdiffuse.problems.problem import Problem
@@ -158,6 +160,32 @@ def test_rerun_recordings_hold_the_joints(planned: tuple[Problem, Trajectory], t
         batch = chunks[f"/joints/{name}/positions"].to_record_batch()
         values = [row[0] for row in batch.column("Scalars:scalars").to_pylist()]
         np.testing.assert_array_equal(values, trajectory.positions[:, j])
+
+
+def test_a_bag_is_not_read_from_a_pipe(planned: tuple[Problem, Trajectory], tmp_path: Path) -> None:
+    bag = tmp_path / "m.rosbag2"
+    write_motion(*planned, bag)
+    (database,) = bag.glob("*.db3")
+    database.unlink()
+    os.mkfifo(database)
+    with pytest.raises(InputError, match=r"\.db3 cannot be read: it is a device or a pipe"):
+        read_motion(bag)
+
+
+@pytest.mark.parametrize("ending", sorted([*WRITERS, *OWN]))
+def test_a_disk_that_fills_up_is_one_line(
+    planned: tuple[Problem, Trajectory], tmp_path: Path, ending: str
+) -> None:
+    """ROS 2 bags and Rerun's recordings ended with tracebacks of SQLite and of Rerun."""
+    problem, trajectory = planned
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))  # bytes of a file
+    try:
+        with pytest.raises(InputError, match=r"m\.\w+ cannot be written: ") as caught:
+            write_motion(problem, trajectory, tmp_path / f"m{ending}")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
 
 
 def panda_record(**changes: Any) -> dict[str, Any]:

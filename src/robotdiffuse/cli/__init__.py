@@ -2,6 +2,7 @@
 written, 130 stopped by Ctrl-C."""
 
 import argparse
+import errno
 import io
 import os
 import sys
@@ -52,7 +53,7 @@ class Parser(argparse.ArgumentParser):
     """Reports misuse in one line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(BAD_INPUT, f"{self.prog}: error: {message}; see {self.prog} --help\n")
+        self.exit(BAD_INPUT, f"{self.prog}: error: {InputError(message)}; see {self.prog} --help\n")
 
 
 def build_parser() -> Parser:
@@ -87,6 +88,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _unwritten("its reader has gone")
         raise
     except OSError as error:
+        if error.errno == errno.ENAMETOOLONG:
+            named = InputError(f"{error.filename}: {error.strerror}")
+            print(f"robotdiffuse: error: {named}", file=sys.stderr)
+            return BAD_INPUT
         return _unwritten(error.strerror or str(error))
 
 

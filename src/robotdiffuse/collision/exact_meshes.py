@@ -118,7 +118,8 @@ def _obstacle(solid: Solid) -> _Obstacle:
             geometry = coal_surface(shape.mesh.world_vertices, shape.mesh.faces)
         case PointCloud():
             # Each point is a triangle of zero size: Coal's tree then prunes 100,000 points in about 0.1 ms.
-            geometry = coal_surface(shape.points, np.repeat(np.arange(len(shape.points))[:, None], 3, axis=1))
+            points = shape.distinct_points
+            geometry = coal_surface(points, np.repeat(np.arange(len(points))[:, None], 3, axis=1))
         case _:
             raise TypeError(f"no collision geometry for a {type(shape).__name__}")
     # surfaces are given in the base frame
@@ -144,7 +145,7 @@ def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
 def _surfaces(shape: Shape) -> tuple[int, str]:
     """How many surfaces Coal sorts into a tree, and what they are."""
     if isinstance(shape, PointCloud):
-        return len(shape.points), "points"
+        return len(shape.distinct_points), "points"
     return (len(shape.mesh.faces), "triangles") if isinstance(shape, Triangulated) else (0, "")
 
 

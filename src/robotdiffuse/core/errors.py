@@ -25,6 +25,12 @@ class InputError(ValueError):
         super().__init__("\n  ".join([line, *listed]))
 
 
+def check_type(what: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
+    """Raises InputError unless the value is of one of these types; `wanted` says what it must be."""
+    if not isinstance(value, kind):
+        raise InputError(f"{what} is {shown(value)}; it must be {wanted}")
+
+
 def shown(value: object) -> str:
     """A value as one short line, for error messages."""
     if isinstance(value, np.ndarray):

@@ -55,6 +55,13 @@ def no_files() -> Iterator[None]:
         _closed.reset(before)
 
 
+def file_name(file: object, what: str = "file") -> Path:
+    """The path that a name stands for; InputError for what is neither text nor a path."""
+    if not isinstance(file, str | os.PathLike):
+        raise InputError(f"{what} is {shown(file)}; it must be the name of a file, a text or a pathlib.Path")
+    return Path(file)
+
+
 def is_file(file: str | Path) -> bool:
     """Whether there is a regular file of this name that may be looked at; False also for impossible names."""
     try:
@@ -69,7 +76,7 @@ def input_file(file: str | Path, what: str = "", largest: int = LARGEST_FILE) ->
     Raises InputError for one that is missing, no regular file (a folder, a device, a pipe), too large, not
     permitted, or whose name cannot be one.
     """
-    text = str(file)
+    text = str(file_name(file, what or "file"))
     named = f"{what} {text if len(text) <= LONGEST_NAME else shortened(text)}".strip()
     if _closed.get():
         raise InputError(f"{named} is a file, and none is read here: give what it holds instead")
@@ -123,12 +130,29 @@ def read_triangles(file: str | Path, what: str = "mesh file", merge: bool = Fals
         raise InputError(f"{what} {file} is empty")
     try:
         with np.errstate(all="ignore"):
-            mesh = trimesh.load_mesh(path, process=merge)
+            mesh = trimesh.load_mesh(path, process=merge, resolver=_beside(path))
+    except InputError as error:
+        raise InputError(f"{what} {file}: {error}") from None
     except Exception as error:  # trimesh raises whatever its parsers meet in a damaged file
         raise InputError(f"{what} {file} cannot be read: {shortened(str(error))}") from None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
         raise InputError(f"{what} {file} holds no triangles")
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+
+
+def _beside(mesh: Path) -> Any:
+    """Opens for trimesh what a mesh file names, such as buffers and materials: regular files alone."""
+    from trimesh.resolvers import FilePathResolver
+
+    class RegularFiles(FilePathResolver):
+        def get(self, name: str) -> Any:
+            for place in (name.strip(), name.strip().lstrip("/"), Path(name).name):  # which trimesh tries
+                file = Path(self.parent, place)
+                if os.path.lexists(file):
+                    input_file(file)
+            return super().get(name)
+
+    return RegularFiles(str(mesh))
 
 
 def read_arrays(file: str | Path, what: str = "") -> dict[str, ndarray]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.input_files import file_name
 
 
 def write_atomically(file: Path, content: str | bytes, make_folder: bool = False) -> None:
@@ -35,7 +36,7 @@ def check_output(file: str | Path, endings: tuple[str, ...]) -> Path:
 
     Raises InputError for an ending that is not among `endings` and for a folder that is missing or read-only.
     """
-    path = Path(file)
+    path = file_name(file)
     if path.suffix.lower() not in endings:
         raise InputError(f"{path}: unknown ending {shown(path.suffix)}; known: {', '.join(endings)}")
     if path.is_dir():

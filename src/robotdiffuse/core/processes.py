@@ -16,6 +16,7 @@ import subprocess
 import sys
 import threading
 import time
+import traceback
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -38,6 +39,44 @@ CONNECT_SECONDS = 5.0
 LOST_NODES = 20
 """Times that a call is made again on another node of a Ray cluster."""
 AGAIN = "give the same command again"
+GUARD = 'if __name__ == "__main__":'
+
+
+class NotStartedError(BrokenProcessPool):
+    """A worker process ended before it could make a call; the message says what to change."""
+
+
+def check_not_importing() -> None:
+    """Ends this process if it is a worker that still imports the main script, which starts workers as it is
+    imported: it lacks GUARD. The process that a person started says so."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):
+        sys.exit(1)
+
+
+def _check_script() -> None:
+    """Raises NotStartedError if the main script is no file, which worker processes could import."""
+    main = sys.modules["__main__"]
+    script = getattr(main, "__file__", None)
+    if main.__spec__ is None and script is not None and not Path(script).is_file():
+        raise NotStartedError(
+            "worker processes cannot import a script from standard input; save it to a file, and put what it "
+            f"does below the line: {GUARD}"
+        )
+
+
+def _not_started() -> NotStartedError:
+    """For a process that ended before its first call."""
+    script = getattr(sys.modules["__main__"], "__file__", None)
+    if script is None:
+        return NotStartedError("a worker process was killed as it started")
+    return NotStartedError(
+        f"a worker process could not import the main script {script}, or was killed as it started; put what "
+        f"the script does below the line: {GUARD}"
+    )
+
+
+def _nothing() -> None:
+    """A first call, which shows that a process can make calls."""
 
 
 class Workers:
@@ -45,10 +84,13 @@ class Workers:
 
     def __init__(self, count: int, patience: float = PATIENCE) -> None:
         """`count` 0: this process makes the calls itself. `patience`: for those that are stopped [s]."""
+        if count:
+            check_not_importing()
         # fresh interpreters: forked ones could inherit locks of running threads
         context = multiprocessing.get_context("spawn")
         self._pool = ProcessPoolExecutor(count, context, prepare_worker, (added(),)) if count else None
         self._count, self._patience = count, patience
+        self._begun: Future[None] | None = None
 
     def __enter__(self) -> "Workers":
         return self
@@ -70,6 +112,10 @@ class Workers:
             number, arguments = left.pop()
             yield number, call(*arguments)
         try:
+            if self._pool is not None and self._begun is None:
+                _check_script()
+                with interrupts_not_passed_on():
+                    self._begun = self._pool.submit(_nothing)
             while left or running:
                 while self._pool is not None and left and len(running) < self._count + 1:
                     number, arguments = left.pop()
@@ -77,37 +123,57 @@ class Workers:
                         running[self._pool.submit(call, *arguments)] = number
                 for job in wait(running, return_when=FIRST_COMPLETED).done:
                     yield running.pop(job), job.result()
+        except NotStartedError as error:
+            raise InputError(str(error)) from None
         except BrokenProcessPool:
-            raise InputError(f"a worker process was killed, or could not be started; {AGAIN}") from None
+            if self._begun is None or self._begun.exception() is not None:
+                raise InputError(str(_not_started())) from None
+            raise InputError(f"a worker process was killed; {AGAIN}") from None
 
 
 class LoneWorker:
     """A process that makes calls in turn. One that dies of a call costs that call alone: the next has a new
     one."""
 
-    def __init__(self, prepare: Callable[..., None], arguments: tuple) -> None:
-        """`prepare(*arguments)` is called once in each process."""
-        self._prepare, self._arguments = prepare, arguments
+    def __init__(
+        self, prepare: Callable[..., None], arguments: tuple, inherited: tuple[Any, ...] = ()
+    ) -> None:
+        """`prepare(*arguments, *inherited)` is called once in each process. `inherited`: what only a process
+        that starts can be given, such as shared memory."""
+        self._prepare, self._arguments, self._inherited = prepare, arguments, inherited
         self._pool: ProcessPoolExecutor | None = None
         self._closed = False
 
     def call(self, call: Callable[..., Any], *arguments: Any) -> Any:
         """The result of `call(*arguments)` there; what it raises is raised here. Raises BrokenProcessPool if
-        the process dies or was closed."""
-        return self.submit(call, *arguments).result()
+        the process dies or was closed, NotStartedError if it could not begin."""
+        return self._submit(call, arguments, wait=True).result()
 
     def submit(self, call: Callable[..., Any], *arguments: Any) -> "Future[Any]":
         """The same, to be waited for."""
+        return self._submit(call, arguments, wait=False)
+
+    def _submit(self, call: Callable[..., Any], arguments: tuple, wait: bool) -> "Future[Any]":
+        """`wait`: until a process that has to be started has begun, before it is sent anything that would not
+        fit a pipe: who writes to a pipe that nobody will read waits for ever."""
         if self._closed:
             raise BrokenProcessPool("closed")
         with interrupts_not_passed_on():
             if self._pool is not None:
                 with suppress(BrokenProcessPool):
                     return self._pool.submit(call, *arguments)
+            _check_script()
             context = multiprocessing.get_context("spawn")
-            given = added(), self._prepare, self._arguments
-            self._pool = ProcessPoolExecutor(1, context, _prepare_lone, given)
-            return self._pool.submit(call, *arguments)
+            given = added(), self._inherited
+            self._pool = pool = ProcessPoolExecutor(1, context, _begin_lone, given)
+            begun = pool.submit(_nothing)
+        if wait:
+            try:
+                begun.result()
+            except BrokenProcessPool:
+                raise _not_started() from None
+        pool.submit(_prepare_lone, self._prepare, self._arguments)
+        return pool.submit(call, *arguments)
 
     def end(self, by: signal.Signals = signal.SIGTERM) -> None:
         """End the process, whatever anybody waits for; the next call has a new one."""
@@ -126,9 +192,23 @@ class LoneWorker:
         return list((self._pool._processes or {}).values()) if self._pool is not None else []
 
 
-def _prepare_lone(entries: Added, prepare: Callable[..., None], arguments: tuple) -> None:
+_inherited: tuple[Any, ...] = ()
+"""What this process, a lone worker, was given as it started."""
+
+
+def _begin_lone(entries: Added, inherited: tuple[Any, ...]) -> None:
+    global _inherited
     prepare_worker(entries)
-    prepare(*arguments)
+    _inherited = inherited
+
+
+def _prepare_lone(prepare: Callable[..., None], arguments: tuple) -> None:
+    """An error ends the process: it can make no calls."""
+    try:
+        prepare(*arguments, *_inherited)
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
 
 
 def on_this_machine(call: Callable[..., Any], calls: Sequence[tuple], workers: int) -> Results:

@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
+from numbers import Integral, Real
 from types import UnionType
 from typing import Annotated, Any, ClassVar, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -131,9 +132,11 @@ class Settings:
             cls.settings_name = name
 
     def __post_init__(self) -> None:
-        """Raises InputError for the first field that is out of its bounds."""
+        """Raises InputError for the first field that is of another type or out of its bounds."""
         prefix = f"{self.settings_name}." if self.settings_name else ""
         for name, hint in _hints(type(self)).items():
+            if not _fits(hint, getattr(self, name)):
+                raise InputError(f"{prefix}{name} is {shown(getattr(self, name))}; it takes {_rule(hint)}")
             _check(prefix + name, hint, getattr(self, name), self)
 
     def to_json(self) -> dict[str, Any]:
@@ -240,6 +243,24 @@ def _split(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     return hint, ()
 
 
+def _fits(hint: Any, value: Any) -> bool:
+    """Whether a value is of a type, whatever its entries are: NumPy's numbers are numbers."""
+    for option in _options(_split(hint)[0]):
+        bare = _split(option)[0]
+        kind = get_origin(bare) or bare
+        if kind in (Union, UnionType):
+            fits = _fits(bare, value)
+        elif kind in (int, float):
+            fits = isinstance(value, Integral if kind is int else Real) and not isinstance(value, bool)
+        elif kind is tuple:
+            fits = isinstance(value, tuple | list)
+        else:
+            fits = kind is Any or not isinstance(kind, type) or isinstance(value, kind)
+        if fits:
+            return True
+    return False
+
+
 def _check(where: str, hint: Any, value: Any, owner: object) -> None:
     if value is None:
         return
@@ -291,6 +312,8 @@ def _typed(hint: Any, value: Any, where: str) -> Any:
     """The value as one of a type: lists become tuples, integers floats; InputError for others."""
     bare, _ = _split(hint)
     options = [_split(option)[0] for option in _options(bare)]
+    if Any in options:
+        return value
     for option in options:
         if get_origin(option) is tuple and isinstance(value, list | tuple):
             count = len(get_args(option))

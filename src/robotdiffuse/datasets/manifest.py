@@ -5,8 +5,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.output_files import write_atomically
+from robotdiffuse.core.settings import Count, Natural, Settings
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.shapes import Box
@@ -16,7 +18,7 @@ MANIFEST = "manifest.json"
 
 
 @dataclass(frozen=True)
-class Manifest:
+class Manifest(Settings):
     """Robot, scenes, settings and versions of a data set."""
 
     robot: str
@@ -26,26 +28,27 @@ class Manifest:
     lower: tuple[float, ...]
     """Limits [rad]."""
     upper: tuple[float, ...]
-    waypoints: int
+    waypoints: Count
     timing: str
     """How waypoints are spaced: "arc", evenly in joint-space length, or "time"."""
     families: dict[str, dict[str, Any]]
     """Settings of each family of scenes; their order gives the numbers of the array `family`."""
     floors: dict[str, dict[str, list[float]] | None]
     """`center` and `size` of the box that the scenes of each family stand on [m]; None without one."""
-    slots: int
+    slots: Natural
     """Most obstacles of a scene."""
-    goals: int
+    goals: Count
     """Most goal configurations of a problem."""
-    trajectories: int
+    trajectories: Natural
     """Number of trajectories of the whole set."""
-    shard: int
+    shard: Count
     """Rows per shard."""
     settings: dict[str, Any]
     """Settings of the generation."""
     versions: dict[str, str]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not len(self.joint_names) == len(self.lower) == len(self.upper) > 0:
             raise InputError(
                 f"joint_names, lower and upper have {len(self.joint_names)}, {len(self.lower)} and "
@@ -90,7 +93,7 @@ def write_manifest(folder: str | FilePath, manifest: Manifest) -> None:
 
 def read_manifest(folder: str | FilePath) -> Manifest:
     """Read manifest.json. Raises InputError if it is missing, damaged or of another version of the format."""
-    file = FilePath(folder) / MANIFEST
+    file = file_name(folder, "folder") / MANIFEST
     try:
         data = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -106,14 +109,12 @@ def read_manifest(folder: str | FilePath) -> Manifest:
     check_format(file, data.pop("format"))
     try:
         data.pop("dof")
-        for name in ("joint_names", "lower", "upper"):
-            data[name] = tuple(data[name])
-        return Manifest(**data)
-    except (KeyError, TypeError, ValueError) as error:
+        return Manifest.from_json(data, MANIFEST)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{file} is damaged: {error}") from None
 
 
 def check_format(file: FilePath, found: object) -> None:
     """Raise InputError for another version of the format."""
     if found != FORMAT:
-        raise InputError(f"{file}: format is {found}; this version reads {FORMAT}")
+        raise InputError(f"{file}: format is {shown(found)}; this version reads {FORMAT}")

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.output_files import check_output
 from robotdiffuse.core.registry import Entry, Registry
 
@@ -50,7 +51,7 @@ def check_export(file: str | Path) -> Path:
     Raises InputError for an ending that is not in WRITERS or OWN, for a package that is not installed, and
     for a folder that is missing or read-only.
     """
-    path = Path(file)
+    path = file_name(file)
     ending = path.suffix.lower()
     if ending not in OWN:
         WRITERS.load(ending)
@@ -75,7 +76,7 @@ def read_motion(file: str | Path, topic: str | None = None) -> "Recorded":
     Raises InputError for another ending, a file that is damaged or holds no motion, and a package that is not
     installed.
     """
-    path = Path(file)
+    path = file_name(file)
     ending = BAG if path.is_dir() else path.suffix.lower()
     if ending == ".db3":
         raise InputError(f"{path} is a part of a ROS 2 bag; give the folder that it is in")

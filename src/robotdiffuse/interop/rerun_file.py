@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import quaternion_from_rotation
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop import missing
@@ -25,24 +25,16 @@ FPS = 60.0
 def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
     """Entities: scene/NAME, robot/LINK with its meshes, joints/NAME/position and velocity over time; see
     `interop.write_motion`."""
-    part = file.with_name(f".{file.name}.part")
     robot, recording = problem.robot, rr.RecordingStream("robotdiffuse", recording_id=file.stem)
-    try:
-        part.touch()
-        recording.save(part)
-        recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for name, _, drawn in obstacles(problem):
-            recording.log(f"scene/{rr.escape_entity_path_part(name)}", *_archetypes(drawn), static=True)
-        for name, link, drawn in arm(robot):
-            recording.log(f"robot/{link}/{name.partition('/')[2]}", *_archetypes(drawn), static=True)
-        _motion(recording, problem, trajectory)
-        recording.flush()
-        recording.disconnect()
-        part.replace(file)
-    except OSError as error:
-        raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
-    finally:
-        part.unlink(missing_ok=True)
+    # in memory: what Rerun cannot write to a disk ends a thread of its own, with messages of several lines
+    content = recording.memory_recording()
+    recording.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for name, _, drawn in obstacles(problem):
+        recording.log(f"scene/{rr.escape_entity_path_part(name)}", *_archetypes(drawn), static=True)
+    for name, link, drawn in arm(robot):
+        recording.log(f"robot/{link}/{name.partition('/')[2]}", *_archetypes(drawn), static=True)
+    _motion(recording, problem, trajectory)
+    write_atomically(file, content.drain_as_bytes())
 
 
 def _motion(recording: rr.RecordingStream, problem: Problem, trajectory: Trajectory) -> None:

@@ -1,9 +1,12 @@
 """ROS 2 bags, without ROS: folders with metadata.yaml and a database."""
 
 import shutil
+import sqlite3
+import sys
 from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, shortened
+from robotdiffuse.core.input_files import input_file
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop.plain_messages import joint_trajectory
 from robotdiffuse.interop.recorded_motion import Recorded
@@ -50,8 +53,9 @@ def write(problem: Problem, trajectory: Trajectory, file: Path) -> None:
                 writer.write(connection, 0, typestore().serialize_cdr(message(kind, content), kind))
         shutil.rmtree(file, ignore_errors=True)
         (part / file.name).replace(file)
-    except OSError as error:
-        raise InputError(f"{file} cannot be written: {error.strerror or error}") from None
+    except (OSError, sqlite3.Error) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InputError(f"{file} cannot be written: {why}") from None
     finally:
         shutil.rmtree(part, ignore_errors=True)
 
@@ -60,6 +64,9 @@ def read(file: Path, topic: str | None = None) -> Recorded:
     """The motion on a topic; see `ros_types.chosen`."""
     if not (file / "metadata.yaml").is_file():
         raise InputError(f"{file} is no ROS 2 bag: it has no metadata.yaml")
+    for part in file.iterdir():
+        if not part.is_dir():
+            input_file(part, largest=sys.maxsize)
     try:
         with AnyReader([file], default_typestore=typestore()) as reader:
             topics = {connection.topic: connection.msgtype for connection in reader.connections}

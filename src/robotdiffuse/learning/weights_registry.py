@@ -1,10 +1,12 @@
 """Finds trained weights for a robot without loading them or PyTorch."""
 
 import json
+import os
 from functools import lru_cache
 from pathlib import Path as FilePath
 
 from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.input_files import is_file
 from robotdiffuse.learning.networks import NETWORKS
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.robots.robot import Robot
@@ -49,8 +51,9 @@ def _identity(file: FilePath, _changed: int) -> RobotIdentity:
 def check_weights(name: str, folder: str | FilePath | None) -> None:
     """Raises InputError if a folder is given that holds no weights of this network."""
     NETWORKS.entry(name)
-    if folder is not None and not (FilePath(folder) / f"{name}.json").is_file():
-        raise no_weights_error(name, f"{folder} holds no {name}")
+    if folder is not None and not is_file(FilePath(folder) / f"{name}.json"):
+        what = f"{folder} holds no {name}" if os.path.isdir(folder) else f"there are no weights {folder}"
+        raise no_weights_error(name, what)
 
 
 def no_weights_error(name: str, what: str) -> InputError:

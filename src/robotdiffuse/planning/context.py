@@ -5,6 +5,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from numbers import Integral, Real
 from typing import Annotated
 
 import numpy as np
@@ -14,11 +15,11 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.core.bounds import LARGEST
 from robotdiffuse.core.deadline import OutOfTimeError, check_left, deadline
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
 from robotdiffuse.core.types import SHORT, UNTIL, Path, Status, Trajectory
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
     NOTHING,
@@ -67,6 +68,16 @@ def _timing(request: Request, constrained: bool) -> TimingSettings:
     )
 
 
+def check_asked(problem: object, time_limit: object, seed: object) -> None:
+    """Raises InputError for what is no problem, a time limit that is not positive and a seed that is no
+    whole number from 0 on."""
+    check_problem(problem)
+    if not isinstance(time_limit, Real) or not 0 < float(time_limit) < float("inf"):
+        raise InputError(f"time_limit is {shown(time_limit)}; it must be a positive number of seconds")
+    if not isinstance(seed, Integral) or seed < 0:
+        raise InputError(f"seed is {shown(seed)}; it must be a whole number, at least 0")
+
+
 class PlanningContext:
     """One call of plan(); see the head of this file."""
 
@@ -78,12 +89,9 @@ class PlanningContext:
         seed: int,
         request: Request = Request(),
     ) -> None:
-        """Starts the clock. Raises InputError for a time limit that is not positive or a negative seed."""
+        """Starts the clock. Raises InputError as `check_asked`."""
         self.started, self._compiled = time.perf_counter(), compile_seconds()
-        if not 0 < time_limit < float("inf"):
-            raise InputError(f"time_limit is {time_limit}; it must be a positive number of seconds")
-        if seed < 0:
-            raise InputError(f"seed is {seed}; it must be at least 0")
+        check_asked(problem, time_limit, seed)
         self.planner, self.problem, self.time_limit, self.seed = planner, problem, time_limit, seed
         self.until = request.until
         wanted = (request.clearance, problem.clearance, CLEARANCE)

@@ -11,7 +11,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import FIRST, SHORT
-from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.context import PlanningContext, Request, check_asked
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots.kinematics import link_pose
@@ -82,6 +82,7 @@ class Planner(ABC, Generic[Own]):
         Raises InputError for arguments that are none of these, for what the planner cannot keep, and where
         `prepare` does.
         """
+        check_asked(problem, time_limit, seed)
         request = Request(until, clearance, velocity_scaling, acceleration_scaling, jerk)
         self._check_keeps(problem, request)
         self.prepare(problem.robot)

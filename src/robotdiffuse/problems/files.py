@@ -1,16 +1,17 @@
 """Problem files: one problem in YAML or JSON, many in JSON lines or a MotionBenchMaker folder."""
 
 import json
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from numbers import Integral
 from pathlib import Path
 
 import yaml
 
 from robotdiffuse.core.bounds import numbers
-from robotdiffuse.core.errors import InputError, shown, unknown_name
-from robotdiffuse.core.input_files import no_files, parse_json, parse_yaml, read_text, read_yaml
+from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
+from robotdiffuse.core.input_files import file_name, no_files, parse_json, parse_yaml, read_text, read_yaml
+from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
@@ -79,7 +80,8 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
 
     ignore_joints: joints of MoveIt files that the robot lacks are a note rather than an error.
     """
-    file = Path(file)
+    file = file_name(file, "problem file")
+    check_type("index", index, Integral, "a whole number from 0 on")
     if file.suffix.lower() not in WRITERS:
         raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
     text = read_text(file)
@@ -103,7 +105,7 @@ def load_problems(file: str | Path, ignore_joints: bool = False) -> list[Problem
     first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`;
     `ignore_joints` as in `load_problem`.
     """
-    file = Path(file)
+    file = file_name(file, "problem file")
     if file.is_dir():
         return load_motion_bench_maker(file, ignore_joints=ignore_joints)
     if file.suffix.lower() != ".jsonl":
@@ -191,19 +193,17 @@ def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -
 
     `robot` as in `problem_record`. Raises InputError for a place that cannot be written to.
     """
-    file = Path(file)
+    file = file_name(file, "problem file")
     ending = file.suffix.lower()
     if ending not in WRITERS:
         raise unknown_name(f"problem file format of {file}:", file.suffix, WRITERS)
     text = WRITERS[ending](problem_record(problem, file.parent, robot))
+    if ending != ".jsonl":
+        write_atomically(file, text)
+        return
     try:
-        if ending == ".jsonl":
-            with file.open("a", encoding="utf-8") as stream:
-                stream.write(text + "\n")
-        else:
-            part = file.with_name(f".{file.name}.{os.getpid()}.part")
-            part.write_text(text, encoding="utf-8")
-            part.replace(file)
+        with file.open("a", encoding="utf-8") as stream:
+            stream.write(text + "\n")
     except OSError as error:
         raise InputError(f"{file} cannot be written: {error.strerror}") from None
 

@@ -6,6 +6,7 @@ As with shapes, the constructors check their arguments themselves: see `no_type_
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from dataclasses import replace as dataclass_replace
+from pathlib import PurePath
 from typing import TYPE_CHECKING, ClassVar, no_type_check
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import LARGEST, SLOWEST, Value, numbers, rigid_transform
-from robotdiffuse.core.errors import InputError, shown, unknown_name
+from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
 from robotdiffuse.problems.constraints import CONSTRAINTS, CartesianLine, Constraint
@@ -225,6 +226,14 @@ class Problem(Value):
 
     load: ClassVar[Callable[..., "Problem"]]
     """`problems.files.load_problem`, put here by the package: files know problems, not the reverse."""
+
+
+def check_problem(problem: object, field: str = "problem") -> None:
+    """InputError for anything but a Problem, with what to call for the name of a file."""
+    how = "e.g. rd.Problem(robot, scene, start, goal)"
+    if isinstance(problem, str | PurePath):
+        how = f"rd.load_problem({shown(str(problem))}) reads one from a file"
+    check_type(field, problem, Problem, f"a Problem: {how}")
 
 
 def check_clearance(field: str, value: object) -> float:

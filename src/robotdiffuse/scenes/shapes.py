@@ -28,7 +28,7 @@ from robotdiffuse.core.bounds import (
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.transforms import rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh
-from robotdiffuse.scenes.point_cloud import voxel_thin
+from robotdiffuse.scenes.point_cloud import distinct, voxel_thin
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
@@ -332,6 +332,11 @@ class PointCloud(Shape):
             file: str | None = None,
             name: str = "point_cloud",
         ) -> None: ...
+
+    @cached_property
+    def distinct_points(self) -> Float[ndarray, "m 3"]:
+        """Without repetitions, each of which takes as long as a point of its own in Coal's tree."""
+        return distinct(self.points)
 
     @cached_property
     def area(self) -> float:

@@ -46,7 +46,7 @@ class _Seat:
     def __init__(self, robots: dict[str, Robot], longest: float) -> None:
         self.shared = multiprocessing.get_context("spawn").RawValue(worker.Shared)
         bare = {name: replace(robot) for name, robot in robots.items()}  # without what was compiled of them
-        self.process = LoneWorker(worker.prepare, (bare, longest, self.shared))
+        self.process = LoneWorker(worker.prepare, (bare, longest), (self.shared,))
 
 
 class Pool:

@@ -5,10 +5,10 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult, ResultFile
 from robotdiffuse.problems.files import problem_from_record
-from robotdiffuse.problems.problem import Problem
+from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.visualization.replay_page import write_replay
 
 
@@ -33,6 +33,9 @@ def show(result: PlanResult | ResultFile, problem: Problem | None = None, height
 
     Raises InputError outside a notebook, for a result without a motion and where the problem is not known.
     """
+    check_type("result", result, (PlanResult, ResultFile), "a result, as of rd.plan or rd.load_result")
+    if problem is not None:
+        check_problem(problem)
     if isinstance(result, ResultFile):
         if problem is None and result.problem is not None:
             problem = problem_from_record(result.problem)
