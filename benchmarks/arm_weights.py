@@ -159,14 +159,14 @@ def whole(learned: RobotDiffuse, every: dict[str, list[Problem]]) -> None:
         for planner in planners.values():
             planner.warm_up(drawn[0])
             for problem in drawn[:WARM]:
-                planner.plan(problem, LIMITS[-1], until="limit")
+                planner.plan(problem, LIMITS[-1], until="time_limit")
         for limit in LIMITS:
             lengths = {name: np.full(len(drawn), np.inf) for name in planners}
             by_batch = dict.fromkeys(planners, 0)
             for i, problem in enumerate(progress(drawn, f"{family}, {limit} s")):
                 turn = list(planners)[i % 3 :] + list(planners)[: i % 3]
                 for name in turn:
-                    result = planners[name].plan(problem, limit, seed=i, until="limit")
+                    result = planners[name].plan(problem, limit, seed=i, until="time_limit")
                     if result.path is not None:
                         lengths[name][i] = result.path.length
                         by_batch[name] += result.stage in ("network", "refinement", "smooth_noise")

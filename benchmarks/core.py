@@ -89,7 +89,7 @@ def best_known(cases: Sequence[Case], lengths: dict, found: Sequence[Record]) ->
 def warm(name: str, cases: Sequence[Case]) -> Planner:
     """A planner whose compiled code, Coal and network are loaded."""
     planner = load_planner(name)
-    planner.warm_up(cases[0].problem, "short")
+    planner.warm_up(cases[0].problem, "converged")
     return planner
 
 
@@ -120,7 +120,7 @@ def lengths(cases: Sequence[Case], known: dict, limits: Sequence[float], seeds: 
     names = ("aorrtc", "robotdiffuse", "rrt_connect")
     found: dict[tuple[str, float], list[Record]] = {}
     for limit in limits:
-        methods = {name: planned(warm(name, cases), until="limit", clearance=0.0) for name in names}
+        methods = {name: planned(warm(name, cases), until="time_limit", clearance=0.0) for name in names}
         for name, records in tried(cases, methods, range(seeds), limit, title=f"{limit:g} s").items():
             found[name, limit] = records
     best = best_known(cases, known, [record for records in found.values() for record in records])
@@ -204,7 +204,7 @@ def limits(cases: Sequence[Case], _lengths: dict) -> None:
             over = []
             for case in progress(cases, f"{name} {limit:g} s"):
                 with Clock() as clock:
-                    result = planner.plan(case.problem, limit, until="limit", clearance=0.0)
+                    result = planner.plan(case.problem, limit, until="time_limit", clearance=0.0)
                 over.append((1e3 * (clock.wall - limit), result.solved))
             late = np.array([o for o, _ in over])
             solved = sum(s for _, s in over)

@@ -109,8 +109,10 @@ class Told(RobotDiffuse):
 def equal_time(every: dict[str, list[Case]], settings: RobotDiffuseSettings) -> None:
     planners = {"as it ships": RobotDiffuse(settings), "with the code": Told(settings)}
     for planner in planners.values():
-        planner.warm_up(next(iter(every.values()))[0].problem, "short")  # loads the network
-    methods = {name: planned(planner, until="limit", clearance=0.0) for name, planner in planners.items()}
+        planner.warm_up(next(iter(every.values()))[0].problem, "converged")  # loads the network
+    methods = {
+        name: planned(planner, until="time_limit", clearance=0.0) for name, planner in planners.items()
+    }
     rows, ratios = [], dict[str, ndarray]()
     own = {name: list[bool]() for name in planners}
     for family, cases in every.items():

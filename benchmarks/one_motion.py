@@ -81,7 +81,7 @@ def nearest(problem: Problem, motion: Trajectory) -> list[float]:
 def blended(number: int, name: str) -> None:
     """Plan, show to the oracles, and print."""
     planner, every = rd.load_planner(name), list(sequences(number))
-    planner.warm_up(every[0], "short")
+    planner.warm_up(every[0], "converged")
     rows, collisions = [], 0
     for i, problem in enumerate(progress(every, "Blended")):
         found: dict[str, Any] = {}

@@ -208,7 +208,7 @@ def _dense(path: JointPath) -> ndarray:
 def measured(title: str, every: list[Asked], name: str) -> None:
     """Plan, show to the oracles, and print."""
     planner = rd.load_planner(name)
-    planner.warm_up(every[0].problem, "short")
+    planner.warm_up(every[0].problem, "converged")
     results, longer, seen = [], [], []
     for i, asked in enumerate(progress(every, title)):
         result = planner.plan(asked.problem, time_limit=SHORT, seed=i)

@@ -77,7 +77,7 @@ def requests(planner: str) -> list[Asked]:
 def bare(asked: list[Asked], planner: str) -> tuple[float, float]:
     """Wall and processor time of the bare planner for all requests [s]; notes what it answers."""
     loaded = rd.load_planner(planner)
-    loaded.warm_up(asked[0].problem, "short")
+    loaded.warm_up(asked[0].problem, "converged")
     for one in asked:
         result = loaded.plan(one.problem, TIME_LIMIT, one.seed)
         waypoints = None if result.path is None else result.path.positions.tolist()

@@ -88,7 +88,7 @@ def tried(name: str, problems: int) -> Tally:
     if not drawn:
         return tally
     for planner in (hybrid, search):
-        planner.warm_up(drawn[0][1], "short")
+        planner.warm_up(drawn[0][1], "converged")
     with PyBulletOracle(robot, drawn[0][1].scene) as oracle:
         for i, (what, problem) in enumerate(progress(drawn, name)):
             tally.problems += 1
@@ -104,7 +104,7 @@ def tried(name: str, problems: int) -> Tally:
                 check(problem, result, oracle, tally)
             if i % EACH == 0 and result.solved and result.stage != "straight_line":
                 ours, theirs = (
-                    p.plan(problem, SOON, seed=i, until="limit", clearance=0.0) for p in (hybrid, search)
+                    p.plan(problem, SOON, seed=i, until="time_limit", clearance=0.0) for p in (hybrid, search)
                 )
                 if ours.path is not None and theirs.path is not None:
                     tally.ratios.append(ours.path.length / theirs.path.length)

@@ -167,7 +167,7 @@ def run(arguments: argparse.Namespace) -> None:
             partial = Problem(problem.robot, known, problem.start, problem.goal, views=taken)
             spent = time.process_time() - began
             if warm:
-                HYBRID_PLANNER.warm_up(problem, "short")
+                HYBRID_PLANNER.warm_up(problem, "converged")
                 tried(problem, partial, PREDICTED if PREDICTED in missing else "padded")
                 warm = False
             for method in missing:

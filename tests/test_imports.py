@@ -105,7 +105,9 @@ def test_every_package_has_a_place_in_the_order() -> None:
 
 def test_no_module_imports_itself_through_others() -> None:
     names = {".".join(file.relative_to(SOURCE.parent).with_suffix("").parts): file for file in MODULES}
-    graph = {name: {n for full in imported(file) if (n := _module(full, names))} for name, file in names.items()}
+    graph = {
+        name: {n for full in imported(file) if (n := _module(full, names))} for name, file in names.items()
+    }
     circles = [ring for ring in strongly_connected(graph) if len(ring) > 1]
     assert not circles, "\n".join(" ".join(sorted(ring)) for ring in circles)
 

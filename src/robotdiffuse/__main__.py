@@ -12,9 +12,9 @@ def main() -> int:
     """As `cli.main`; Ctrl-C is one line while that is still imported, too."""
     gc.set_threshold(YOUNG)
     try:
-        from robotdiffuse.core.processes import interrupts_at_once
+        from robotdiffuse.core.processes import exit_on_interrupt
 
-        with interrupts_at_once():
+        with exit_on_interrupt():
             from robotdiffuse import cli
     except KeyboardInterrupt:
         print("robotdiffuse: stopped", file=sys.stderr)
@@ -25,9 +25,9 @@ def main() -> int:
 def run() -> NoReturn:
     """`main`, and the end of the process."""
     status = main()
-    from robotdiffuse.core.processes import leave
+    from robotdiffuse.core.processes import exit_process
 
-    leave(status)
+    exit_process(status)
 
 
 if __name__ == "__main__":

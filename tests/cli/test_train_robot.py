@@ -55,7 +55,7 @@ def test_an_arm_of_five_joints_plans_with_what_it_learned(tmp_path: Path) -> Non
     model = planner.model(robot)
     assert model is not None and model.dof == 5
     drawn = family_for("rop_dense", robot).draw(robot, np.random.default_rng(1))
-    result = planner.plan(drawn.problem(robot), 20.0, until="short")
+    result = planner.plan(drawn.problem(robot), 20.0, until="converged")
     assert result.solved and rd.verify(drawn.problem(robot), result.path).valid  # type: ignore[arg-type]
     assert not any("there are no weights" in note for note in result.notes)
     assert weights_for("model", replace(load_robot("ur5e"), name="so101")) is None

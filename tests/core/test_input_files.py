@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError, joined, shown, unknown_name
 from robotdiffuse.core.input_files import (
-    LONGEST_NAME,
+    MAX_SHOWN_NAME,
     input_file,
     is_file,
     parse_json,
@@ -157,7 +157,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
         patch.setattr(os, "access", lambda *_: False)  # root may read everything
         assert "permission denied" in one_line(lambda: input_file(closed))
     long = tmp_path / ("y" * 200)
-    assert str(long) in one_line(lambda: input_file(long)) or len(str(long)) > LONGEST_NAME
+    assert str(long) in one_line(lambda: input_file(long)) or len(str(long)) > MAX_SHOWN_NAME
 
 
 def test_a_broken_mesh_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

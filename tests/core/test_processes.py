@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from robotdiffuse.core.processes import LoneWorker, end
+from robotdiffuse.core.processes import SingleWorker, terminate
 
 ROOT = Path(__file__).parents[1]
 HELD = 60
@@ -32,13 +32,13 @@ class AliveWhenAsked(multiprocessing.get_context("spawn").Process):
 
 
 def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
-    worker = LoneWorker(nothing, ())
+    worker = SingleWorker(nothing, ())
     try:
         first = worker.call(os.getpid)
         with pytest.raises(BrokenProcessPool):
             worker.call(os.kill, first, signal.SIGKILL)
         second = worker.call(os.getpid)
-        worker.end(signal.SIGKILL)
+        worker.terminate(signal.SIGKILL)
         third = worker.call(os.getpid)
         assert len({first, second, third, os.getpid()}) == 4
         sent = worker.submit(time.sleep, HELD)
@@ -52,10 +52,10 @@ def test_a_lone_worker_is_replaced_when_it_dies_or_is_ended() -> None:
 
 
 def test_a_process_that_ends_on_its_own_meanwhile_is_no_error() -> None:
-    """`LoneWorker.close` raised ProcessLookupError where the pool's thread had waited for the process."""
+    """`SingleWorker.close` raised ProcessLookupError where the pool's thread had waited for the process."""
     process = AliveWhenAsked(target=nothing)
     process.start()
-    end([process], signal.SIGTERM, patience=float(HELD))
+    terminate([process], signal.SIGTERM, patience=float(HELD))
     assert process.exitcode == 0
 
 
@@ -82,8 +82,8 @@ def test_a_worker_in_compiled_code_does_not_outlive_a_parent_that_is_killed() ->
 
 SWALLOWING = """
 import ctypes, signal, time
-from robotdiffuse.core.processes import interrupts_at_once
-with interrupts_at_once(lambda: print("tidy", flush=True)):
+from robotdiffuse.core.processes import exit_on_interrupt
+with exit_on_interrupt(lambda: print("tidy", flush=True)):
     try:
         ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
         time.sleep(0.1)

@@ -5,8 +5,8 @@ from pathlib import Path
 import pytest
 
 from robotdiffuse.core import registry
-from robotdiffuse.core.processes import LoneWorker, on_this_machine
-from robotdiffuse.core.registry import Entry, Registry, added, take_over
+from robotdiffuse.core.processes import SingleWorker, on_this_machine
+from robotdiffuse.core.registry import Entry, Registry, added_entries, adopt_entries
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.problems.families import FAMILIES, load_family
 from robotdiffuse.problems.families.rop import Rop
@@ -27,7 +27,7 @@ def one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rop:
 
 def test_added_are_entries_that_the_package_has_not(one: Rop, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLANNERS, "rrt_connect", Entry("mine:RRT", "in place of ours"))
-    assert added() == {
+    assert added_entries() == {
         "family": {"one": FAMILIES["one"]},
         "planner": {"rrt_connect": PLANNERS["rrt_connect"]},
     }
@@ -35,7 +35,7 @@ def test_added_are_entries_that_the_package_has_not(one: Rop, monkeypatch: pytes
 
 def test_processes_have_what_was_added(one: Rop) -> None:
     assert list(on_this_machine(load_family, [("one",)], 1)) == [(0, one)]
-    worker = LoneWorker(take_over, ({},))
+    worker = SingleWorker(adopt_entries, ({},))
     assert worker.call(load_family, "one") == one
     worker.close()
 
@@ -44,8 +44,8 @@ def test_what_was_taken_over_is_in_tables_made_later(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(registry, "_taken_over", {})
     monkeypatch.setattr(registry, "_tables", {})
     before, ours, theirs = Registry("fruit", {}), Entry("a:B", "ours"), Entry("c:D", "theirs")
-    take_over({"fruit": {"fig": theirs}, "nut": {"hazel": theirs}})
+    adopt_entries({"fruit": {"fig": theirs}, "nut": {"hazel": theirs}})
     assert before == {"fig": theirs}
     assert Registry("nut", {"pecan": ours}) == {"pecan": ours, "hazel": theirs}
     # and on to the processes of a process
-    assert added() == {"fruit": {"fig": theirs}, "nut": {"hazel": theirs}}
+    assert added_entries() == {"fruit": {"fig": theirs}, "nut": {"hazel": theirs}}

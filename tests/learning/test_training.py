@@ -21,7 +21,7 @@ from helpers.stores import WAYPOINTS as STORED
 from helpers.stores import manifest_of, random_arrays
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.datasets.manifest import write_manifest
 from robotdiffuse.datasets.shards import shard_path, split_of, write_shard
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors, save_encoder
@@ -354,7 +354,7 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
 
 def test_two_trainings_do_not_share_a_folder(tmp_path, data):
     out = tmp_path / "out"
-    with alone_in(out), pytest.raises(InputError, match="another process"):
+    with lock_folder(out), pytest.raises(InputError, match="another process"):
         train_planner(planner_settings(data), str(out))
 
 

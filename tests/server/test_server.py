@@ -250,7 +250,7 @@ def test_a_worker_that_holds_too_much_is_replaced_between_requests() -> None:
 def test_it_stops_gracefully_and_leaves_no_worker() -> None:
     with serving("--workers", "1") as (client, process), ThreadPoolExecutor(2) as threads:
         workers = subprocess.run(["pgrep", "-P", str(process.pid)], capture_output=True, text=True).stdout
-        slow = asked(planner="aorrtc", time_limit=2.0, until="limit")
+        slow = asked(planner="aorrtc", time_limit=2.0, until="time_limit")
         first = threads.submit(client.post, "/plan", json=slow)
         until(lambda: gauge(client, "workers_busy") == 1)
         second = threads.submit(client.post, "/plan", json=asked())

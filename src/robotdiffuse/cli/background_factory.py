@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.processes import end, interrupts_not_passed_on, prepare_worker
-from robotdiffuse.core.registry import Added, added
+from robotdiffuse.core.processes import block_interrupts_in_children, prepare_worker, terminate
+from robotdiffuse.core.registry import AddedEntries, added_entries
 
 if TYPE_CHECKING:
     from robotdiffuse.generation import GenerationSettings
@@ -39,16 +39,16 @@ def filled_meanwhile(folder: str, workers: int, robot: str) -> Iterator[None]:
         return
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    factory = context.Process(target=_fill, args=(folder, workers, robot, theirs, added()))
+    factory = context.Process(target=_fill, args=(folder, workers, robot, theirs, added_entries()))
     # Ctrl-C is for this process, which then ends the factory
-    with interrupts_not_passed_on():
+    with block_interrupts_in_children():
         factory.start()
     theirs.close()
     try:
         _wait_for_shard(folder, ours)
         yield
     finally:
-        end([factory], signal.SIGINT, PATIENCE)
+        terminate([factory], signal.SIGINT, PATIENCE)
     error = _message(ours)
     if error:
         print(f"robotdiffuse: the data factory ended early: {error}", file=sys.stderr)
@@ -84,7 +84,7 @@ def _message(connection: Connection) -> str | None:
         return None
 
 
-def _fill(folder: str, workers: int, robot: str, connection: Connection, entries: Added) -> None:
+def _fill(folder: str, workers: int, robot: str, connection: Connection, entries: AddedEntries) -> None:
     """The factory's process: tells that it began, or its error; ends on SIGINT, and with its parent."""
     os.setpgrp()  # the terminal's Ctrl-C does not reach it
     begun = False

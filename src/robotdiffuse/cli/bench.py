@@ -30,7 +30,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         required=True,
         metavar="NAME,...",
         help="see `robotdiffuse planners`, or all; with settings, NAME:SETTING=VALUE:SETTING=VALUE, among "
-        "them until=first|short|limit and clearance=M of its calls, or with weights of its own, NAME@FOLDER",
+        "them until=first|converged|time_limit and clearance=M of its calls, or with weights of its own, NAME@FOLDER",
     )
     run.add_argument(
         "--problems",

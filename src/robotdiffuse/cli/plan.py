@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from robotdiffuse.cli.arguments import natural, not_negative, positive, share
 from robotdiffuse.cli.console import Waiting, print_next_view, print_result
 from robotdiffuse.cli.drawing import ENDINGS, draw, show
-from robotdiffuse.core.types import SHORT, UNTIL
+from robotdiffuse.core.types import CONVERGED, UNTIL
 from robotdiffuse.interop import WRITERS
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def add_plan(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--until",
         choices=UNTIL,
-        default=SHORT,
+        default=CONVERGED,
         help="end with the first motion, when more time stops paying (default), or with the time limit",
     )
     parser.add_argument(
@@ -270,12 +270,12 @@ def solve(
 
     The compiled code is loaded before, or compiled on a new machine, which would otherwise use up the limit.
     """
-    from robotdiffuse.core.processes import interrupts_at_once
+    from robotdiffuse.core.processes import exit_on_interrupt
     from robotdiffuse.planning import load_planner
     from robotdiffuse.planning.planner import compiles_first
 
     loading = Waiting(f"loading compiled code ({compiles_first(problem.robot)})")
-    with interrupts_at_once(loading.stop), loading:
+    with exit_on_interrupt(loading.stop), loading:
         loaded = load_planner(planner, settings, weights)
         loaded.warm_up(problem)
     with Waiting(f"planning with {planner}"):

@@ -124,11 +124,11 @@ def run_add(arguments: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import Progress
 
-    from robotdiffuse.core.processes import interrupts_at_once
+    from robotdiffuse.core.processes import exit_on_interrupt
 
     console = Console(stderr=True)
     bar = Progress(console=console, transient=True, disable=not console.is_terminal)
-    with interrupts_at_once(bar.stop), bar:
+    with exit_on_interrupt(bar.stop), bar:
         from robotdiffuse.cli.robot_report import print_preparation
         from robotdiffuse.robots.fitting.add import add_robot
 

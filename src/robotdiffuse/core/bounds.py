@@ -5,12 +5,12 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, shown
 
-LARGEST = 1e4
+MAX_COORDINATE = 1e4
 """Of all coordinates, sizes and joint values, either way [m] or [rad]: ten kilometres. float32 keeps a
 millimetre there, which compiled code makes up for."""
-SMALLEST = 1e-9
+MIN_SIZE = 1e-9
 """Of all sizes [m]: what is smaller is nothing in float32."""
-FASTEST = 1e6
+MAX_RATE = 1e6
 """Of all rates, in their units."""
 RIGID_SLACK = 1e-4
 """How far the rotation of a pose may be from orthonormal and its last row from 0 0 0 1, by entry."""
@@ -26,12 +26,12 @@ def numbers(value: object) -> ndarray | None:
     return array.astype(np.float64) if array.dtype.kind in "iuf" else None
 
 
-def within(array: ndarray, most: float = LARGEST) -> bool:
+def within(array: ndarray, most: float = MAX_COORDINATE) -> bool:
     """Whether all numbers are finite and at most so large either way."""
     return bool((np.abs(array) <= most).all())
 
 
-def vector(owner: str, name: str, value: object, size: int, most: float = LARGEST) -> ndarray:
+def vector(owner: str, name: str, value: object, size: int, most: float = MAX_COORDINATE) -> ndarray:
     """`size` numbers within ±most, or an InputError that names owner.name."""
     array = numbers(value)
     if array is None or array.shape != (size,) or not np.isfinite(array).all():
@@ -42,28 +42,28 @@ def vector(owner: str, name: str, value: object, size: int, most: float = LARGES
 
 
 def points(owner: str, name: str, value: object) -> ndarray:
-    """n x 3 coordinates within ±LARGEST [m], or an InputError that names the first wrong row."""
+    """n x 3 coordinates within ±MAX_COORDINATE [m], or an InputError that names the first wrong row."""
     array = numbers(value)
     if array is not None and array.size == 0:
         array = array.reshape(0, 3)
     if array is None or array.ndim != 2 or array.shape[1] != 3:
         raise InputError(f"{owner}.{name} is {form(array)}; it must be n x 3 finite numbers")
-    bad = np.flatnonzero(~(np.abs(array) <= LARGEST).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(array) <= MAX_COORDINATE).all(axis=1))
     if len(bad):
         row, more = array[bad[0]], "" if len(bad) == 1 else f" and {len(bad) - 1} more"
-        rule = f"finite numbers within ±{LARGEST:g} m"
+        rule = f"finite numbers within ±{MAX_COORDINATE:g} m"
         raise InputError(f"{owner}.{name}[{bad[0]}]{more} is {shown(row)}; it must be {rule}")
     return array
 
 
-def positive(owner: str, name: str, value: object, most: float = LARGEST) -> float:
-    """A number from SMALLEST to `most`, or an InputError that names owner.name."""
+def positive(owner: str, name: str, value: object, most: float = MAX_COORDINATE) -> float:
+    """A number from MIN_SIZE to `most`, or an InputError that names owner.name."""
     array = numbers(value)
     if array is None or array.ndim != 0 or not np.isfinite(array) or array <= 0:
         raise InputError(f"{owner}.{name} is {shown(value)}; it must be a positive number")
-    if not SMALLEST <= array <= most:
+    if not MIN_SIZE <= array <= most:
         raise InputError(
-            f"{owner}.{name} is {shown(value)}; it must be a number from {SMALLEST:g} to {most:g}"
+            f"{owner}.{name} is {shown(value)}; it must be a number from {MIN_SIZE:g} to {most:g}"
         )
     return float(array)
 
@@ -81,7 +81,9 @@ def rigid_transform(what: str, value: object) -> ndarray:
     """A pose as a 4 x 4 array, or an InputError that names `what`."""
     T = numbers(value)
     if T is None or T.shape != (4, 4) or not within(T):
-        raise InputError(f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{LARGEST:g}")
+        raise InputError(
+            f"{what} is {shown(value)}; it must be 4 x 4 finite numbers within ±{MAX_COORDINATE:g}"
+        )
     rotation = T[:3, :3]
     off = max(np.abs(rotation @ rotation.T - np.eye(3)).max(), np.abs(T[3] - LAST_ROW).max())
     if off > RIGID_SLACK or np.linalg.det(rotation) < 0:

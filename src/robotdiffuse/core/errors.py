@@ -4,11 +4,11 @@ from collections.abc import Iterable
 
 import numpy as np
 
-LONGEST_QUOTE = 60
+MAX_QUOTE = 60
 """Characters of a given value that a message repeats."""
-LONGEST_WORD = 300
+MAX_WORD = 300
 """Characters of any word of a message, as the name of a file."""
-MOST_NAMES = 100
+MAX_NAMES = 100
 """Known names that a message lists."""
 
 
@@ -21,16 +21,16 @@ class InputError(ValueError):
 
     def __init__(self, message: str = "", listed: Iterable[str] = ()) -> None:
         words = _printable(message).split()
-        line = " ".join(shortened(word) if len(word) > LONGEST_WORD else word for word in words)
+        line = " ".join(shortened(word) if len(word) > MAX_WORD else word for word in words)
         super().__init__("\n  ".join([line, *listed]))
 
 
 def shown(value: object) -> str:
     """A value as one short line, for error messages."""
     if isinstance(value, np.ndarray):
-        value = (value if value.size <= LONGEST_QUOTE else value.ravel()[:LONGEST_QUOTE]).tolist()
+        value = (value if value.size <= MAX_QUOTE else value.ravel()[:MAX_QUOTE]).tolist()
     if isinstance(value, str | bytes):
-        value = value[: LONGEST_QUOTE + 1]
+        value = value[: MAX_QUOTE + 1]
     try:
         text = repr(value)
     except (ValueError, RecursionError):  # an integer of too many digits, lists within lists
@@ -41,10 +41,10 @@ def shown(value: object) -> str:
 def shortened(text: str) -> str:
     """Text that others wrote, as one short line."""
     text = " ".join(_printable(text).split())
-    return text if len(text) <= LONGEST_QUOTE else text[: LONGEST_QUOTE - 3] + "..."
+    return text if len(text) <= MAX_QUOTE else text[: MAX_QUOTE - 3] + "..."
 
 
-def joined(names: Iterable[object], most: int = MOST_NAMES) -> str:
+def joined(names: Iterable[object], most: int = MAX_NAMES) -> str:
     """Names that others wrote, as one line of short ones."""
     short = [shortened(str(name)) for name in names]
     more = f" and {len(short) - most} more" if len(short) > most else ""

@@ -25,17 +25,17 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shortened, shown, unknown_name
 
 MEGABYTE = 2**20
-LARGEST_FILE = 256 * MEGABYTE
+MAX_FILE_SIZE = 256 * MEGABYTE
 MESH_FORMATS = (".dae", ".glb", ".gltf", ".obj", ".off", ".ply", ".stl")
-LARGEST_YAML = 16 * MEGABYTE
+MAX_YAML_SIZE = 16 * MEGABYTE
 """Ten seconds of reading; JSON takes less than one."""
-DEEPEST = 64
+MAX_DEPTH = 64
 """Lists and mappings within each other."""
-MOST_VALUES = 2_000_000
+MAX_VALUES = 2_000_000
 """Values that a YAML file may stand for, aliases followed."""
-LONGEST_NAME = 300
+MAX_SHOWN_NAME = 300
 """Of a file, in messages."""
-LONGEST_INTEGER = 30
+MAX_DIGITS = 30
 """Digits."""
 
 # trimesh logs the tracebacks of what it then raises, which without a handler go to standard error
@@ -63,14 +63,14 @@ def is_file(file: str | Path) -> bool:
         return False
 
 
-def input_file(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> Path:
+def input_file(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -> Path:
     """The path of a regular file of at most `largest` bytes; `what` stands before its name in messages.
 
     Raises InputError for one that is missing, no regular file (a folder, a device, a pipe), too large, not
     permitted, or whose name cannot be one.
     """
     text = str(file)
-    named = f"{what} {text if len(text) <= LONGEST_NAME else shortened(text)}".strip()
+    named = f"{what} {text if len(text) <= MAX_SHOWN_NAME else shortened(text)}".strip()
     if _closed.get():
         raise InputError(f"{named} is a file, and none is read here: give what it holds instead")
     try:
@@ -93,7 +93,7 @@ def input_file(file: str | Path, what: str = "", largest: int = LARGEST_FILE) ->
     return Path(file)
 
 
-def read_bytes(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> bytes:
+def read_bytes(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -> bytes:
     """The content of a file; InputError as `input_file`."""
     path = input_file(file, what, largest)
     try:
@@ -102,7 +102,7 @@ def read_bytes(file: str | Path, what: str = "", largest: int = LARGEST_FILE) ->
         raise InputError(f"{what} {path} cannot be read: {error.strerror}".strip()) from None
 
 
-def read_text(file: str | Path, what: str = "", largest: int = LARGEST_FILE) -> str:
+def read_text(file: str | Path, what: str = "", largest: int = MAX_FILE_SIZE) -> str:
     """The content of a UTF-8 text file; InputError as `input_file`, and if it is not text."""
     try:
         return read_bytes(file, what, largest).decode("utf-8-sig").replace("\r\n", "\n")
@@ -133,19 +133,19 @@ def read_triangles(file: str | Path, what: str = "mesh file", merge: bool = Fals
 
 def read_arrays(file: str | Path, what: str = "") -> dict[str, ndarray]:
     """The arrays of an .npz file, or of an .npy file under the name "". InputError as `input_file`, for a
-    damaged file, and for an archive that unpacks to more than LARGEST_FILE."""
+    damaged file, and for an archive that unpacks to more than MAX_FILE_SIZE."""
     path = input_file(file, what)
     try:
         if path.suffix.lower() != ".npz":
             return {"": np.load(path, allow_pickle=False)}
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
-        if size <= LARGEST_FILE:
+        if size <= MAX_FILE_SIZE:
             with np.load(path, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
     except Exception as error:  # NumPy, zipfile and zlib raise whatever they meet in a damaged file
         raise InputError(f"{what} {file} is damaged: {shortened(str(error))}".strip()) from None
-    most = LARGEST_FILE // MEGABYTE
+    most = MAX_FILE_SIZE // MEGABYTE
     raise InputError(f"{what} {file} unpacks to {size // MEGABYTE} MB; at most {most} MB are read".strip())
 
 
@@ -156,11 +156,11 @@ def read_json(file: str | Path, what: str = "") -> Any:
 
 def parse_json(text: str, where: str) -> Any:
     """The value in a JSON text; InputError, naming the place, for invalid, deep and endless ones."""
-    if text.count("[") + text.count("{") > DEEPEST:
+    if text.count("[") + text.count("{") > MAX_DEPTH:
         marks = np.frombuffer(_STRING.sub("", text).encode("utf-8", "replace"), np.uint8)
         opened = (marks == ord("[")) | (marks == ord("{"))
         closed = (marks == ord("]")) | (marks == ord("}"))
-        if (np.cumsum(opened.astype(np.int64) - closed)).max(initial=0) > DEEPEST:
+        if (np.cumsum(opened.astype(np.int64) - closed)).max(initial=0) > MAX_DEPTH:
             _too_deep(where)
     try:
         return json.loads(text, parse_int=lambda digits: _integer(digits, where))
@@ -173,7 +173,7 @@ def parse_json(text: str, where: str) -> Any:
 
 def read_yaml(file: str | Path, what: str = "") -> Any:
     """The content of a YAML (or JSON) file; InputError as `read_text` and `parse_yaml`."""
-    return parse_yaml(read_text(file, what, LARGEST_YAML), str(file))
+    return parse_yaml(read_text(file, what, MAX_YAML_SIZE), str(file))
 
 
 def parse_yaml(text: str, where: str) -> Any:
@@ -203,7 +203,7 @@ def parse_xml(text: bytes, where: str) -> ET.Element:
         events: list[Any] = list(parser.read_events())
         for event, _ in events:
             depth += 1 if event == "start" else -1
-            if depth > DEEPEST:
+            if depth > MAX_DEPTH:
                 _too_deep(where)
     except (ET.ParseError, ValueError, LookupError) as error:
         if isinstance(error, InputError):
@@ -256,7 +256,7 @@ class _Composer:
         self._add(1, event)
         if isinstance(event, yaml.ScalarEvent):
             value = self._scalar(event)
-        elif depth >= DEEPEST:
+        elif depth >= MAX_DEPTH:
             _too_deep(self.where)
         elif isinstance(event, yaml.SequenceStartEvent):
             value = []
@@ -296,8 +296,8 @@ class _Composer:
 
     def _add(self, count: int, event: Any) -> None:
         self.count += count
-        if self.count > MOST_VALUES:
-            self._refuse(event, f"it stands for more than {MOST_VALUES:,} values")
+        if self.count > MAX_VALUES:
+            self._refuse(event, f"it stands for more than {MAX_VALUES:,} values")
 
     def _refuse(self, event: Any, why: str) -> NoReturn:
         raise InputError(f"{self.where} is not valid YAML: {why} in line {event.start_mark.line + 1}")
@@ -316,9 +316,9 @@ def _integer(digits: str, where: str) -> int:
 
 
 def _check_digits(text: str, where: str) -> None:
-    if len(text) > LONGEST_INTEGER:
+    if len(text) > MAX_DIGITS:
         raise InputError(f"{where} holds the integer {shortened(text)}; no number there can be so large")
 
 
 def _too_deep(where: str) -> NoReturn:
-    raise InputError(f"{where} is nested more than {DEEPEST} levels deep")
+    raise InputError(f"{where} is nested more than {MAX_DEPTH} levels deep")

@@ -89,7 +89,7 @@ class JsonLines:
 
 
 @contextmanager
-def alone_in(out: Path) -> Iterator[None]:
+def lock_folder(out: Path) -> Iterator[None]:
     """Make the folder and lock it; the lock ends with this process, however that ends.
 
     Raises InputError if another process has the lock, or there can be no such folder.

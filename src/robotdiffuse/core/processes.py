@@ -1,6 +1,6 @@
-"""Calls shared out over processes of this machine or over a Ray cluster; who hears Ctrl-C, and how they end.
+"""Calls shared out over processes of this machine or over a Ray cluster; who hears Ctrl-C, and how they terminate.
 
-Ctrl-C is for the process that a person started: it ends the others. They end with it too, even where it is
+Ctrl-C is for the process that a person started: it ends the others. They terminate with it too, even where it is
 killed.
 """
 
@@ -27,27 +27,29 @@ from typing import Any, NoReturn
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.registry import Added, added, take_over
+from robotdiffuse.core.registry import AddedEntries, added_entries, adopt_entries
 
 Results = Generator[tuple[int, Any], None, None]
 """Results of calls as they are done, each with the number of its call; to be closed, so that none goes on."""
-PATIENCE = 5.0
-"""Until a process that was told to end is killed [s]."""
-CONNECT_SECONDS = 5.0
+TERMINATE_TIMEOUT = 5.0
+"""Until a process that was told to terminate is killed [s]."""
+CONNECT_TIMEOUT = 5.0
 """Until a Ray cluster that does not answer is given up; Ray itself tries for minutes."""
-LOST_NODES = 20
+MAX_RETRIES = 20
 """Times that a call is made again on another node of a Ray cluster."""
-AGAIN = "give the same command again"
+RERUN_HINT = "give the same command again"
 
 
 class Workers:
     """Processes of this machine, started when they are first asked and ended when the block is left."""
 
-    def __init__(self, count: int, patience: float = PATIENCE) -> None:
+    def __init__(self, count: int, patience: float = TERMINATE_TIMEOUT) -> None:
         """`count` 0: this process makes the calls itself. `patience`: for those that are stopped [s]."""
         # fresh interpreters: forked ones could inherit locks of running threads
         context = multiprocessing.get_context("spawn")
-        self._pool = ProcessPoolExecutor(count, context, prepare_worker, (added(),)) if count else None
+        self._pool = (
+            ProcessPoolExecutor(count, context, prepare_worker, (added_entries(),)) if count else None
+        )
         self._count, self._patience = count, patience
 
     def __enter__(self) -> "Workers":
@@ -57,7 +59,7 @@ class Workers:
         if self._pool is not None:
             processes = list((self._pool._processes or {}).values())
             self._pool.shutdown(wait=False, cancel_futures=True)
-            end(processes, signal.SIGTERM, self._patience)
+            terminate(processes, signal.SIGTERM, self._patience)
 
     def each(self, call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
         """Results of `call(*arguments)` for each of `calls`.
@@ -73,15 +75,15 @@ class Workers:
             while left or running:
                 while self._pool is not None and left and len(running) < self._count + 1:
                     number, arguments = left.pop()
-                    with interrupts_not_passed_on():
+                    with block_interrupts_in_children():
                         running[self._pool.submit(call, *arguments)] = number
                 for job in wait(running, return_when=FIRST_COMPLETED).done:
                     yield running.pop(job), job.result()
         except BrokenProcessPool:
-            raise InputError(f"a worker process was killed, or could not be started; {AGAIN}") from None
+            raise InputError(f"a worker process was killed, or could not be started; {RERUN_HINT}") from None
 
 
-class LoneWorker:
+class SingleWorker:
     """A process that makes calls in turn. One that dies of a call costs that call alone: the next has a new
     one."""
 
@@ -100,22 +102,22 @@ class LoneWorker:
         """The same, to be waited for."""
         if self._closed:
             raise BrokenProcessPool("closed")
-        with interrupts_not_passed_on():
+        with block_interrupts_in_children():
             if self._pool is not None:
                 with suppress(BrokenProcessPool):
                     return self._pool.submit(call, *arguments)
             context = multiprocessing.get_context("spawn")
-            given = added(), self._prepare, self._arguments
+            given = added_entries(), self._prepare, self._arguments
             self._pool = ProcessPoolExecutor(1, context, _prepare_lone, given)
             return self._pool.submit(call, *arguments)
 
-    def end(self, by: signal.Signals = signal.SIGTERM) -> None:
+    def terminate(self, by: signal.Signals = signal.SIGTERM) -> None:
         """End the process, whatever anybody waits for; the next call has a new one."""
         pool, processes = self._pool, self._processes()
         self._pool = None
         if pool is not None:
             pool.shutdown(wait=False, cancel_futures=True)
-            end(processes, by, PATIENCE)
+            terminate(processes, by, TERMINATE_TIMEOUT)
 
     def close(self, by: signal.Signals = signal.SIGTERM) -> None:
         """End the process for good."""
@@ -126,7 +128,7 @@ class LoneWorker:
         return list((self._pool._processes or {}).values()) if self._pool is not None else []
 
 
-def _prepare_lone(entries: Added, prepare: Callable[..., None], arguments: tuple) -> None:
+def _prepare_lone(entries: AddedEntries, prepare: Callable[..., None], arguments: tuple) -> None:
     prepare_worker(entries)
     prepare(*arguments)
 
@@ -144,19 +146,19 @@ def on_ray(call: Callable[..., Any], calls: Sequence[tuple]) -> Results:
     """
     left, running = list(enumerate(calls))[::-1], {}
     with ray_cluster() as ray:
-        task = ray.remote(num_cpus=1, max_retries=LOST_NODES)(_on_node)
+        task = ray.remote(num_cpus=1, max_retries=MAX_RETRIES)(_on_node)
         while left or running:
             most = 2 * max(1, int(ray.cluster_resources().get("CPU", 0)))
             while left and len(running) < most:
                 number, arguments = left.pop()
-                running[task.remote(added(), call, arguments)] = number
+                running[task.remote(added_entries(), call, arguments)] = number
             done, _ = ray.wait(list(running), num_returns=1)
             for reference in done:
                 yield running.pop(reference), ray.get(reference)
 
 
-def _on_node(entries: Added, call: Callable[..., Any], arguments: tuple) -> Any:
-    take_over(entries)
+def _on_node(entries: AddedEntries, call: Callable[..., Any], arguments: tuple) -> Any:
+    adopt_entries(entries)
     return call(*arguments)
 
 
@@ -176,7 +178,7 @@ def in_order(results: Results) -> Iterator[Any]:
 
 
 @contextmanager
-def interrupts_not_passed_on() -> Iterator[None]:
+def block_interrupts_in_children() -> Iterator[None]:
     """Ctrl-C never reaches processes that are started meanwhile: they inherit the signal mask.
 
     So it is the parent alone that handles it, even while they are still importing.
@@ -190,7 +192,7 @@ def interrupts_not_passed_on() -> Iterator[None]:
 
 
 @contextmanager
-def interrupts_afterwards() -> Iterator[None]:
+def delay_interrupts() -> Iterator[None]:
     """Ctrl-C takes effect when this is left."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -206,7 +208,7 @@ def interrupts_afterwards() -> Iterator[None]:
 
 
 @contextmanager
-def interrupts_at_once(tidy: Callable[[], None] = lambda: None) -> Iterator[None]:
+def exit_on_interrupt(tidy: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Ctrl-C ends this process, after `tidy`, wherever it is: for work that leaves nothing half-done.
 
     An exception would be lost while compiled code is loaded, whose callbacks swallow it, and mistaken for an
@@ -230,9 +232,9 @@ def interrupts_at_once(tidy: Callable[[], None] = lambda: None) -> Iterator[None
         signal.signal(signal.SIGINT, before)
 
 
-def prepare_worker(entries: Added) -> None:
-    """A worker has what its parent has `added` to the tables, and ends with it, even where that is killed."""
-    take_over(entries)
+def prepare_worker(entries: AddedEntries) -> None:
+    """A worker has what its parent has `added_entries` to the tables, and ends with it, even where that is killed."""
+    adopt_entries(entries)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     parent = multiprocessing.parent_process()
     if parent is not None:
@@ -254,9 +256,9 @@ def _end_by_signal_with(parent: BaseProcess) -> None:
         fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)
 
 
-def leave(status: int) -> NoReturn:
+def exit_process(status: int) -> NoReturn:
     """End this process with an exit status, as Python does but for taking the interpreter down, which is a
-    twentieth of what a plan by search takes from start to end.
+    twentieth of what a plan by search takes from start to terminate.
 
     One of several that torchrun started ends at once: threads of PyTorch's process group that want the
     interpreter meanwhile abort the process, rarely, and under load. What it had to do is done by then: files
@@ -271,7 +273,7 @@ def leave(status: int) -> NoReturn:
     os._exit(status)
 
 
-def end(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -> None:
+def terminate(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -> None:
     """Send the processes a signal, and kill those that have not ended after `patience` [s]."""
     processes = [process for process in processes if process.is_alive()]
     for process in processes:
@@ -285,14 +287,14 @@ def end(processes: Iterable[BaseProcess], by: signal.Signals, patience: float) -
         process.join()
 
 
-class Companion:
+class LineProcess:
     """A program that reads lines and answers with lines. Whatever happens to it, this process lives on.
 
     It is for one thread at a time; `close` is for any.
     """
 
     def __init__(self, command: Sequence[str], log: Path) -> None:
-        """`log`: what it prints on standard error is added to this file."""
+        """`log`: what it prints on standard error is added_entries to this file."""
         self._command, self._log = command, log
         self._process: subprocess.Popen[bytes] | None = None
         self._unread = b""
@@ -395,7 +397,7 @@ def ray_cluster() -> Iterator[Any]:
             ) from None
         raise
     except RayError as error:
-        raise InputError(f"the Ray cluster failed: {_line(error)}; {AGAIN}") from None
+        raise InputError(f"the Ray cluster failed: {_line(error)}; {RERUN_HINT}") from None
     except (ConnectionError, RuntimeError, ValueError) as error:
         if connected:
             raise
@@ -411,7 +413,7 @@ def _check_reachable(address: str) -> None:
     if not host or not port.isdecimal():
         return
     try:
-        socket.create_connection((host.strip("[]"), int(port)), CONNECT_SECONDS).close()
+        socket.create_connection((host.strip("[]"), int(port)), CONNECT_TIMEOUT).close()
     except (OSError, OverflowError) as error:
         raise InputError(f"no Ray cluster at {address}, where RAY_ADDRESS says: {error}") from None
 

@@ -21,20 +21,20 @@ class Entry:
     """What entries of one table are told apart by, e.g. search, learned, hybrid for planners."""
 
 
-Added = dict[str, dict[str, Entry]]
+AddedEntries = dict[str, dict[str, Entry]]
 """Entries by name, by what they are."""
 _tables: dict[str, "Registry"] = {}
-_taken_over: Added = {}
+_taken_over: AddedEntries = {}
 
 
-def added() -> Added:
-    """What this program has added to the tables that the package has, for `take_over` in its processes."""
+def added_entries() -> AddedEntries:
+    """What this program has added_entries to the tables that the package has, for `adopt_entries` in its processes."""
     found = {what: dict(table.items() - table.own.items()) for what, table in _tables.items()}
     return {what: entries for what, entries in found.items() if entries}
 
 
-def take_over(entries: Added) -> None:
-    """Add to all tables, those too that are made later, what the program that started this one has added."""
+def adopt_entries(entries: AddedEntries) -> None:
+    """Add to all tables, those too that are made later, what the program that started this one has added_entries."""
     _taken_over.update(entries)
     for what in _tables.keys() & entries.keys():
         _tables[what].update(entries[what])

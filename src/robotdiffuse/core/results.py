@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from robotdiffuse.core.bounds import FASTEST, within
+from robotdiffuse.core.bounds import MAX_RATE, within
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.input_files import read_json
 from robotdiffuse.core.output_files import check_output, write_atomically
@@ -250,6 +250,6 @@ def _rows(record: dict[str, Any], name: str, rows: int | None, columns: int | No
         raise InputError(f"{name} has shape {shape or 'none'}; it must be {wanted}")
     if (rows is not None and len(array) != rows) or (columns is not None and array.shape[1] != columns):
         raise InputError(f"{name} has shape {shape}; it must be {wanted}")
-    if not within(array, FASTEST):
-        raise InputError(f"{name} holds numbers that are not finite, or not within ±{FASTEST:g}")
+    if not within(array, MAX_RATE):
+        raise InputError(f"{name} holds numbers that are not finite, or not within ±{MAX_RATE:g}")
     return array

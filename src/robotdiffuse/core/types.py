@@ -36,7 +36,7 @@ class Status(Enum):
     """Of many problems: this one raised an error, or its process died of it."""
 
 
-FIRST, SHORT, LIMIT = UNTIL = ("first", "short", "limit")
+FIRST, CONVERGED, TIME_LIMIT = UNTIL = ("first", "converged", "time_limit")
 """When planning ends: with the first verified motion; when more time stops paying; when time runs out."""
 
 

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import FASTEST, LARGEST, numbers, within
+from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, numbers, within
 from robotdiffuse.core.errors import InputError, joined, shown
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.goals import JointGoal
@@ -53,9 +53,9 @@ def recorded(
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise InputError(f"joint_names has {', '.join(twice)} more than once")
-    q = _rows("positions", positions, len(names), LARGEST)
+    q = _rows("positions", positions, len(names), MAX_COORDINATE)
     v, a = (
-        None if _empty(rates) else _rows(what, rates, len(names), FASTEST)
+        None if _empty(rates) else _rows(what, rates, len(names), MAX_RATE)
         for what, rates in (("velocities", velocities), ("accelerations", accelerations))
     )
     for what, rates in (("velocities", v), ("accelerations", a)):

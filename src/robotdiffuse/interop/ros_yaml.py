@@ -4,7 +4,7 @@ from pathlib import Path
 
 import yaml
 
-from robotdiffuse.core.input_files import LARGEST_YAML, parse_yaml, read_text
+from robotdiffuse.core.input_files import MAX_YAML_SIZE, parse_yaml, read_text
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.interop.plain_messages import joint_trajectory, motion_of
@@ -14,7 +14,7 @@ from robotdiffuse.problems.problem import Problem
 
 def read(file: Path, topic: str | None = None) -> Recorded:
     """A JointTrajectory, RobotTrajectory or DisplayTrajectory."""
-    text = read_text(file, largest=LARGEST_YAML).rstrip()
+    text = read_text(file, largest=MAX_YAML_SIZE).rstrip()
     text = text.removesuffix("---")  # `ros2 topic echo` ends each message so
     return motion_of(parse_yaml(text, str(file)), str(file))
 

@@ -11,12 +11,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import compile_seconds
-from robotdiffuse.core.bounds import LARGEST
+from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.deadline import OutOfTimeError, check_left
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Positive, Settings
-from robotdiffuse.core.types import SHORT, UNTIL, Path, Status, Trajectory
+from robotdiffuse.core.types import CONVERGED, UNTIL, Path, Status, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.speed_limits import DEFAULT, NOTHING, Beside, Pace, TimingSettings
 from robotdiffuse.trajectories.timing import time_parameterize
@@ -40,8 +40,8 @@ _finishing: dict[str, float] = {}
 class Request(Settings):
     """What a call may ask for beyond its time limit and seed; see `planning.planner.Planner.plan`."""
 
-    until: Annotated[str, OneOf(UNTIL)] = SHORT
-    clearance: Annotated[float, Bound(least=0.0, most=LARGEST)] | None = None
+    until: Annotated[str, OneOf(UNTIL)] = CONVERGED
+    clearance: Annotated[float, Bound(least=0.0, most=MAX_COORDINATE)] | None = None
     velocity_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
     acceleration_scaling: Annotated[float, Bound(above=0.0, most=1.0)] = 1.0
     jerk: Positive | None = None

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import LARGEST
+from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
@@ -338,8 +338,8 @@ class Robot:
         for name, value in locked.items():
             if name not in movable:
                 raise unknown_name("joint in locked", name, movable)
-            if not abs(value) <= LARGEST:
-                raise InputError(f"locked: {name} is {value}; it must be a number within ±{LARGEST:g}")
+            if not abs(value) <= MAX_COORDINATE:
+                raise InputError(f"locked: {name} is {value}; it must be a number within ±{MAX_COORDINATE:g}")
         held = following(self.joints, self.locked | {name: float(value) for name, value in locked.items()})
         for name, value in locked.items():
             mimic = movable[name].mimic

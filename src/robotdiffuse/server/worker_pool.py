@@ -14,7 +14,7 @@ from dataclasses import replace
 from typing import Any
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.processes import LoneWorker
+from robotdiffuse.core.processes import SingleWorker
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.server import worker
 from robotdiffuse.server.metrics import Metrics
@@ -46,7 +46,7 @@ class _Seat:
     def __init__(self, robots: dict[str, Robot], longest: float) -> None:
         self.shared = multiprocessing.get_context("spawn").RawValue(worker.Shared)
         bare = {name: replace(robot) for name, robot in robots.items()}  # without what was compiled of them
-        self.process = LoneWorker(worker.prepare, (bare, longest, self.shared))
+        self.process = SingleWorker(worker.prepare, (bare, longest, self.shared))
 
 
 class Pool:
@@ -212,7 +212,7 @@ class Pool:
     async def _renew(self, seat: _Seat) -> None:
         """Another worker in this one's place."""
         self.ready -= 1
-        seat.process.end(signal.SIGKILL)
+        seat.process.terminate(signal.SIGKILL)
         await self._replace(seat)
 
     async def _replace(self, seat: _Seat) -> None:
@@ -227,7 +227,7 @@ class Pool:
     async def _prepared(self, seat: _Seat) -> None:
         """One that compiled makes place for one that loads: so all give the same numbers, bit for bit."""
         if await asyncio.wrap_future(seat.process.submit(worker.warm_up)):
-            seat.process.end(signal.SIGKILL)
+            seat.process.terminate(signal.SIGKILL)
             await asyncio.wrap_future(seat.process.submit(worker.warm_up))
         self.ready += 1
         self._free(seat)

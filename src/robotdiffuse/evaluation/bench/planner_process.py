@@ -17,9 +17,9 @@ from dataclasses import astuple
 from pathlib import Path as FilePath
 from typing import TextIO
 
-from robotdiffuse.core.processes import Companion
-from robotdiffuse.core.registry import Entry, added, take_over
-from robotdiffuse.core.types import SHORT
+from robotdiffuse.core.processes import LineProcess
+from robotdiffuse.core.registry import Entry, added_entries, adopt_entries
+from robotdiffuse.core.types import CONVERGED
 from robotdiffuse.evaluation.bench.entries import Contestant
 from robotdiffuse.evaluation.methods import measure_of, planner_calls
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN
@@ -45,8 +45,8 @@ class PlannerProcess:
 
     def __init__(self, contestant: Contestant, log: FilePath) -> None:
         """`log`: what the process prints is added to this file."""
-        entries = {what: {n: astuple(e) for n, e in table.items()} for what, table in added().items()}
-        self._far = Companion([*FAR_SIDE, contestant.text, json.dumps([sys.path, entries])], log)
+        entries = {what: {n: astuple(e) for n, e in table.items()} for what, table in added_entries().items()}
+        self._far = LineProcess([*FAR_SIDE, contestant.text, json.dumps([sys.path, entries])], log)
 
     def warm(self, trial: Trial) -> None:
         """Be ready for a trial's robot. A process that dies of it will say so when it is to plan."""
@@ -130,7 +130,7 @@ def _read(tasks: TextIO, lines: "queue.Queue[str]") -> None:
 def _warm_up(planner: Planner, problem: Problem) -> None:
     """Calls that compile, load and fill caches, those of the measurements too."""
     try:
-        for result in planner.warm_up(problem, SHORT):
+        for result in planner.warm_up(problem, CONVERGED):
             if result.path is not None and result.trajectory is not None:
                 measure_of(problem.robot)(result.path, result.trajectory, result)
     except Exception:  # the timed call will show it
@@ -152,7 +152,7 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"  # of PyTorch, which only planners with a network load
     path, entries = json.loads(sys.argv[2])
     sys.path += [place for place in path if place not in sys.path]
-    take_over({what: {n: Entry(*e) for n, e in table.items()} for what, table in entries.items()})
+    adopt_entries({what: {n: Entry(*e) for n, e in table.items()} for what, table in entries.items()})
     contestant = Contestant.of(sys.argv[1])
     serve(contestant.load(), contestant.request(), sys.stdin, answers)
 

@@ -10,7 +10,7 @@ from pathlib import Path as FilePath
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.evaluation.bench.entries import Contestant
 from robotdiffuse.evaluation.bench.workers import on_ray, on_this_machine
 from robotdiffuse.evaluation.machine import processor, versions
@@ -86,7 +86,7 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
     gives the same. Raises InputError for bad settings or a planner that cannot be loaded, before any call,
     and KeyboardInterrupt on Ctrl-C; the same settings go on.
     """
-    with alone_in(settings.out):
+    with lock_folder(settings.out):
         contestants = settings.contestants
         for contestant in contestants.values():
             contestant.load()
