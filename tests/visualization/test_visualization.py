@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import robotdiffuse as rd
 from helpers.visual_bundles import visual_meshes, write_visual
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
@@ -271,3 +272,15 @@ def test_bad_settings(settings):
 def test_meshes_without_area_are_drawn(flat: list[list[int]]) -> None:
     surface = creased(np.array(flat, np.float64), np.array([[0, 1, 2]]), np.ones((1, 3)))
     assert np.isfinite(surface.normals).all()
+
+
+def test_names_of_obstacles_stay_text_in_a_replay(tmp_path) -> None:
+    panda, name = rd.load_robot("panda"), "</script><script>alert(1)</script>"
+    q = np.zeros((2, panda.dof))
+    motion = rd.Trajectory(panda.joint_names, np.array([0.0, 1.0]), q, 0 * q, 0 * q)
+    file = tmp_path / "replay.html"
+    write_replay(panda, rd.Scene([rd.Sphere([1, 1, 1], 0.1, name=name)]), motion, file)
+    text = file.read_text("utf-8")
+    assert "<script>alert" not in text
+    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)
+    assert found is not None and name in json.dumps(json.loads(found.group(1)), ensure_ascii=False)

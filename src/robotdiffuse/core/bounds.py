@@ -1,4 +1,5 @@
-"""Numbers at the door: arrays of what anybody gave, within bounds that all code behind can work with."""
+"""Checks of numbers that users give: converted to arrays, and kept within bounds that all other code can
+handle."""
 
 import numpy as np
 from numpy import ndarray
@@ -6,19 +7,19 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shown
 
 MAX_COORDINATE = 1e4
-"""Of all coordinates, sizes and joint values, either way [m] or [rad]: ten kilometres. float32 keeps a
-millimetre there, which compiled code makes up for."""
+"""Largest absolute coordinate, size or joint value [m] or [rad]: ten kilometres. At this distance float32
+resolves about a millimetre, and compiled code adds a margin for it."""
 MIN_SIZE = 1e-9
-"""Of all sizes [m]: what is smaller is nothing in float32."""
+"""Smallest size [m]; float32 cannot resolve smaller ones beside coordinates."""
 MAX_RATE = 1e6
-"""Of all rates, in their units."""
+"""Largest absolute velocity, acceleration or jerk, in its own unit."""
 RIGID_SLACK = 1e-4
-"""How far the rotation of a pose may be from orthonormal and its last row from 0 0 0 1, by entry."""
+"""Largest deviation of any entry: of the rotation from orthonormal, of the last row from 0 0 0 1."""
 LAST_ROW = (0.0, 0.0, 0.0, 1.0)
 
 
 def numbers(value: object) -> ndarray | None:
-    """A float64 array, or None where the value is anything but (nested lists of) numbers."""
+    """The value as a float64 array; None if it is not a number or nested lists of numbers."""
     try:
         array = np.asarray(value)
     except (TypeError, ValueError, OverflowError, RecursionError):
@@ -27,12 +28,12 @@ def numbers(value: object) -> ndarray | None:
 
 
 def within(array: ndarray, most: float = MAX_COORDINATE) -> bool:
-    """Whether all numbers are finite and at most so large either way."""
+    """Whether all numbers are finite and at most `most` in absolute value."""
     return bool((np.abs(array) <= most).all())
 
 
 def vector(owner: str, name: str, value: object, size: int, most: float = MAX_COORDINATE) -> ndarray:
-    """`size` numbers within ±most, or an InputError that names owner.name."""
+    """The value as `size` numbers within ±most. Raises InputError, naming owner.name, for anything else."""
     array = numbers(value)
     if array is None or array.shape != (size,) or not np.isfinite(array).all():
         raise InputError(f"{owner}.{name} is {shown(value)}; it must be {size} finite numbers")
@@ -42,7 +43,10 @@ def vector(owner: str, name: str, value: object, size: int, most: float = MAX_CO
 
 
 def points(owner: str, name: str, value: object) -> ndarray:
-    """n x 3 coordinates within ±MAX_COORDINATE [m], or an InputError that names the first wrong row."""
+    """The value as n x 3 coordinates within ±MAX_COORDINATE [m].
+
+    Raises InputError, naming the first wrong row, for anything else.
+    """
     array = numbers(value)
     if array is not None and array.size == 0:
         array = array.reshape(0, 3)
@@ -57,7 +61,8 @@ def points(owner: str, name: str, value: object) -> ndarray:
 
 
 def positive(owner: str, name: str, value: object, most: float = MAX_COORDINATE) -> float:
-    """A number from MIN_SIZE to `most`, or an InputError that names owner.name."""
+    """The value as a number from MIN_SIZE to `most`. Raises InputError, naming owner.name, for anything
+    else."""
     array = numbers(value)
     if array is None or array.ndim != 0 or not np.isfinite(array) or array <= 0:
         raise InputError(f"{owner}.{name} is {shown(value)}; it must be a positive number")
@@ -69,7 +74,7 @@ def positive(owner: str, name: str, value: object, most: float = MAX_COORDINATE)
 
 
 def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
-    """The quaternion scaled to length 1; one that has it already is kept bit for bit."""
+    """The quaternion scaled to length 1; one of length 1 is returned unchanged, bit for bit."""
     wxyz = vector(owner, name, value, 4)
     norm = np.linalg.norm(wxyz)
     if norm < 1e-6:
@@ -78,7 +83,7 @@ def unit_quaternion(owner: str, value: object, name: str = "wxyz") -> ndarray:
 
 
 def rigid_transform(what: str, value: object) -> ndarray:
-    """A pose as a 4 x 4 array, or an InputError that names `what`."""
+    """The value as a 4 x 4 pose. Raises InputError, naming `what`, for anything else."""
     T = numbers(value)
     if T is None or T.shape != (4, 4) or not within(T):
         raise InputError(
@@ -93,5 +98,5 @@ def rigid_transform(what: str, value: object) -> ndarray:
 
 
 def form(array: ndarray | None) -> str:
-    """What an array is, for messages."""
+    """The shape of an array in words, for error messages."""
     return "not numbers" if array is None else f"an array of {' x '.join(map(str, array.shape))}"
