@@ -1,4 +1,4 @@
-"""Motions in requests, and what the validator says of them."""
+"""Paths and trajectories in requests, and validation reports in answers."""
 
 from dataclasses import asdict
 from typing import Any
@@ -15,9 +15,10 @@ MOTIONS = ("path", "trajectory")
 
 
 def read_motion(name: str, data: object) -> Path | Trajectory:
-    """{joint_names, positions}, of a path; for a trajectory times, velocities and accelerations too.
+    """The motion in a request: `name` is path (joint_names, positions) or trajectory (also times, velocities
+    and accelerations).
 
-    Raises InputError, which names the field, for anything else; whether times increase is for the validator.
+    Raises InputError, naming the field, for anything else. The validator checks that times increase.
     """
     rows = ROWS if name == "trajectory" else ("positions",)
     timed = ("times",) if name == "trajectory" else ()
@@ -52,7 +53,7 @@ def _array(where: str, value: object, dimensions: int, most: float) -> ndarray:
 
 
 def report_record(report: Report) -> dict[str, Any]:
-    """For JSON."""
+    """A validation report as JSON values."""
     return {
         "valid": report.valid,
         "min_clearance": report.min_clearance,
