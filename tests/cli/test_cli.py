@@ -1,4 +1,4 @@
-"""The command line, run as a user would: exit status, one line for bad input, files that come out."""
+"""The command line: exit status, one line for bad input, and written files."""
 
 import json
 import multiprocessing
@@ -15,7 +15,7 @@ import pytest
 from helpers.made_arms import chain, row, written
 from helpers.quick_preparation import QUICK
 from robotdiffuse.cli import main
-from robotdiffuse.cli.background_factory import filled_meanwhile
+from robotdiffuse.cli.train_generate import generate_meanwhile
 from robotdiffuse.core.results import PlanResult, load_result
 from robotdiffuse.core.types import Status
 from robotdiffuse.datasets.manifest import read_manifest, write_manifest
@@ -259,7 +259,7 @@ def test_data_are_made_meanwhile(tmp_path: Path) -> None:
     settings = GenerationSettings(trajectories=10_000, shard=2, waypoints=16)
     out.mkdir()
     write_manifest(out, manifest_of(settings))
-    with filled_meanwhile(str(out), 1, "panda"):
+    with generate_meanwhile(str(out), 1, "panda"):
         first = len(shard_indices(out))
         assert first > 0
         end = time.monotonic() + 300
@@ -299,7 +299,7 @@ def test_ctrl_c(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("robotdiffuse.cli.plan.solve", interrupted)
+    monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", interrupted)
     assert run("plan", write(tmp_path), "--planner", "rrt_connect") == 130
     assert capsys.readouterr().err == "robotdiffuse: stopped\n"
 
@@ -328,7 +328,7 @@ def test_plan_takes_settings_of_the_planner(tmp_path: Path, monkeypatch: pytest.
         given.extend(rest)
         return PlanResult(Status.NO_PATH, "none", planner, "panda", 0.1, 0)
 
-    monkeypatch.setattr("robotdiffuse.cli.plan.solve", solve)
+    monkeypatch.setattr("robotdiffuse.cli.plan.load_and_plan", solve)
     sets = ("--set", "search.range=0.5", "--set", "samples=4")
     assert run("plan", write(tmp_path), *sets) == 1
     settings = planner_settings("robotdiffuse", ["samples=4", "search.range=0.5"])
@@ -371,7 +371,7 @@ def test_robot_add_with_srdf_and_robot_list(
 
     assert run("robot", "add", str(file), "--allow", "j1_link", "j4_link") == 0
     told = capsys.readouterr()
-    assert "made.srdf sees differently" in told.out and "User" in told.out and "named 1" in told.out
+    assert "pairs that differ from made.srdf" in told.out and "User" in told.out and "named 1" in told.out
     assert "5 of 11: spheres of base" in told.err and "11 of 11: done" in told.err
     allowed = load_robot("made").allowed_collisions
     assert frozenset(("j1_link", "j4_link")) in allowed
@@ -431,7 +431,11 @@ def test_example_in_python(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     ("command", "status", "said"),
     [
         ("{} > /dev/full", 3, "the output could not be written: No space left on device"),
-        ("{} | true; exit ${{PIPESTATUS[0]}}", 3, "the output could not be written: its reader has gone"),
+        (
+            "{} | true; exit ${{PIPESTATUS[0]}}",
+            3,
+            "the output could not be written: its reader has closed the pipe",
+        ),
         ("{} >&-", 0, ""),
         ("PYTHONIOENCODING=ascii {} > /dev/null", 0, ""),
     ],

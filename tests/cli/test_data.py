@@ -1,4 +1,4 @@
-"""robotdiffuse data info, check, view, export and import, as a user would run them."""
+"""The commands `data info`, `check`, `view`, `export` and `import`."""
 
 import json
 import re
