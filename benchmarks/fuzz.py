@@ -594,7 +594,7 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     from robotdiffuse.core.types import Trajectory
     from robotdiffuse.interop import read_motion, write_motion
     from robotdiffuse.interop.plain_messages import joint_trajectory
-    from robotdiffuse.interop.recorded_motion import fitted
+    from robotdiffuse.interop.recorded_motion import motion_of_robot
     from robotdiffuse.problems.files import problem_from_record
     from robotdiffuse.validation.validator import Verifier
 
@@ -621,7 +621,7 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         part.write_bytes(damaged(rng, part.read_bytes()))
 
     def read() -> None:
-        motion = fitted(read_motion(file), problem.robot).motion
+        motion = motion_of_robot(read_motion(file), problem.robot).motion
         validator = Verifier(problem)
         validator.trajectory(motion) if isinstance(motion, Trajectory) else validator.path(motion)
 

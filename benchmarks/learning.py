@@ -159,7 +159,7 @@ def partial_views(count: int, folder: File | None) -> tuple[list[Case], list[Pro
     seen: list[Case] = []
     wholes: list[Problem] = []
     rng, touched = np.random.default_rng([SEED, 4]), 0
-    with World(PANDA, Scene([]), look=True) as world:
+    with World(PANDA, Scene([]), visuals=True) as world:
         for family in cycle(FAMILIES):
             case = next(queues[family], None)
             if case is None or len(seen) == count:

@@ -83,7 +83,7 @@ def motion(robot: Robot, *waypoints: np.ndarray) -> Trajectory:
 @pytest.mark.parametrize("kind", ["sphere", "box", "cylinder", "capsule"])
 def test_points_lie_on_what_the_camera_sees_of_a_shape(kind: str) -> None:
     shape = shape_at(kind)
-    with World(box_arm(), Scene([shape]), look=True) as world:
+    with World(box_arm(), Scene([shape]), visuals=True) as world:
         world.place(AWAY)
         cloud = point_cloud(world, [CAMERA], np.random.default_rng(0), voxel=1e-4)
     assert len(cloud.points) > 1000
@@ -101,7 +101,7 @@ def test_points_lie_on_what_the_camera_sees_of_a_shape(kind: str) -> None:
 def test_the_arm_is_not_in_the_cloud_but_hides_what_is_behind() -> None:
     robot, scene = box_arm(), Scene([Box([0.6, 0, -0.2], [1.5, 1, 0.02])])
     above = DepthCamera((0.6, 0.0, 1.5), (0.6, 0.0, 0.0), up=(1.0, 0.0, 0.0))
-    with World(robot, scene, look=True) as world:
+    with World(robot, scene, visuals=True) as world:
         world.place(np.zeros(3))
         image = render(world, above)
         cloud = point_cloud(world, [above], np.random.default_rng(0), voxel=1e-4)
@@ -120,7 +120,7 @@ def test_noise_lies_along_the_ray_and_dropout_is_a_share() -> None:
     scene = Scene([Box([-0.5, 0, 0.5], [0.02, 4, 4])])
     camera = DepthCamera((1.5, 0.0, 0.5), (0.0, 0.0, 0.5))
     noisy = replace(camera, noise=0.005, dropout=0.25)
-    with World(box_arm(), scene, look=True) as world:
+    with World(box_arm(), scene, visuals=True) as world:
         world.place(AWAY)
         clouds = [
             point_cloud(world, [c], np.random.default_rng(s), voxel=1e-5).points
@@ -139,7 +139,7 @@ def test_cameras_are_merged_and_thinned_and_obstacles_left_out() -> None:
     floor = Box([0, 0, -0.5], [3, 3, 0.02], name="floor")
     scene = Scene([Sphere([0, 0, 0.5], 0.25), floor])
     across = replace(CAMERA, position=(-1.5, 1.2, 1.4))
-    with World(box_arm(), scene, look=True) as world:
+    with World(box_arm(), scene, visuals=True) as world:
         world.place(AWAY)
         rng = np.random.default_rng(0)
         one = point_cloud(world, [CAMERA], rng, without=["floor"]).points
@@ -160,7 +160,7 @@ def test_cameras_are_merged_and_thinned_and_obstacles_left_out() -> None:
 def test_a_point_cloud_is_seen_as_points() -> None:
     points = np.array([[0.0, 0.1, 0.4], [0.0, -0.1, 0.5], [0.2, 0.0, 0.3]])
     cloud = PointCloud(points, 0.03)
-    with World(box_arm(), Scene([cloud]), look=True) as world:
+    with World(box_arm(), Scene([cloud]), visuals=True) as world:
         world.place(AWAY)
         seen = point_cloud(world, [CAMERA], np.random.default_rng(0), voxel=1e-4).points
     nearest = np.linalg.norm(seen[:, None] - points, axis=2)
@@ -189,7 +189,7 @@ def test_cameras_that_cannot_be(values: dict, message: str) -> None:
 def test_a_world_without_surfaces_cannot_be_looked_at() -> None:
     with (
         World(box_arm(), Scene()) as world,
-        pytest.raises(InputError, match=r"World\(\.\.\., look=True\)"),
+        pytest.raises(InputError, match=r"World\(\.\.\., visuals=True\)"),
     ):
         render(world, CAMERA)
 

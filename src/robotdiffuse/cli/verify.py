@@ -112,7 +112,7 @@ def _read(
     """The problem, the motions to validate by name, and notes on changes made to read them."""
     from robotdiffuse.core.types import Trajectory
     from robotdiffuse.interop import read_motion
-    from robotdiffuse.interop.recorded_motion import fitted, own_problem
+    from robotdiffuse.interop.recorded_motion import motion_of_robot, problem_of_motion
     from robotdiffuse.problems.files import load_problem
 
     if (arguments.scene is None) != (arguments.robot is None):
@@ -134,9 +134,9 @@ def _read(
         from robotdiffuse.robots import load_robot
 
         robot = load_robot(arguments.robot)
-        problem = own_problem(recorded, robot, read_moveit_scene(str(arguments.scene), robot))
+        problem = problem_of_motion(recorded, robot, read_moveit_scene(str(arguments.scene), robot))
     try:
-        fit = fitted(recorded, problem.robot)
+        fit = motion_of_robot(recorded, problem.robot)
     except InputError as error:
         raise InputError(f"{arguments.motion}: {error}") from None
     what = "trajectory" if isinstance(fit.motion, Trajectory) else "path"
