@@ -694,13 +694,13 @@ def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     """Heads of requests, at the door of the live page: handed on or not, never an error."""
-    from robotdiffuse.visualization.live.access import admitted
+    from robotdiffuse.visualization.live.access import accepted_head
 
     token = ("", "abc")[rng.integers(2)]
     host = (b"localhost:8080", b"[::1]:1", b"a.example")[rng.integers(3)]
     head = b"GET /abc/?x=1 HTTP/1.1\r\nHost: %s\r\nOrigin: http://%s\r\nUpgrade: websocket" % (host, host)
     head = damaged(rng, head)
-    return lambda: admitted(head, token)
+    return lambda: accepted_head(head, token)
 
 
 def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:

@@ -176,7 +176,7 @@ def test_joints_are_put_into_order_by_name() -> None:
         point["positions"] = point["positions"][::-1]
     found = motion_of_robot(motion_from_record(record, "it"), rd.load_robot("panda"))
     assert found.motion.positions[0].tolist() == START
-    assert "joints were put into the robot's order by their names" in found.notes
+    assert "joints were reordered by name" in found.notes
     assert "no accelerations are given: those of the velocities are validated" in found.notes
 
 
@@ -204,7 +204,7 @@ def test_all_forms_of_messages_hold_the_same_motion() -> None:
 def test_times_that_begin_later_and_no_times() -> None:
     found = checked_motion(["a"], [[0.0], [1.0]], [0.5, 1.0])
     assert found.times is not None and found.times.tolist() == [0.0, 0.5]
-    assert found.notes == ("times begin at 0.5 s, counted from there",)
+    assert found.notes == ("times begin at 0.5 s; they were shifted to 0",)
     assert checked_motion(["a"], [[0.0], [1.0]], [0, 0]).times is None
     assert checked_motion(["a"], [[0.0], [1.0]]).times is None
 
@@ -265,7 +265,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
             ),
             rd.load_robot("panda"),
         ),
-        "moves panda_finger_joint1 from 0 to 0.04, which the problem holds at 0.04",
+        "moves panda_finger_joint1 from 0 to 0.04, which the problem locks at 0.04",
     ),
     "no points": (lambda: motion_from_record(panda_record(points=[]), "it"), "it: points is empty"),
     "points of text": (lambda: motion_from_record(panda_record(points=["x"]), "it"), r"points\[0\] is 'x'"),
@@ -381,7 +381,7 @@ def test_a_missing_extra_says_what_to_install(module: str, package: str, extra: 
     import subprocess
     import sys
 
-    modules = {"rosbags": "bag", "mcap": "mcap_file", "rerun": "rerun_file", "roslibpy": "rosbridge"}
+    modules = {"rosbags": "rosbag", "mcap": "mcap_file", "rerun": "rerun_file", "roslibpy": "rosbridge"}
     code = (
         f"import sys; sys.modules[{module!r}] = None\n"
         f"try: import robotdiffuse.interop.{modules[module]}\nexcept ValueError as error: print(error)"

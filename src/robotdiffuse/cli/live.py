@@ -64,17 +64,17 @@ def run(arguments: argparse.Namespace) -> NoReturn:
     from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS
     from robotdiffuse.visualization.live.access import is_loopback, listen, new_token
     from robotdiffuse.visualization.live.files import first_problem
-    from robotdiffuse.visualization.live.session import Choice, Session
+    from robotdiffuse.visualization.live.session import PageOptions, Session
 
     planner = arguments.planner or DEFAULT_PLANNER
     PLANNERS.entry(planner)
-    choice = Choice(planner, arguments.time_limit)
+    options = PageOptions(planner, arguments.time_limit)
     listening = listen(arguments.host, arguments.port)
     with Console(stderr=True).status("loading the robot (preparing a new URDF takes a minute)"):
         problem = first_problem(arguments.problem, arguments.robot)
     host, number = listening.getsockname()[:2]
     token = "" if is_loopback(host) else new_token()
-    page = Page(Session(problem, choice), listening, token)
+    page = Page(Session(problem, options), listening, token)
     ended = threading.Event()
     for stop_signal in (signal.SIGINT, signal.SIGTERM):
         signal.signal(stop_signal, lambda *_: ended.set())
