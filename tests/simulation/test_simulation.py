@@ -41,6 +41,7 @@ from robotdiffuse.simulation.model import mass_properties
 from robotdiffuse.simulation.replay import sample
 from robotdiffuse.trajectories.timing import time_parameterize
 
+pytestmark = pytest.mark.sim
 EYE = (1.5, -1.2, 1.4)
 CAMERA = DepthCamera(EYE, (0.0, 0.0, 0.4))
 TURN = np.array([0.9, 0.3, 0.2, 0.1])

@@ -1,4 +1,4 @@
-"""Pictures and replays: what they show, that they stand alone, and how bad input is answered."""
+"""Pictures and replays: their content, that replays are self-contained, and errors for bad input."""
 
 import base64
 import json

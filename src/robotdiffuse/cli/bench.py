@@ -190,18 +190,20 @@ def _write_replays(bench: "Bench", parts: "list[Section]", file: "Path") -> str 
     """The name of the written file; None if there is no motion to replay."""
     from robotdiffuse.core.types import Path as Waypoints
     from robotdiffuse.evaluation.bench.page import worth_showing
-    from robotdiffuse.visualization.gallery import Exhibit, write_gallery
+    from robotdiffuse.visualization.gallery import GalleryEntry, write_gallery
 
     shown = worth_showing(bench, parts)
     if not shown:
         return None
     robot = shown[0].case.problem.robot
-    exhibits = [
-        Exhibit(motion.title, motion.caption, problem.scene, Waypoints(robot.joint_names, motion.positions))
+    entries = [
+        GalleryEntry(
+            motion.title, motion.caption, problem.scene, Waypoints(robot.joint_names, motion.positions)
+        )
         for motion in shown
         if (problem := motion.case.problem).robot.name == robot.name
     ]
-    write_gallery(robot, exhibits, file, "Motions")
+    write_gallery(robot, entries, file, "Motions")
     return file.name
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from robotdiffuse.generation import GenerationSettings
     from robotdiffuse.robots.robot import Robot
-    from robotdiffuse.visualization.gallery import Exhibit
+    from robotdiffuse.visualization.gallery import GalleryEntry
 
 LOG_INTERVAL = 60.0
 """Time between two progress lines without a terminal [s]."""
@@ -310,13 +310,13 @@ def run_view(arguments: argparse.Namespace) -> int:
     out = check_output(arguments.out or folder / "samples.html", (".html", ".htm"))
     robot = _robot(arguments.robot) or load_robot(manifest.robot)
     manifest.check_robot(robot)
-    exhibits = list(_exhibits(folder, robot, arguments.count, arguments.seed))
-    if not exhibits:
+    entries = list(_gallery_entries(folder, robot, arguments.count, arguments.seed))
+    if not entries:
         raise InputError(f"{folder} holds no motions yet; continue `robotdiffuse data generate` first")
     with _bar() as bar:
-        task = bar.add_task("drawing", total=len(exhibits))
+        task = bar.add_task("drawing", total=len(entries))
         write_gallery(
-            robot, exhibits, out, folder.resolve().name, lambda done, _: bar.update(task, completed=done)
+            robot, entries, out, folder.resolve().name, lambda done, _: bar.update(task, completed=done)
         )
     print(f"wrote {out}")
     if not arguments.out:
@@ -324,11 +324,11 @@ def run_view(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _exhibits(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[Exhibit]":
+def _gallery_entries(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator[GalleryEntry]":
     """Random motions, in the order of the shards."""
     from robotdiffuse.datasets.manifest import read_manifest
     from robotdiffuse.datasets.shards import motion_of, random_rows, scenes_of
-    from robotdiffuse.visualization.gallery import Exhibit
+    from robotdiffuse.visualization.gallery import GalleryEntry
 
     manifest = read_manifest(folder)
     for shard, rows in random_rows(folder, number, seed):
@@ -339,7 +339,7 @@ def _exhibits(folder: Path, robot: "Robot", number: int, seed: int) -> "Iterator
             line = "line free" if shard["line_free"][row] else f"detour {detour:.2f}"
             caption = f"{cost:.2f} rad · {line} · {100 * clearance:.1f} cm clear"
             title = f"{family} · shard {shard.index}, row {row}"
-            yield Exhibit(title, caption, scene, motion_of(robot, shard, row))
+            yield GalleryEntry(title, caption, scene, motion_of(robot, shard, row))
 
 
 def run_export(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Who is let in to the page, and what is said of ports and hosts."""
+"""Which requests reach the page, and errors for ports and hosts."""
 
 import http.client
 import socket
@@ -52,7 +52,7 @@ def test_elsewhere_the_path_begins_with_the_token() -> None:
 
 @pytest.mark.parametrize("wrong", ["[::1", "[::fg]:1", "]", "//[", "127.0.0.1]["])
 def test_what_is_no_host_is_not_let_in(wrong: str) -> None:
-    """Python's splitting of URLs raises errors about brackets; found by fuzzing."""
+    """urlsplit raises ValueError for brackets in hosts; found by fuzzing."""
     assert accepted_head(request(Host=wrong), "") is None
     assert accepted_head(request(Host="localhost", Origin=f"http://{wrong}"), "") is None
 

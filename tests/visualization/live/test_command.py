@@ -1,4 +1,4 @@
-"""`robotdiffuse live` as a command."""
+"""The command `robotdiffuse live`."""
 
 import http.client
 import re
@@ -73,7 +73,7 @@ def test_elsewhere_nothing_is_served_without_the_token() -> None:
 
 
 def test_viser_itself_lets_no_one_in_but_through_the_door() -> None:
-    """A web page elsewhere may find viser's own port; what opens it is closed before anything is said."""
+    """A page of another site may find viser's own port; its connection is closed before any data is sent."""
     websockets = pytest.importorskip("websockets.sync.client")
     viser = pytest.importorskip("viser")
     from websockets.exceptions import ConnectionClosed

@@ -1,4 +1,4 @@
-"""What the page begins with, what it takes from a browser, and what it hands out."""
+"""The first problem of the page, uploads, and saved files."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""The page in a browser: what is clicked and dragged there, and what it shows."""
+"""The page in a real browser: clicks, drags, and what it shows."""
 
 import shutil
 import time
@@ -38,7 +38,11 @@ PATIENCE, COMPILING = 30_000, 300_000
 """[ms]; a new machine compiles before the first plan."""
 VALID, INVALID = "[data-validity=valid]", "[data-validity=invalid]"
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +65,7 @@ def live() -> Iterator["tuple[Page, str]"]:
 
 @pytest.fixture(scope="module")
 def view(browser: Any, live: "tuple[Page, str]") -> Any:
-    """A browser on the page, which is green."""
+    """A browser with the page open and a valid motion."""
     view = browser.new_page(viewport={"width": 900, "height": 500})
     view.set_default_timeout(PATIENCE)
     view.goto(live[1])
@@ -77,7 +81,7 @@ def until(holds: Callable[[], object]) -> None:
 
 
 def beside(view: Any, label: str) -> Any:
-    """The entry that a label stands beside."""
+    """The input with this label."""
     return view.get_by_text(label, exact=True).locator("xpath=following::input[not(@type='hidden')][1]")
 
 
@@ -118,7 +122,7 @@ def test_a_size_is_typed_beside_its_slider(view: Any, live: "tuple[Page, str]") 
 
 
 def test_the_target_is_dragged(view: Any, live: "tuple[Page, str]") -> None:
-    """By an arrow of its gizmo."""
+    """Drags the target by an arrow of its gizmo."""
     page = live[0]
     before = page.session.state.goal_pose.copy()
     dragged = any(drag_arrow(view, page, before, axis) for axis in (2, 0, 1))
@@ -129,7 +133,7 @@ def test_the_target_is_dragged(view: Any, live: "tuple[Page, str]") -> None:
 
 
 def drag_arrow(view: Any, page: "Page", T: np.ndarray, axis: int) -> bool:
-    """Whether the target goes along when the mouse takes an arrow of its gizmo, which may be seen end-on."""
+    """Whether the target follows when the mouse drags an arrow of its gizmo, which may be seen end-on."""
     arrow = page.goal_gizmo.handle.scale * T[:3, axis]
     view.mouse.move(*on_screen(view, page, T[:3, 3] + 0.7 * arrow))
     time.sleep(0.1)
@@ -141,7 +145,7 @@ def drag_arrow(view: Any, page: "Page", T: np.ndarray, axis: int) -> bool:
 
 
 def on_screen(view: Any, page: "Page", point: np.ndarray) -> tuple[float, float]:
-    """Pixel of a point [m], by the camera as the browser reports it."""
+    """Pixel of a point [m], from the camera that the browser reports."""
     [client] = page.server.get_clients().values()
     camera = client.camera
     x, y, z = rotation_from_quaternion(np.array(camera.wxyz)).T @ (point - camera.position)

@@ -1,4 +1,4 @@
-"""The session: what changes do, the verdict on the motion shown, and which plans are shown."""
+"""The session: changes, validation of the motion shown, and which plans are shown."""
 
 import re
 import threading
@@ -29,7 +29,7 @@ from robotdiffuse.visualization.live.validity import INVALID, NO_MOTION, VALID, 
 START = np.array([0.0, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 END = np.array([1.2, -0.4, 0.0, -2.0, 0.0, 1.6, 0.8])
 PATIENCE = 300.0
-"""A new machine compiles first [s]."""
+"""Timeout [s]; a new machine compiles first."""
 
 
 def until(session: Session, holds: Callable[[State], object]) -> State:
@@ -61,7 +61,7 @@ def session() -> Iterator[Session]:
 
 
 def in_the_way(session: Session) -> np.ndarray:
-    """T_base_handle of a ball where the hand is halfway through the motion shown."""
+    """T_base_handle of a sphere at the hand halfway through the motion shown."""
     motion = session.state.motion
     assert motion is not None and motion.trajectory is not None
     q = motion.trajectory.positions[len(motion.trajectory.times) // 2]
@@ -82,7 +82,7 @@ def test_a_motion_is_planned_validated_and_certified(session: Session) -> None:
     ]
 
 
-def test_the_certificate_turns_red_at_once_and_green_with_the_new_plan(session: Session) -> None:
+def test_the_badge_turns_red_at_once_and_green_with_the_new_plan(session: Session) -> None:
     session.set_options(follow=False)
     first = until(session, settled).motion
     session.move_obstacle("lamp", in_the_way(session))
@@ -127,7 +127,7 @@ def test_the_target_is_dragged(session: Session) -> None:
 
 
 def _stands(state: State, T: np.ndarray) -> bool:
-    """Whether the configuration that is shown for the goal stands there."""
+    """Whether the configuration shown for the goal reaches it."""
     q, robot = state.goal_configuration, state.problem.robot
     return q is not None and np.allclose(link_pose(robot, q, state.goal_frame), T, atol=1e-5)
 

@@ -22,6 +22,7 @@ from robotdiffuse.simulation import PyBulletOracle
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.validator import verify
 
+pytestmark = pytest.mark.sim
 TOLERANCE = 7e-4
 """Most distances agree to 5e-6 m; Bullet rounds the edges of its boxes and cylinders by up to 0.6 mm."""
 
