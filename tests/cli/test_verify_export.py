@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from robotdiffuse.cli import main
+from helpers.commands import run
 
 START, GOAL = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 BALL = {"sphere": {"center": [0.5, 0.0, 0.5], "radius": 0.15, "name": "ball"}}
@@ -23,14 +23,6 @@ SCENE = {
         ]
     }
 }
-
-
-def run(*argv: object) -> int:
-    try:
-        return main([str(value) for value in argv])
-    except SystemExit as end:
-        assert isinstance(end.code, int)
-        return end.code
 
 
 @pytest.fixture(autouse=True)
