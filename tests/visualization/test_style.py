@@ -5,50 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from helpers.three_bars import CORNERS, CUBE
 from helpers.visual_bundles import visual_meshes, write_visual
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.transforms import transform
-from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.kinematics import link_pose
-from robotdiffuse.robots.robot import ConvexMesh, Joint, Robot
 from robotdiffuse.robots.visual_meshes import VisualMesh, load_visual
 from robotdiffuse.visualization.style import creased, dense, robot_surfaces, tool_point, trace
-
-CORNERS = np.array([[x, y, z] for x in (-1.0, 1) for y in (-1, 1) for z in (-1, 1)])
-
-
-FACES = "013 032 467 475 045 051 237 276 026 064 157 173"
-
-
-CUBE = np.array([[int(corner) for corner in face] for face in FACES.split()])
-
-
-def bar(length: float) -> ConvexMesh:
-    """A square bar of 8 cm along z, from the origin."""
-    return ConvexMesh(CORNERS * [0.04, 0.04, length / 2] + [0, 0, length / 2], CUBE)
-
-
-@pytest.fixture(scope="module")
-def arm() -> Robot:
-    """Three bars: a turning pillar, a hinge with its axis off z, a slide."""
-    quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    z, y = np.array([0.0, 0, 1]), np.array([0.0, 1, 0])
-    limits = (-3.0, 3.0, 2.0, 5.0, 50.0)
-    joints = (
-        Joint("turn", "revolute", "base", "pillar", transform(np.array([0, 0, 0.1])), z, *limits),
-        Joint("hinge", "revolute", "pillar", "arm", transform(np.array([0, 0, 0.4]), quarter), y, *limits),
-        Joint("slide", "prismatic", "arm", "tip", transform(np.array([0, 0, 0.3])), z, *limits),
-    )
-    meshes = {"base": (bar(0.1),), "pillar": (bar(0.4),), "arm": (bar(0.3),), "tip": (bar(0.2),)}
-    spheres = {"tip": np.array([[0, 0, 0.1, 0.12]])}
-    return Robot("three_bars", "base", "tip", joints, spheres, meshes)
-
-
-@pytest.fixture(scope="module")
-def motion(arm: Robot) -> Trajectory:
-    t = np.linspace(0, 2.0, 501)
-    q = np.stack([-1.2 + 1.2 * t, 0.3 + 0.2 * t, 0.1 * t], axis=1)
-    return Trajectory(arm.joint_names, t, q, np.gradient(q, t, axis=0), np.zeros_like(q))
 
 
 def test_trace_follows_the_outer_end_of_the_tip(arm, motion):
