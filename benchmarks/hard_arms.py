@@ -39,7 +39,7 @@ def hard_ones(name: str, count: int) -> list[Problem]:
         with suppress(InputError):  # no free ends in many scenes
             problem = family_for(family, robot).draw(robot, rng).problem(robot)
             if drawn == 1 or not found:
-                search.warm_up(problem, "short")
+                search.warm_up(problem, "converged")
             if not search.plan(problem, SOON, seed=SELECTION, until="first").solved:
                 found.append(problem)
     print(f"{name}: {count} hard problems among {drawn} draws", flush=True)
@@ -62,7 +62,7 @@ def main() -> None:
         problems = hard_ones(name, arguments.problems)
         planners = {planner: load_planner(planner) for planner in PLANNERS}
         for planner in planners.values():
-            planner.warm_up(problems[0], "short")
+            planner.warm_up(problems[0], "converged")
         at: dict[str, list[float]] = {planner: [] for planner in PLANNERS}
         longest = max(arguments.limits)
         for i, problem in enumerate(progress(problems, name)):

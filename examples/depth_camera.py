@@ -18,7 +18,7 @@ cameras = [
     DepthCamera(position=(0.2, -1.4, 1.2), target=(0.4, 0.0, 0.4), noise=0.002, dropout=0.05),
 ]
 
-with World(robot, scene, look=True) as world:
+with World(robot, scene, visuals=True) as world:
     world.place(start)
     for count in (1, 2):
         cloud = point_cloud(world, cameras[:count], np.random.default_rng(0), point_radius=0.02)

@@ -1,4 +1,4 @@
-"""Time that large scenes take counts, and what there is no time for is named."""
+"""Preparing a large scene counts against the time limit, and messages name the step that did not fit."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ RIGHT = np.array([-0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.785])
 
 
 def wall(sides: int = 20) -> rd.Mesh:
-    """A wall in the way, of two triangles for each square."""
+    """A wall across the straight path, of two triangles for each square."""
     x, z = np.meshgrid(np.linspace(0.3, 0.6, sides), np.linspace(0.0, 0.5, sides))
     vertices = np.stack([x.ravel(), 0 * x.ravel(), z.ravel()], axis=1)
     at = (np.arange(sides - 1)[:, None] * sides + np.arange(sides - 1)).ravel()
@@ -109,7 +109,7 @@ def test_meshes_end_with_the_time() -> None:
 def test_a_tree_of_the_validator_that_takes_too_long_is_refused(
     cloud: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Here the exact meshes are to say where the start collides."""
+    """The start collides, so the exact meshes are asked where."""
     tip = link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
     vertices = wall().vertices - wall().vertices.mean(axis=0) + tip
     asked = problem(rd.PointCloud(vertices, 0.01) if cloud else rd.Mesh(vertices, wall().faces))

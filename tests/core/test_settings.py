@@ -1,4 +1,4 @@
-"""Settings: bounds in the type, JSON and back, NAME=VALUE, and what people are told of them."""
+"""Settings: bounds in the types, JSON round trips, NAME=VALUE, and descriptions."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -138,7 +138,7 @@ def test_assignments_that_are_wrong(text: str, message: str) -> None:
 
 
 def test_tuples_of_a_fixed_length_have_it() -> None:
-    """It was an IndexError, from weights whose description had lost a number; found by fuzzing."""
+    """It raised IndexError for weights whose description lacked a number; found by fuzzing."""
     with pytest.raises(InputError, match=r"region.center is \[0.0, 0.1\]; it must have 3 entries"):
         VisibleRegion.from_json({"center": [0.0, 0.1]}, "region")
 

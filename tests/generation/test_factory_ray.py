@@ -102,7 +102,7 @@ def test_a_cluster_that_nobody_listens_at_is_refused_at_once(
         taken.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         monkeypatch.setenv("RAY_ADDRESS", address)
-        with pytest.raises(InputError, match=f"no Ray cluster at {address}, where RAY_ADDRESS says"):
+        with pytest.raises(InputError, match=f"no Ray cluster at {address}, the value of RAY_ADDRESS"):
             generate(SETTINGS, tmp_path, cluster="ray")
 
 

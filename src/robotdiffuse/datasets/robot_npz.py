@@ -18,7 +18,7 @@ from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.motions import motions_free
 from robotdiffuse.collision.motions import search_space
 from robotdiffuse.core.errors import InputError, shortened
-from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
 from robotdiffuse.datasets.shards import Row, check_shapes, read_shard, row_of, shard_indices, write_shard
 from robotdiffuse.problems.families import load_family
@@ -118,7 +118,7 @@ def import_npz(
         settings={"imported": FilePath(file).name, "radius": radius},
         versions={"robotdiffuse": __version__},
     )
-    with alone_in(folder):
+    with lock_folder(folder):
         if (folder / MANIFEST).exists() or shard_indices(folder):
             raise InputError(f"{folder} holds data already; import into another folder")
         for index, first in enumerate(range(0, len(q), ROWS_PER_SHARD)):

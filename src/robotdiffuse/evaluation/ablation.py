@@ -16,7 +16,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.core.processes import Workers
 from robotdiffuse.datasets.manifest import read_manifest
 from robotdiffuse.evaluation.methods import NETWORK_ALONE, from_network, sampled, without_network
@@ -142,7 +142,7 @@ def run_ablation(
     if workers < 1:
         raise InputError(f"workers is {workers}; it must be at least 1")
     read_manifest(settings.data).check_robot(load_robot("panda"))
-    with alone_in(FilePath(settings.out)):
+    with lock_folder(FilePath(settings.out)):
         return _run(settings, rows, workers, report)
 
 

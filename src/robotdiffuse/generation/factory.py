@@ -11,8 +11,8 @@ from typing import Any
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError, unknown_name
-from robotdiffuse.core.output_files import alone_in
-from robotdiffuse.core.processes import CLUSTERS, interrupts_afterwards, on_this_machine
+from robotdiffuse.core.output_files import lock_folder
+from robotdiffuse.core.processes import CLUSTERS, delay_interrupts, on_this_machine
 from robotdiffuse.datasets.manifest import MANIFEST, Manifest, floor_record, read_manifest, write_manifest
 from robotdiffuse.datasets.shards import remove_leftovers, shard_indices, write_shard
 from robotdiffuse.generation.settings import GenerationSettings
@@ -45,7 +45,7 @@ def generate(
     if cluster is not None and cluster not in CLUSTERS:
         raise unknown_name("cluster", cluster, CLUSTERS)
     wanted = manifest_of(settings)
-    with alone_in(out):
+    with lock_folder(out):
         try:
             remove_leftovers(out)
             _claim(wanted, out)
@@ -82,7 +82,7 @@ def _fill(
         for number, (arrays, counts) in made:
             index = missing[number]
             # else zarr's threads would write files after the clean-up
-            with interrupts_afterwards():
+            with delay_interrupts():
                 write_shard(out, index, arrays, counts)
             done += settings.rows(index)
             progress(done, settings.trajectories)

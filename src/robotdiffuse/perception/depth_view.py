@@ -11,7 +11,7 @@ from jaxtyping import Float, Float32
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import FASTEST, Value, numbers, rigid_transform, vector
+from robotdiffuse.core.bounds import MAX_RATE, Value, numbers, rigid_transform, vector
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.scenes.shapes import PointCloud
 
@@ -49,7 +49,7 @@ class DepthView(Value):
         if depth is None or depth.ndim != 2 or depth.size == 0:
             form = "not numbers" if depth is None else f"an array of {' x '.join(map(str, depth.shape))}"
             raise InputError(f"view.depth is {form}; it must be an image of height x width")
-        intrinsics = vector("view", "intrinsics", self.intrinsics, 4, FASTEST)
+        intrinsics = vector("view", "intrinsics", self.intrinsics, 4, MAX_RATE)
         if min(intrinsics[:2]) < LEAST_FOCAL:
             least = f"fx and fy must be at least {LEAST_FOCAL:g} [pixels]"
             raise InputError(f"view.intrinsics is {shown(intrinsics)}; {least}")

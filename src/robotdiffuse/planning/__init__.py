@@ -8,7 +8,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.input_files import file_name
 from robotdiffuse.core.registry import Entry, Registry
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import SHORT
+from robotdiffuse.core.types import CONVERGED
 
 if TYPE_CHECKING:
     from robotdiffuse.core.results import PlanResult
@@ -145,7 +145,7 @@ def plan(
     problem: "Problem",
     time_limit: float = 1.0,
     seed: int = 0,
-    until: str = SHORT,
+    until: str = CONVERGED,
     clearance: float | None = None,
     velocity_scaling: float = 1.0,
     acceleration_scaling: float = 1.0,

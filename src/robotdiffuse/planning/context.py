@@ -13,12 +13,12 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import compile_seconds
-from robotdiffuse.core.bounds import LARGEST
+from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.deadline import OutOfTimeError, check_left, deadline
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, OneOf, Settings
-from robotdiffuse.core.types import SHORT, UNTIL, Path, Status, Trajectory
+from robotdiffuse.core.types import CONVERGED, UNTIL, Path, Status, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
@@ -50,8 +50,8 @@ _finishing: dict[str, float] = {}
 class Request(Settings):
     """What a call may ask for beyond its time limit and seed; see `planning.planner.Planner.plan`."""
 
-    until: Annotated[str, OneOf(UNTIL)] = SHORT
-    clearance: Annotated[float, Bound(least=0.0, most=LARGEST)] | None = None
+    until: Annotated[str, OneOf(UNTIL)] = CONVERGED
+    clearance: Annotated[float, Bound(least=0.0, most=MAX_COORDINATE)] | None = None
     velocity_scaling: Scaling = 1.0
     acceleration_scaling: Scaling = 1.0
     jerk: Jerk | None = None

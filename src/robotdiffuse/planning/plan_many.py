@@ -10,7 +10,7 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.processes import LoneWorker, NotStartedError, check_not_importing
+from robotdiffuse.core.processes import SingleWorker, NotStartedError, check_not_importing
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Status
@@ -76,8 +76,8 @@ def _planned(
     robots = list(dict.fromkeys(problem.robot for problem in problems))
     number = {robot: i for i, robot in enumerate(robots)}
     bare = [replace(robot) for robot in robots]
-    pool = [LoneWorker(_prepare, (loaded, bare, request)) for _ in range(workers)]
-    idle: queue.SimpleQueue[LoneWorker] = queue.SimpleQueue()
+    pool = [SingleWorker(_prepare, (loaded, bare, request)) for _ in range(workers)]
+    idle: queue.SimpleQueue[SingleWorker] = queue.SimpleQueue()
     for worker in pool:
         idle.put(worker)
 

@@ -10,7 +10,7 @@ from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import FIRST, SHORT
+from robotdiffuse.core.types import FIRST, CONVERGED
 from robotdiffuse.planning.context import PlanningContext, Request, check_asked
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -50,7 +50,7 @@ class Planner(ABC, Generic[Own]):
         problem: Problem,
         time_limit: float = 1.0,
         seed: int = 0,
-        until: str = SHORT,
+        until: str = CONVERGED,
         clearance: float | None = None,
         velocity_scaling: float = 1.0,
         acceleration_scaling: float = 1.0,
@@ -61,8 +61,8 @@ class Planner(ABC, Generic[Own]):
         The same seed gives the same path, as long as time does not run out. A result with status SOLVED holds
         a path and a trajectory that passed `verify`; any other status comes with a reason.
 
-        until: "first" ends with the first verified motion, "short" when more time stops paying, "limit" when
-            time runs out; planners that cannot improve a path always end with their first.
+        until: "first" ends with the first verified motion, "converged" when more time stops paying,
+            "time_limit" when time runs out; planners that cannot improve a path always end with their first.
         clearance: distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
             and passages allow it [m]; where they do not, less, and a note says so. None: what the problem
             says, or 1 cm. The other planners have settings of their own, or keep what their motions have;

@@ -13,15 +13,15 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import LARGEST, Value, numbers, read_only, rigid_transform, vector
+from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, rigid_transform, vector
 from robotdiffuse.core.errors import InputError, shown
 
 LEAST_TOLERANCE, LEAST_ANGLE = 1e-4, 1e-3
 """The tightest constraints [m], [rad]."""
 SIZES = {
     "angle": (LEAST_ANGLE, np.pi, "rad"),
-    "tolerance": (LEAST_TOLERANCE, LARGEST, "m"),
-    "speed": (1e-4, LARGEST, "m/s"),
+    "tolerance": (LEAST_TOLERANCE, MAX_COORDINATE, "m"),
+    "speed": (1e-4, MAX_COORDINATE, "m/s"),
 }
 """Fields that are sizes: least, greatest, unit."""
 DIRECTIONS = ("axis", "direction", "normal")

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
-from robotdiffuse.core.bounds import LARGEST, SLOWEST, Value, numbers, rigid_transform
+from robotdiffuse.core.bounds import MAX_COORDINATE, MIN_RATE, Value, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
 from robotdiffuse.core.transforms import inverse
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
@@ -239,8 +239,8 @@ def check_problem(problem: object, field: str = "problem") -> None:
 def check_clearance(field: str, value: object) -> float:
     """The value as a distance [m]; InputError unless it is a finite number from 0 on."""
     clearance = numbers(value)
-    if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= LARGEST:
-        raise InputError(f"{field} is {shown(value)}; it must be a distance from 0 to {LARGEST:g} m")
+    if clearance is None or clearance.ndim != 0 or not 0 <= clearance <= MAX_COORDINATE:
+        raise InputError(f"{field} is {shown(value)}; it must be a distance from 0 to {MAX_COORDINATE:g} m")
     return float(clearance)
 
 
@@ -337,7 +337,7 @@ def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
             f"start_velocity: {robot.joint_names[j]} is {velocity[j]:g}; its velocity limit is "
             f"{robot.velocity[j]:g}"
         )
-    return velocity if (np.abs(velocity) >= SLOWEST).any() else None
+    return velocity if (np.abs(velocity) >= MIN_RATE).any() else None
 
 
 def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
@@ -384,9 +384,9 @@ def _configuration(robot: Robot, field: str, value: object, notes: list[str]) ->
 
 def _position(field: str, joint: Joint, value: float, notes: list[str]) -> float:
     unit = "m" if joint.kind == "prismatic" else "rad"
-    if not abs(value) <= LARGEST:
+    if not abs(value) <= MAX_COORDINATE:
         raise InputError(
-            f"{field}: {joint.name} is {value}; it must be a finite number within ±{LARGEST:g} [{unit}]"
+            f"{field}: {joint.name} is {value}; it must be a finite number within ±{MAX_COORDINATE:g} [{unit}]"
         )
     if joint.kind == "continuous":
         return float(value)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import LARGEST, Value, read_only
+from robotdiffuse.core.bounds import MAX_COORDINATE, Value, read_only
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import inverse, rotation_about, rotation_z_to, transform
 from robotdiffuse.robots.bodies import TOOL, Attached, ConvexMesh, Rigid
@@ -340,8 +340,8 @@ class Robot(Value):
         for name, value in locked.items():
             if name not in movable:
                 raise unknown_name("joint in locked", name, movable)
-            if not isinstance(value, Real) or not abs(value) <= LARGEST:
-                raise InputError(f"locked: {name} is {shown(value)}; it must be a number within ±{LARGEST:g}")
+            if not isinstance(value, Real) or not abs(value) <= MAX_COORDINATE:
+                raise InputError(f"locked: {name} is {shown(value)}; it must be a number within ±{MAX_COORDINATE:g}")
         held = following(self.joints, self.locked | {name: float(value) for name, value in locked.items()})
         for name, value in locked.items():
             mimic = movable[name].mimic

@@ -15,7 +15,7 @@ from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from robotdiffuse.core.bounds import (
-    SMALLEST,
+    MIN_SIZE,
     Value,
     form,
     numbers,
@@ -129,9 +129,9 @@ class Box(Shape):
 
     def __post_init__(self) -> None:
         size = vector("box", "size", self.size, 3)
-        if (size < SMALLEST).any():
+        if (size < MIN_SIZE).any():
             raise InputError(
-                f"box.size is {shown(self.size)}; edge lengths must be positive, at least {SMALLEST:g} m"
+                f"box.size is {shown(self.size)}; edge lengths must be positive, at least {MIN_SIZE:g} m"
             )
         center = vector("box", "center", self.center, 3)
         _set(self, center=center, size=size, wxyz=unit_quaternion("box", self.wxyz))

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.convex_geometry import describe_contact
 from robotdiffuse.collision.motions import Contact, ContinuousCollision
-from robotdiffuse.core.bounds import LARGEST, for_kernels, within
+from robotdiffuse.core.bounds import MAX_COORDINATE, for_kernels, within
 from robotdiffuse.core.errors import InputError, check_type, joined, shown
 from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
@@ -192,10 +192,10 @@ class Verifier:
         `at_rest`: at which rows a timed motion stands still. `along`: times and positions of one for path
         constraints.
         """
-        bad = np.flatnonzero(~(np.abs(q) <= LARGEST).all(axis=1))
+        bad = np.flatnonzero(~(np.abs(q) <= MAX_COORDINATE).all(axis=1))
         if len(bad):
             at = float(bad[0] if times is None else times[bad[0]])
-            message = f"waypoint {bad[0]} holds values that are not finite, or not within ±{LARGEST:g}"
+            message = f"waypoint {bad[0]} holds values that are not finite, or not within ±{MAX_COORDINATE:g}"
             return Report(False, Violation("not_finite", at, message), None, None)
         clock = np.arange(len(q), dtype=float) if times is None else times
         limits = self._limits(q, clock, "waypoint {:g}" if times is None else "{:.3f} s")

@@ -473,7 +473,7 @@ def test_bad_input_is_one_clear_line(small: Path, capsys: pytest.CaptureFixture[
     with (small / "records" / "mpnet.jsonl").open("a") as stream:
         stream.write("{broken\n")
     assert main(["bench", "report", str(small)]) == 2
-    assert re.search(r"mpnet\.jsonl, line 5 is no JSON object", capsys.readouterr().err)
+    assert re.search(r"mpnet\.jsonl, line 5 is not a JSON object", capsys.readouterr().err)
 
 
 def test_an_empty_folder_says_how_to_go_on(tmp_path: Path) -> None:

@@ -224,8 +224,8 @@ def test_a_planner_with_settings() -> None:
     planner = PlannerSpec.parse("rrt_connect:optimize_time=0.05:tightenings=0").load()
     assert isinstance(planner, RRTConnect)
     assert (planner.settings.optimize_time, planner.settings.tightenings) == (0.05, 0)
-    calls = PlannerSpec.parse("aorrtc:until=limit:gain=0.01:clearance=0")
-    assert calls.request()["until"] == "limit" and calls.request()["clearance"] == 0
+    calls = PlannerSpec.parse("aorrtc:until=time_limit:gain=0.01:clearance=0")
+    assert calls.request()["until"] == "time_limit" and calls.request()["clearance"] == 0
     assert calls.load().settings == AORRTCSettings(gain=0.01)
     with pytest.raises(InputError, match="unknown until 'soon'"):
         PlannerSpec.parse("aorrtc:until=soon")

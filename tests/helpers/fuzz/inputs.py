@@ -322,7 +322,7 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
     from robotdiffuse.core.types import Trajectory
     from robotdiffuse.interop import read_motion, write_motion
     from robotdiffuse.interop.plain_messages import joint_trajectory
-    from robotdiffuse.interop.recorded_motion import fitted
+    from robotdiffuse.interop.recorded_motion import motion_of_robot
     from robotdiffuse.problems.files import problem_from_record
     from robotdiffuse.validation.validator import Verifier
 
@@ -349,7 +349,7 @@ def _motion(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
         part.write_bytes(damaged(rng, part.read_bytes()))
 
     def read() -> None:
-        motion = fitted(read_motion(file), problem.robot).motion
+        motion = motion_of_robot(read_motion(file), problem.robot).motion
         validator = Verifier(problem)
         validator.trajectory(motion) if isinstance(motion, Trajectory) else validator.path(motion)
 
@@ -421,14 +421,14 @@ def _upload(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
 
 
 def _head(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    """Heads of requests to the live page, which admits them or not and never raises."""
-    from robotdiffuse.visualization.live.access import admitted
+    """Heads of requests to the live page, which accepts them or not and never raises."""
+    from robotdiffuse.visualization.live.access import accepted_head
 
     token = ("", "abc")[rng.integers(2)]
     host = (b"localhost:8080", b"[::1]:1", b"a.example")[rng.integers(3)]
     head = b"GET /abc/?x=1 HTTP/1.1\r\nHost: %s\r\nOrigin: http://%s\r\nUpgrade: websocket" % (host, host)
     head = damaged(rng, head)
-    return lambda: admitted(head, token)
+    return lambda: accepted_head(head, token)
 
 
 def _settings(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:

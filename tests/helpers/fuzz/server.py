@@ -389,14 +389,14 @@ def main() -> None:
     from robotdiffuse.cli import main as command
     from robotdiffuse.server import settings
 
-    settings.SENDING = settings.KEPT = CLIENT_TIMEOUT
+    settings.READ_TIMEOUT = settings.KEEP_ALIVE_TIMEOUT = CLIENT_TIMEOUT
 
     def ended() -> None:
         sys.stdin.read()
         os._exit(0)
 
     threading.Thread(target=ended, daemon=True).start()
-    sys.exit(command(["serve", "--port", "0", "--workers", "1", "--longest", "1", "--largest", "1"]))
+    sys.exit(command(["serve", "--port", "0", "--workers", "1", "--max-time-limit", "1", "--max-request-size", "1"]))
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import torch
 from helpers.training_log import read_log
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.learning.checkpoint import load_encoder, load_model, read_tensors
 from robotdiffuse.learning.denoisers import DENOISERS
 from robotdiffuse.learning.denoisers.transformer import TransformerSettings
@@ -255,7 +255,7 @@ def test_every_choice_trains_and_plans(changes, tmp_path, data, arm, monkeypatch
 
 def test_two_trainings_do_not_share_a_folder(tmp_path, data):
     out = tmp_path / "out"
-    with alone_in(out), pytest.raises(InputError, match="another process"):
+    with lock_folder(out), pytest.raises(InputError, match="another process"):
         train_planner(planner_settings(data), str(out))
 
 

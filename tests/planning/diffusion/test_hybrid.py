@@ -149,7 +149,7 @@ def test_the_first_path_comes_before_the_network_is_asked(monkeypatch):
     planner.plan(PROBLEM, time_limit=10.0)
     monkeypatch.setattr(RobotDiffuse, "draw", late)
     start = time.perf_counter()
-    result = planner.plan(PROBLEM, time_limit=2.0, until="limit")
+    result = planner.plan(PROBLEM, time_limit=2.0, until="time_limit")
     assert result.path is not None and verify(PROBLEM, result.path).valid
     (first, longest), *_, (_, shortest) = result.progress
     assert first < began[0] and result.path.length == pytest.approx(shortest) and shortest <= longest
@@ -161,18 +161,18 @@ def test_a_call_loads_the_network_in_its_own_time_or_not_at_all(monkeypatch):
     monkeypatch.setattr(RobotDiffuse, "model", lambda self, robot: loaded.append(robot) or model(self, robot))
     planner = RobotDiffuse(RobotDiffuseSettings(network_share=0.9))  # which is due soon after the path
     for _ in range(2):
-        assert planner.plan(PROBLEM, time_limit=0.5, until="limit").stage == "aorrtc"
+        assert planner.plan(PROBLEM, time_limit=0.5, until="time_limit").stage == "aorrtc"
     assert not loaded
     planner.load_wanted(PANDA)
     assert loaded == [PANDA]
-    planner.plan(PROBLEM, time_limit=0.5, until="limit")
+    planner.plan(PROBLEM, time_limit=0.5, until="time_limit")
     assert len(loaded) > 1, "at hand, it is used"
     loaded.clear()
     fresh = RobotDiffuse()
     fresh.load_wanted(PANDA)
     fresh.warm_up(PROBLEM)
     assert not loaded, "nothing wanted it"
-    fresh.warm_up(PROBLEM, "short")
+    fresh.warm_up(PROBLEM, "converged")
     assert loaded
 
 

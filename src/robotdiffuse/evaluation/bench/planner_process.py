@@ -17,9 +17,9 @@ from dataclasses import astuple
 from pathlib import Path as FilePath
 from typing import TextIO
 
-from robotdiffuse.core.processes import Companion
-from robotdiffuse.core.registry import Entry, added, take_over
-from robotdiffuse.core.types import SHORT
+from robotdiffuse.core.processes import LineProcess
+from robotdiffuse.core.registry import Entry, added_entries, adopt_entries
+from robotdiffuse.core.types import CONVERGED
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.methods import measure_of, planner_calls
 from robotdiffuse.evaluation.records import CRASHED, OVERRAN
@@ -46,8 +46,8 @@ class PlannerProcess:
 
     def __init__(self, spec: PlannerSpec, log: FilePath) -> None:
         """`log`: the process's output is appended to this file."""
-        entries = {what: {n: astuple(e) for n, e in table.items()} for what, table in added().items()}
-        self._process = Companion([*COMMAND, spec.text, json.dumps([sys.path, entries])], log)
+        entries = {what: {n: astuple(e) for n, e in table.items()} for what, table in added_entries().items()}
+        self._process = LineProcess([*COMMAND, spec.text, json.dumps([sys.path, entries])], log)
 
     def warm(self, run: Run) -> None:
         """Warm up for a run's robot. If the process dies of that, `plan` will report it."""
@@ -131,7 +131,7 @@ def _read(tasks: TextIO, lines: "queue.Queue[str]") -> None:
 def _warm_up(planner: Planner, problem: Problem) -> None:
     """Compile, load and fill caches, those of the metrics too."""
     try:
-        for result in planner.warm_up(problem, SHORT):
+        for result in planner.warm_up(problem, CONVERGED):
             if result.path is not None and result.trajectory is not None:
                 measure_of(problem.robot)(result.path, result.trajectory, result)
     except Exception:  # the timed call will report it
@@ -153,7 +153,7 @@ def main() -> None:
     os.environ["OMP_NUM_THREADS"] = "1"  # of PyTorch, which only planners with a network load
     path, entries = json.loads(sys.argv[2])
     sys.path += [place for place in path if place not in sys.path]
-    take_over({what: {n: Entry(*e) for n, e in table.items()} for what, table in entries.items()})
+    adopt_entries({what: {n: Entry(*e) for n, e in table.items()} for what, table in entries.items()})
     spec = PlannerSpec.parse(sys.argv[1])
     serve(spec.load(), spec.request(), sys.stdin, answers)
 

@@ -10,7 +10,7 @@ from pathlib import Path as FilePath
 
 from robotdiffuse import __version__
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.output_files import alone_in
+from robotdiffuse.core.output_files import lock_folder
 from robotdiffuse.evaluation.bench.planner_spec import PlannerSpec
 from robotdiffuse.evaluation.bench.workers import on_ray, on_this_machine
 from robotdiffuse.evaluation.machine import processor, versions
@@ -87,7 +87,7 @@ def run_bench(settings: BenchSettings, report: Report, done: Done) -> int:
     InputError, before any call, for bad settings or a planner that cannot be loaded, and KeyboardInterrupt on
     Ctrl-C; another call with the same settings continues.
     """
-    with alone_in(settings.out):
+    with lock_folder(settings.out):
         specs = settings.specs
         for spec in specs.values():
             spec.load()

@@ -22,7 +22,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from torch import Tensor, nn
 
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.core.output_files import alone_in, write_atomically
+from robotdiffuse.core.output_files import lock_folder, write_atomically
 from robotdiffuse.learning.checkpoint import read_tensors, write_tensors
 from robotdiffuse.learning.training.config import TrainingSettings
 from robotdiffuse.learning.training.processes import Processes
@@ -152,7 +152,7 @@ class TrainingRun:
             torch.set_num_threads(threads)
 
     def _alone(self) -> AbstractContextManager[None]:
-        return alone_in(self.out) if self.processes.first else nullcontext()
+        return lock_folder(self.out) if self.processes.first else nullcontext()
 
     def step(self, loss: LossFn) -> None:
         """One step of the optimiser, which is skipped if the loss or the gradient is not finite."""

@@ -9,8 +9,8 @@ from concurrent.futures import Future, ProcessPoolExecutor
 
 import numpy as np
 
-from robotdiffuse.core.processes import interrupts_not_passed_on, prepare_worker
-from robotdiffuse.core.registry import Added, added
+from robotdiffuse.core.processes import block_interrupts_in_children, prepare_worker
+from robotdiffuse.core.registry import AddedEntries, added_entries
 from robotdiffuse.learning.completion.samples import Samples, draw_samples
 from robotdiffuse.robots.robot import Robot
 
@@ -35,7 +35,7 @@ class SamplePrefetcher:
         self._pool: ProcessPoolExecutor | None = None
         if workers:
             context = multiprocessing.get_context("spawn")
-            self._pool = ProcessPoolExecutor(workers, context, _start_worker, (added(),))
+            self._pool = ProcessPoolExecutor(workers, context, _start_worker, (added_entries(),))
         self._pending: deque[tuple[tuple[int, ...], Future[Samples]]] = deque()
 
     def next(self, rng: np.random.Generator) -> Samples:
@@ -63,11 +63,11 @@ class SamplePrefetcher:
 
     def _submit(self, seeds: tuple[int, ...]) -> None:
         assert self._pool is not None
-        with interrupts_not_passed_on():
+        with block_interrupts_in_children():
             job = self._pool.submit(draw_samples, self._families, self._robot, seeds)
         self._pending.append((seeds, job))
 
 
-def _start_worker(entries: Added) -> None:
+def _start_worker(entries: AddedEntries) -> None:
     prepare_worker(entries)
     os.nice(NICENESS)

@@ -14,7 +14,7 @@ from robotdiffuse.collision.motions import finer
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, Positive, Settings
-from robotdiffuse.core.types import FIRST, SHORT, Tree
+from robotdiffuse.core.types import CONVERGED, FIRST, Tree
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.search import rrt_kernel
 from robotdiffuse.planning.start_goal import StartGoal
@@ -316,7 +316,7 @@ def anytime(
 
     def ended() -> bool:
         done = context.until == FIRST or search.shortest or context.remaining <= 0
-        return done or (context.until == SHORT and not pays())
+        return done or (context.until == CONVERGED and not pays())
 
     answers = Answers(context, start_goal)
     while search.first(context.search_until, help_out):

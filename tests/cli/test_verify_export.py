@@ -1,4 +1,4 @@
-"""verify, certificate check, export and publish on the command line."""
+"""The commands `verify`, `certificate check`, `export` and `publish`."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from robotdiffuse.cli import main
+from helpers.commands import run
 
 START, GOAL = [-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8], [1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8]
 BALL = {"sphere": {"center": [0.5, 0.0, 0.5], "radius": 0.15, "name": "ball"}}
@@ -25,17 +25,9 @@ SCENE = {
 }
 
 
-def run(*argv: object) -> int:
-    try:
-        return main([str(value) for value in argv])
-    except SystemExit as end:
-        assert isinstance(end.code, int)
-        return end.code
-
-
 @pytest.fixture(autouse=True)
 def planned(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a result, its motion as others write it, and scenes."""
+    """A folder with a result, its motion in formats of other programs, and scenes."""
     folder = tmp_path_factory.getbasetemp() / "handed"
     monkeypatch.chdir(tmp_path_factory.mktemp("here"))
     if not folder.exists():
@@ -61,7 +53,7 @@ def test_a_certificate_is_written_and_checked(planned: Path, capsys: pytest.Capt
     assert "is not a certificate" in capsys.readouterr().err
 
 
-def test_anybodys_motion(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_motions_from_other_programs(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for file in ("m.rosbag2", "m.yaml", "r.json"):
         assert run("verify", planned / file, "--problem", planned / "problem.json") == 0
         assert "trajectory: valid" in capsys.readouterr().out
@@ -84,7 +76,7 @@ def test_scene_of_another_robot(planned: Path, capsys: pytest.CaptureFixture[str
     assert "note: robot_state.joint_state: ignored gripper" in capsys.readouterr().out
 
 
-def test_all_that_is_wrong(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_violations_are_listed(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
     asked = ("verify", planned / "m.yaml", "--problem", planned / "other.json")
     assert run(*asked, "--certificate", "c.json") == 1
     first = capsys.readouterr().out
@@ -98,14 +90,14 @@ def test_all_that_is_wrong(planned: Path, capsys: pytest.CaptureFixture[str]) ->
     assert times == sorted(times)
 
 
-def test_only_valid_motions_are_handed_over(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_valid_motions_are_exported(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("export", planned / "r.json", "--out", "a.csv", "--out", "a.rrd") == 0
     record = json.loads((planned / "r.json").read_text())
     record["problem"] = json.loads((planned / "other.json").read_text())
     Path("bad.json").write_text(json.dumps(record))
     for command in (("export", "bad.json", "--out", "b.yaml"), ("publish", "bad.json", "--to", "localhost")):
         assert run(*command) == 2
-        assert "is not handed over: its motion is not valid" in capsys.readouterr().err
+        assert "is not exported: its motion is not valid" in capsys.readouterr().err
     assert not Path("b.yaml").exists()
     assert run("publish", planned / "r.json", "--to", "host:0") == 2
     assert "'host:0' is not HOST or HOST:PORT" in capsys.readouterr().err

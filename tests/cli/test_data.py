@@ -1,4 +1,4 @@
-"""robotdiffuse data info, check, view, export and import, as a user would run them."""
+"""The commands `data info`, `check`, `view`, `export` and `import`."""
 
 import json
 import re
@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from helpers.commands import run
 from helpers.motion_stores import line, random_motions, record, write_motions
-from robotdiffuse.cli import main
 from robotdiffuse.robots import load_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Sphere
@@ -20,15 +20,6 @@ PANDA = load_robot("panda")
 START = np.array([-1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 GOAL = np.array([1.0, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 BALL = Scene([Sphere([0.5, 0.0, 0.5], 0.15)])
-
-
-def run(*argv: object) -> int:
-    """Exit status of the command."""
-    try:
-        return main([str(value) for value in argv])
-    except SystemExit as end:
-        assert isinstance(end.code, int)
-        return end.code
 
 
 @pytest.fixture

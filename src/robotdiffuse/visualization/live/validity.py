@@ -1,4 +1,4 @@
-"""The live certificate in words: what the validator says of the motion shown, in the scene as it now is."""
+"""The validity badge of the page: whether the current motion is valid in the current scene."""
 
 from dataclasses import dataclass
 
@@ -6,44 +6,47 @@ from robotdiffuse.planning.planner import compiles_first
 from robotdiffuse.validation.validator import Report
 from robotdiffuse.visualization.live.session import State
 
-FREE, WRONG, NONE, WAITING = "free", "wrong", "none", "waiting"
-"""Kinds of certificates: green, red, no motion, not validated yet."""
+VALID, INVALID, NO_MOTION, PENDING = "valid", "invalid", "none", "pending"
+"""Kinds of badges: green, red, no motion, not validated yet."""
 COLLISIONS = ("scene_collision", "self_collision")
 
 
 @dataclass(frozen=True)
-class Certificate:
+class Validity:
+    """Kind and text of the badge."""
+
     kind: str
     headline: str
     lines: tuple[str, ...] = ()
 
 
-def certificate(state: State) -> Certificate:
-    """Green with clearances; red with link, obstacle, depth and time; or why there is no motion."""
+def validity(state: State) -> Validity:
+    """The badge of a state: clearances, or link, obstacle, depth and time of a violation, or why there is no
+    motion."""
     why_not = _why_not(state)
     more = (f"no new plan: {why_not}",) if why_not else ()
-    verdict = state.verdict
+    validation = state.validation
     if state.motion is None:
         if why_not:
-            return Certificate(NONE, "no plan", (why_not,))
+            return Validity(NO_MOTION, "no plan", (why_not,))
         if state.planning:
-            return Certificate(WAITING, "planning", (compiles_first(state.problem.robot),))
-        return Certificate(WAITING, "nothing planned yet")
-    if verdict is None:
-        return Certificate(WAITING, "validating")
-    report, trajectory = verdict.report, state.motion.trajectory
+            return Validity(PENDING, "planning", (compiles_first(state.problem.robot),))
+        return Validity(PENDING, "not planned yet")
+    if validation is None:
+        return Validity(PENDING, "validating")
+    report, trajectory = validation.report, state.motion.trajectory
     assert trajectory is not None
     violation = report.violation
     if violation is None:
         lines = (
             f"{_to_obstacles(state, report)}, between links {_distance(report.self_clearance)}, "
-            f"all along {trajectory.duration:.2f} s",
+            f"over {trajectory.duration:.2f} s",
             *more,
         )
-        return Certificate(FREE, f"free, clearance at least {_distance(report.min_clearance)}", lines)
+        return Validity(VALID, f"free, clearance at least {_distance(report.min_clearance)}", lines)
     what = "collides" if violation.kind in COLLISIONS else "not valid"
     when = f"at {violation.time:.2f} s of {trajectory.duration:.2f} s"
-    return Certificate(WRONG, f"{what}: {violation.message}", (when, *more))
+    return Validity(INVALID, f"{what}: {violation.message}", (when, *more))
 
 
 def _to_obstacles(state: State, report: Report) -> str:
@@ -54,7 +57,7 @@ def _to_obstacles(state: State, report: Report) -> str:
 
 
 def _why_not(state: State) -> str:
-    """Why the last call of the planner brought no motion; empty if it did."""
+    """Why the last planning call found no motion; "" if it did."""
     if state.failure:
         return state.failure
     if state.answer is None or state.answer.solved:

@@ -22,6 +22,7 @@ from robotdiffuse.simulation import PyBulletOracle
 from robotdiffuse.simulation.world import World
 from robotdiffuse.validation.validator import verify
 
+pytestmark = pytest.mark.sim
 TOLERANCE = 7e-4
 """Most distances agree to 5e-6 m; Bullet rounds the edges of its boxes and cylinders by up to 0.6 mm."""
 
@@ -204,8 +205,8 @@ def test_a_mesh_that_comes_again_takes_no_memory_again() -> None:
             scene = Scene([Mesh(ball.vertices, ball.faces, xyz=(x, 0.0, 0.4))])
             world.set_scene(scene)
             oracle.set_scene(scene)
-            assert len(world._meshes) == 1
+            assert len(world.mesh_shapes) == 1
             with PyBulletOracle(panda, scene) as fresh:
                 assert oracle.distance(home) == pytest.approx(fresh.distance(home), abs=1e-9)
         world.set_scene(Scene([Mesh(1.1 * ball.vertices, ball.faces)]))
-        assert len(world._meshes) == 2
+        assert len(world.mesh_shapes) == 2
