@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from robotdiffuse.cli.train_generate import generate_meanwhile
 
 from helpers.commands import run
-from robotdiffuse.cli.train_generate import generate_meanwhile
 from robotdiffuse.datasets.manifest import read_manifest, write_manifest
 from robotdiffuse.datasets.shards import check_shard, shard_indices
 from robotdiffuse.generation import GenerationSettings

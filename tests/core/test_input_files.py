@@ -215,6 +215,8 @@ def test_a_pipe_that_a_mesh_file_names_is_not_waited_for(kind: str, tmp_path: Pa
         assert "it is a device or a pipe" in one_line(lambda: read_triangles(tmp_path / "model.gltf"))
     else:
         assert len(read_triangles(tmp_path / f"model.{kind}")[1]) == 12
+
+
 @pytest.mark.parametrize(
     "text",
     [

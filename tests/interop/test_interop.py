@@ -314,7 +314,10 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: motion_from_record({"status": "timeout"}, "it"),
         "it holds no motion: its status is 'timeout'",
     ),
-    "nothing": (lambda: motion_from_record({}, "it"), "it holds no motion: it must hold a RobotDiffuse result"),
+    "nothing": (
+        lambda: motion_from_record({}, "it"),
+        "it holds no motion: it must hold a RobotDiffuse result",
+    ),
 }
 
 

@@ -10,7 +10,7 @@ from numbers import Integral
 from typing import Any, NamedTuple
 
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.processes import SingleWorker, NotStartedError, check_not_importing
+from robotdiffuse.core.processes import NotStartedError, SingleWorker, check_not_importing
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Status

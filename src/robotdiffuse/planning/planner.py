@@ -10,7 +10,7 @@ from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
-from robotdiffuse.core.types import FIRST, CONVERGED
+from robotdiffuse.core.types import CONVERGED, FIRST
 from robotdiffuse.planning.context import PlanningContext, Request, check_asked
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
 from robotdiffuse.problems.problem import JointGoal, Problem

@@ -341,7 +341,9 @@ class Robot(Value):
             if name not in movable:
                 raise unknown_name("joint in locked", name, movable)
             if not isinstance(value, Real) or not abs(value) <= MAX_COORDINATE:
-                raise InputError(f"locked: {name} is {shown(value)}; it must be a number within ±{MAX_COORDINATE:g}")
+                raise InputError(
+                    f"locked: {name} is {shown(value)}; it must be a number within ±{MAX_COORDINATE:g}"
+                )
         held = following(self.joints, self.locked | {name: float(value) for name, value in locked.items()})
         for name, value in locked.items():
             mimic = movable[name].mimic

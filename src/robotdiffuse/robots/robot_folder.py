@@ -234,7 +234,11 @@ def _joint_from_json(data: dict) -> Joint:
     axis = _array([data["axis"]], 3, f"joint {name}: axis")[0]
     lower, upper, velocity, acceleration, jerk = (float(data[limit]) for limit in LIMITS)
     rates = (velocity, acceleration, jerk)
-    if not -MAX_COORDINATE <= lower <= upper <= MAX_COORDINATE or not min(rates) >= MIN_RATE or not max(rates) < np.inf:
+    if (
+        not -MAX_COORDINATE <= lower <= upper <= MAX_COORDINATE
+        or not min(rates) >= MIN_RATE
+        or not max(rates) < np.inf
+    ):
         raise ValueError(f"joint {name}: limits")
     if not abs(np.linalg.norm(axis) - 1) < AXIS_SLACK:
         raise ValueError(f"joint {name}: an axis of length 1 expected")

@@ -396,7 +396,11 @@ def main() -> None:
         os._exit(0)
 
     threading.Thread(target=ended, daemon=True).start()
-    sys.exit(command(["serve", "--port", "0", "--workers", "1", "--max-time-limit", "1", "--max-request-size", "1"]))
+    sys.exit(
+        command(
+            ["serve", "--port", "0", "--workers", "1", "--max-time-limit", "1", "--max-request-size", "1"]
+        )
+    )
 
 
 if __name__ == "__main__":

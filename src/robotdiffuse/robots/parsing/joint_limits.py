@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
-from robotdiffuse.core.bounds import MAX_RATE, MAX_COORDINATE, MIN_RATE
+from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, MIN_RATE
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import read_yaml
 from robotdiffuse.robots.parsing.urdf import ACCELERATION_PER_VELOCITY, JERK_PER_ACCELERATION

@@ -10,7 +10,7 @@ import trimesh
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.core.bounds import MAX_RATE, MAX_COORDINATE, MIN_RATE, MIN_SIZE, points, within
+from robotdiffuse.core.bounds import MAX_COORDINATE, MAX_RATE, MIN_RATE, MIN_SIZE, points, within
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.input_files import parse_xml, read_triangles
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
