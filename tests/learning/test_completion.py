@@ -133,6 +133,7 @@ def test_voxels_of_predictions_and_samples_agree(monkeypatch: pytest.MonkeyPatch
     assert average_precision(p[counted], fine[counted]) > 2 * fine[counted].mean()
 
 
+@pytest.mark.slow
 def test_training_is_resumed_exactly_with_and_without_prefetching(tmp_path: Path) -> None:
     report = train_completion(TINY, str(tmp_path / "whole"))
     train_completion(replace(TINY, samples=4), str(tmp_path / "parts"))

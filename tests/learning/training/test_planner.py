@@ -95,6 +95,7 @@ def start(kind, settings, out, *launcher):
     )
 
 
+@pytest.mark.slow
 def test_killed_training_ends_the_same(tmp_path, data):
     """Killed by SIGKILL, at a random moment after the first checkpoint."""
     settings = planner_settings(data, samples=480)
@@ -113,6 +114,7 @@ def test_killed_training_ends_the_same(tmp_path, data):
     assert files[0].read_bytes() == files[1].read_bytes()
 
 
+@pytest.mark.slow
 def test_two_processes_are_one_run(tmp_path, data, monkeypatch):
     """A step of two processes equals one on the union of their batches; they resume and skip together."""
     out = tmp_path / "two"
@@ -277,6 +279,7 @@ def test_errors_in_the_workspace_have_the_same_weight_for_every_objective(data, 
         np.testing.assert_allclose(batch.clean_weight, of_clean, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_planner_learns_which_side(tmp_path, data, arm):
     out = tmp_path / "out"
     report = train_planner(

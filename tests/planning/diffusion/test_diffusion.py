@@ -8,7 +8,9 @@ import pytest
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Status
-from robotdiffuse.learning.motion_model import MotionModel
+from robotdiffuse.learning.encoders.dgcnn import DGCNNSettings
+from robotdiffuse.learning.motion_model import MotionModel, MotionModelSettings
+from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.planning.diffusion.diffusion import Diffusion, DiffusionSettings, encode
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -118,3 +120,19 @@ def test_settings_are_checked() -> None:
         DiffusionSettings(optimize_time=-1.0)
     with pytest.raises(InputError, match=r"diffusion\.sampling_steps is 0; it must be at least 1"):
         DiffusionSettings(sampling_steps=0)
+
+
+def test_an_encoder_of_one_size_gets_clouds_of_that_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = DGCNNSettings(code=8, cloud=50, neighbours=4, edges=(8,), embedding=16, head=(16,))
+    model = MotionModel(
+        RobotIdentity.of(PANDA), MotionModelSettings(encoder="dgcnn", encoder_settings=settings)
+    )
+    sizes: list[int] = []
+
+    def z(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        sizes.append(len(points))
+        return np.zeros(8, np.float32)
+
+    monkeypatch.setattr(model, "encode", z)
+    encode(model, CollisionChecker(PANDA, PROBLEM.scene), 320, np.random.default_rng(0))
+    assert sizes == [50]

@@ -39,6 +39,7 @@ class CameraPlaces:
     distance: Range = (1.2, 2.0)
     """Horizontal distance from the base's axis."""
     height: Range = (0.4, 1.6)
+    """Above the base."""
     front_share: float = 0.75
     """Share of the cameras that stand in front, on the arm's side of the obstacles."""
     front: float = 2.0

@@ -9,8 +9,8 @@ randomness comes from. The planner around it is `planning.baselines.mpnet`.
 Differences from the paper:
 
 - Enet and Pnet are smaller, so that they train in an hour of one core; the settings name the paper's sizes.
-- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here one run does both in
-  turn: z of an auto-encoder alone loses what decides about collisions, and training end to end is cheap, as
+- The paper trains Enet either as an auto-encoder or end to end with Pnet. Here one run does both in turn: z
+  of an auto-encoder alone loses what decides about collisions, and training end to end is cheap, as
   the waypoints of a trajectory share their z.
 - The paper's clouds list the obstacles in a fixed order, which a sensed cloud lacks. So points are sorted
   along a space-filling curve: neighbours in the list are neighbours in space, and a perceptron can average

@@ -1,7 +1,7 @@
 """Compiled grouping of point clouds for PointNet++: furthest point sampling and ball query in one pass.
 
-Both are of C. Qi et al., "PointNet++", NeurIPS 2017. Both need the
-distances from a new centre to all points, which are computed once.
+Both are of C. Qi et al., "PointNet++", NeurIPS 2017, and need the distances from a new centre to all points,
+which are computed once.
 """
 
 import numpy as np

@@ -41,7 +41,7 @@ TEST_SAMPLES = 24
 OCCUPIED_PROBABILITY = 0.1
 """Voxels above this probability count as occupied in precision and recall."""
 CALIBRATION_STRIDE = 17
-"""The temperature is fitted to every so-many-th voxel."""
+"""The temperature is fitted to one voxel out of this many."""
 CALIBRATION_BINS = 20
 """Bins of probabilities for the expected calibration error."""
 
@@ -81,6 +81,8 @@ def train_completion(settings: CompletionTraining, out: str) -> dict[str, float]
 
 
 class CompletionTask(TrainingTask):
+    """The training of the completion network."""
+
     title = "completion"
     module: CompletionNetwork
 

@@ -150,6 +150,8 @@ class PlannerTraining(MotionTraining, ModelParts):
         super().__post_init__()
         if self.target == "limits" and self.smooth_noise:
             raise InputError("target is limits and smooth_noise is True; in units of the limits it is white")
+        if self.encoder_settings is not None:
+            ENCODERS.entry(self.encoder)  # a folder holds a trained encoder with its own settings
 
     @property
     def jointly(self) -> bool:
