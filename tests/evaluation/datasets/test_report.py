@@ -13,7 +13,13 @@ from helpers.motion_stores import random_motions, write_motions
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.evaluation.datasets import report
 from robotdiffuse.evaluation.datasets.page import write_page
-from robotdiffuse.evaluation.datasets.report import SAMPLED_WAYPOINTS, facts, read_figures, size_in_words, tables
+from robotdiffuse.evaluation.datasets.report import (
+    SAMPLED_WAYPOINTS,
+    facts,
+    read_figures,
+    size_in_words,
+    tables,
+)
 from robotdiffuse.robots import load_robot
 
 ARM = box_arm()
