@@ -42,3 +42,4 @@ def test_bad_input(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main([*asked, "--planners", "rrt_connect"]) == 2
     assert "name --planners and --problems, or a --preset" in capfd.readouterr().err
     assert main([*asked, "--preset", "table1", "--planners", "rrt_connect"]) == 2
+    assert "--preset cannot be combined with --planners" in capfd.readouterr().err
