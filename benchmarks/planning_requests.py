@@ -413,7 +413,7 @@ def main() -> None:
     parser.add_argument("--places", type=int, default=1, help="of each scene (1)")
     parser.add_argument("--number", type=int, default=120, help="of problems of each other kind (120)")
     parser.add_argument("--planner", default="aorrtc", help="(aorrtc)")
-    arguments = parse(parser, number=2)
+    arguments = parse(parser, number=1)
     default = PARTS if arguments.scenes else PARTS[1:]
     parts = parts_of(arguments.parts or ",".join(default), PARTS)
     use_processor_time()
