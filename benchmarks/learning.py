@@ -25,9 +25,10 @@ Every
 
 import argparse
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -38,6 +39,7 @@ from numpy import ndarray
 from common import TIME_LIMIT, WIDTH, draw_hard_cases, header, parse, parts_of, print_table
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.types import Path as JointPath
+from robotdiffuse.evaluation import tables
 from robotdiffuse.evaluation.methods import (
     NETWORK_ALONE,
     Draw,
@@ -51,8 +53,7 @@ from robotdiffuse.evaluation.methods import (
 from robotdiffuse.evaluation.records import Record
 from robotdiffuse.evaluation.runs import Clock, Fields, Method, Run, run_all
 from robotdiffuse.evaluation.statistics import bootstrap_interval, wilson_interval
-from robotdiffuse.evaluation.summary import BEST, CPU, LENGTH, SINGLE, SOLVED, half_width, summary
-from robotdiffuse.evaluation.tables import show
+from robotdiffuse.evaluation.tables import Cell, Column, Table, show
 from robotdiffuse.learning.motion_model import MotionModel
 from robotdiffuse.planning.diffusion.diffusion import encode
 from robotdiffuse.planning.diffusion.hybrid import RobotDiffuse, RobotDiffuseSettings
@@ -80,6 +81,64 @@ SCALED_STEPS = (1, 2, 5, 10)
 """Sampling steps that the scales are tried with."""
 COLORS = ("#8a94a3", "#7fb3e0", "#3f7fc4", "#14487f", "#d1495b")
 
+
+class Summary(NamedTuple):
+    """A column, and its figure of some records."""
+
+    column: Column
+    of: Callable[[Sequence[Record]], Cell]
+
+
+def _solved(records: Sequence[Record]) -> Cell:
+    return share([record.solved for record in records])
+
+
+def share(passed: Sequence[bool]) -> Cell:
+    """A share in per cent with its 95 % interval."""
+    low, high = wilson_interval(int(np.sum(passed)), len(passed))
+    text = f"{100 * np.mean(passed):.1f} % ({100 * low:.1f} to {100 * high:.1f})"
+    return tables.Figure(text, float(np.mean(passed)))
+
+
+def half_width(values: Sequence[float]) -> float:
+    """Half the width of the 95 % interval of a mean."""
+    return 1.96 * float(np.std(values)) / len(values) ** 0.5
+
+
+def _single(records: Sequence[Record]) -> Cell:
+    shares = [record.passed or 0.0 for record in records]
+    return tables.Figure(
+        f"{100 * np.mean(shares):.1f} ± {100 * half_width(shares):.1f} %", float(np.mean(shares))
+    )
+
+
+def _ratio(records: Sequence[Record]) -> Cell:
+    ratios = [r.joint_length / r.reference for r in records if r.joint_length is not None and r.reference]
+    return float(np.mean(ratios)) if ratios else None
+
+
+def _cpu(records: Sequence[Record]) -> Cell:
+    seconds = [record.cpu for record in records if record.cpu is not None]
+    median, most = (1e3 * np.percentile(seconds, (50, 95))).tolist()
+    return tables.Figure(f"{median:.1f} / {most:.1f}", median)
+
+
+SINGLE = Summary(Column("single", better="more"), _single)
+"""Share of the samples that pass the validator."""
+BEST = Summary(Column("best", better="more"), _solved)
+"""Share of problems with such a sample."""
+SOLVED = Summary(Column("solved", better="more"), _solved)
+LENGTH = Summary(Column("length*", "", ".3f", "less"), _ratio)
+"""Mean ratio to the cases' reference lengths."""
+CPU = Summary(Column("CPU ms median / p95", better="less"), _cpu)
+
+
+def summary(title: str, of: Mapping[str, Sequence[Record]], figures: Sequence[Summary]) -> Table:
+    """The table of each method's records."""
+    rows = [(name, *(figure.of(records) for figure in figures)) for name, records in of.items()]
+    return Table.of(title, [Column(""), *(figure.column for figure in figures)], rows)
+
+
 Setting = tuple[int, float, int]
 """Gradient steps, classifier-free scale, sampling steps."""
 Found = dict[Setting, list[Record]]
@@ -103,7 +162,7 @@ def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]
             f"{name}, both": from_network(of, other, hidden=True),
         }
         if model.settings.null_condition:
-            found[f"{name}, condition hidden"] = from_network(of, guidance_scale=0.0)
+            found[f"{name}, condition hidden"] = from_network(RobotDiffuse(replace(of.settings, guidance_scale=0.0)))
     control = without_network(planner.settings, model.settings.waypoints)
     return found | {"control: guidance of line and bumps": control}
 
@@ -212,9 +271,9 @@ def try_settings(loaded: RobotDiffuse, cases: list[Case], settings: Sequence[Set
     """The records of each setting, one batch for each problem, with the same random numbers."""
     methods = {}
     for gradient, scale, steps in settings:
-        changed = {"guidance_steps": gradient, "sampling_steps": steps}
+        changed = {"guidance_steps": gradient, "sampling_steps": steps, "guidance_scale": scale}
         planner = RobotDiffuse(replace(loaded.settings, **changed))
-        drawn = from_network(planner, guidance_scale=scale)
+        drawn = from_network(planner)
         methods[name_of((gradient, scale, steps))] = sampled(drawn)
     found = run_all(cases, methods, seeds=(5,), title=title)
     show(summary(f"{title}, {len(cases)} problems", found, (SINGLE, BEST, CPU)), width=WIDTH)

@@ -1,5 +1,4 @@
-"""Moving obstacles: the reactive loop of `Replanner` among balls that cross its workspace, checked by
-PyBullet.
+"""Moving obstacles: the reactive loop among balls that cross its workspace, checked by PyBullet.
 
     python benchmarks/moving_obstacles.py [--runs 100] [--lattice-runs 5]
 

@@ -91,7 +91,7 @@ CURVE_SAMPLES = 20_000
 """Of a motion, at which its distance to waypoints is measured."""
 
 
-class Asked(NamedTuple):
+class NamedProblem(NamedTuple):
     name: str
     problem: Problem
 
@@ -106,7 +106,7 @@ class Checked(NamedTuple):
     """How far the held object or a hand ends off its goal beyond the tolerances [m]."""
 
 
-def carried(folder: Path, places: int) -> Iterator[Asked]:
+def carried(folder: Path, places: int) -> Iterator[NamedProblem]:
     """Problems that carry the can of each scene to random places on its table."""
     for number, entry in enumerate(load_motion_bench_maker(folder)):
         rng = np.random.default_rng([SEED, number])
@@ -121,7 +121,7 @@ def carried(folder: Path, places: int) -> Iterator[Asked]:
             if not isinstance(
                 usable_start_goal(PlanningContext("places", problem, PLACE_LIMIT, 0)), PlanResult
             ):
-                yield Asked(f"{entry.name}-{kept}", problem)
+                yield NamedProblem(f"{entry.name}-{kept}", problem)
                 kept += 1
             if kept == places:
                 break
@@ -146,7 +146,7 @@ def _place(scene: rd.Scene, whole: rd.Scene, rng: np.random.Generator) -> ndarra
             return transform(at[:3])
 
 
-def together(number: int) -> Iterator[Asked]:
+def together(number: int) -> Iterator[NamedProblem]:
     """Held-out problems with base, tool, held box, tolerances and a waypoint, that do not start in
     collision."""
     for i in range(number):
@@ -170,10 +170,10 @@ def together(number: int) -> Iterator[Asked]:
             continue
         if ExactCollision(problem.robot, problem.scene).collides(problem.start[None])[0]:
             continue
-        yield Asked(f"{('shelf', 'table')[i % 2]}/{i // 2}", problem)
+        yield NamedProblem(f"{('shelf', 'table')[i % 2]}/{i // 2}", problem)
 
 
-def both_hands(number: int) -> Iterator[Asked]:
+def both_hands(number: int) -> Iterator[NamedProblem]:
     """Problems whose goals are poses of both of Baxter's hands."""
     robot = rd.load_robot("baxter")
     table = rd.Box([0.75, 0.0, 0.05], [0.5, 1.2, 0.04], name="table")
@@ -185,12 +185,12 @@ def both_hands(number: int) -> Iterator[Asked]:
             drawn = rng.uniform(robot.lower, robot.upper, (16, robot.dof))
             free = np.concatenate([free, drawn[checker.free(drawn)]])
         poses = [PoseGoal(hand, link_pose(robot, free[1], hand)) for hand in HANDS]
-        yield Asked(f"baxter/{i}", Problem(robot, scene, free[0], PosesGoal(poses)))
+        yield NamedProblem(f"baxter/{i}", Problem(robot, scene, free[0], PosesGoal(poses)))
 
 
-def checked(asked: Asked, result: PlanResult) -> Checked:
+def checked(named: NamedProblem, result: PlanResult) -> Checked:
     """The motion before Coal and PyBullet."""
-    problem = asked.problem
+    problem = named.problem
     assert result.path is not None and result.trajectory is not None
     path = dense(result.path.positions, PATH_STEP)
     contacts = contacts_on_meshes(problem, np.concatenate([path, result.trajectory.positions]))
@@ -217,18 +217,18 @@ def _off(problem: Problem, pose: PoseGoal, simulated: World) -> float:
     return float(np.maximum(np.abs(there[:3]) - allowed, 0.0).max())
 
 
-def measured(title: str, every: list[Asked], name: str) -> None:
+def measured(title: str, every: list[NamedProblem], name: str) -> None:
     """Plan, check on meshes, and print."""
     planner = rd.load_planner(name)
     planner.warm_up(every[0].problem, TIME_LIMIT)
     results, longer, seen = [], [], []
-    for i, asked in enumerate(progress(every, title)):
-        result = planner.plan(asked.problem, time_limit=SHORT, seed=i)
-        long = result if result.solved else planner.plan(asked.problem, time_limit=LONG, seed=i + 1)
+    for i, named in enumerate(progress(every, title)):
+        result = planner.plan(named.problem, time_limit=SHORT, seed=i)
+        long = result if result.solved else planner.plan(named.problem, time_limit=LONG, seed=i + 1)
         results.append(result)
         longer.append(long)
         if long.solved:
-            seen.append(checked(asked, long))
+            seen.append(checked(named, long))
     solved, possible = sum(r.solved for r in results), sum(r.solved for r in longer)
     times = [1e3 * r.planning_time for r in results if r.solved]
     print_table(
@@ -310,9 +310,9 @@ def blended(number: int, name: str) -> None:
     for i, problem in enumerate(progress(every, "Blended")):
         found: dict[str, Any] = {}
         for blend in (0.0, *BLENDS):
-            asked = replace(problem, blend=blend)
+            named = replace(problem, blend=blend)
             began = time.process_time()
-            result = planner.plan(asked, time_limit=MOTION_LIMIT, seed=i)
+            result = planner.plan(named, time_limit=MOTION_LIMIT, seed=i)
             spent = time.process_time() - began
             if result.trajectory is None:
                 break
@@ -413,7 +413,7 @@ def main() -> None:
     parser.add_argument("--places", type=int, default=1, help="of each scene (1)")
     parser.add_argument("--number", type=int, default=120, help="of problems of each other kind (120)")
     parser.add_argument("--planner", default="aorrtc", help="(aorrtc)")
-    arguments = parse(parser, number=2)
+    arguments = parse(parser, number=1)
     default = PARTS if arguments.scenes else PARTS[1:]
     parts = parts_of(arguments.parts or ",".join(default), PARTS)
     use_processor_time()

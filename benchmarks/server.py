@@ -41,7 +41,7 @@ ROUNDS = 3
 
 
 @dataclass
-class Asked:
+class PlanRequest:
     """A request, and the answer of the planner alone."""
 
     body: bytes
@@ -51,7 +51,7 @@ class Asked:
 
 
 @dataclass
-class Seen:
+class ClientCounts:
     """What the clients saw."""
 
     answers: Counter = field(default_factory=Counter)
@@ -60,9 +60,9 @@ class Seen:
     seconds: list[float] = field(default_factory=list)
 
 
-def requests(planner: str, count: int) -> list[Asked]:
+def requests(planner: str, count: int) -> list[PlanRequest]:
     """Requests for `count` problems of each family."""
-    asked, rng = [], np.random.default_rng(SEED)
+    plan_requests, rng = [], np.random.default_rng(SEED)
     for number in range(count):
         for family in FAMILIES:
             record: dict[str, Any] = problem_record(held_out_problem(family, number))
@@ -71,54 +71,63 @@ def requests(planner: str, count: int) -> list[Asked]:
                 record["attached"] = [{"link": "panda_hand", "box": box}]
             for seed in SEEDS:
                 body = {"problem": record, "planner": planner, "seed": seed, "time_limit": TIME_LIMIT}
-                asked.append(Asked(json.dumps(body).encode(), problem_from_record(record), seed))
-    return asked
+                plan_requests.append(
+                    PlanRequest(json.dumps(body).encode(), problem_from_record(record), seed)
+                )
+    return plan_requests
 
 
-def bare(asked: list[Asked], planner: str) -> tuple[float, float]:
+def plan_alone(plan_requests: list[PlanRequest], planner: str) -> tuple[float, float]:
     """Wall and CPU time of the planner alone for all requests [s]; keeps its answers in these."""
     loaded = rd.load_planner(planner)
-    loaded.warm_up(asked[0].problem, CONVERGED)
-    for one in asked:
+    loaded.warm_up(plan_requests[0].problem, CONVERGED)
+    for one in plan_requests:
         result = loaded.plan(one.problem, TIME_LIMIT, one.seed)
         waypoints = None if result.path is None else result.path.positions.tolist()
         assert one.expected is None or one.expected == waypoints, "the planner contradicts itself"
         one.expected = waypoints
     wall, spent = time.perf_counter(), time.process_time()
     for _ in range(ROUNDS):
-        for one in asked:
+        for one in plan_requests:
             loaded.plan(one.problem, TIME_LIMIT, one.seed)
     return (time.perf_counter() - wall) / ROUNDS, (time.process_time() - spent) / ROUNDS
 
 
 def run_client(
-    url: str, asked: list[Asked], seed: int, until: float, seen: Seen, lock: threading.Lock
+    url: str,
+    plan_requests: list[PlanRequest],
+    seed: int,
+    until: float,
+    counts: ClientCounts,
+    lock: threading.Lock,
 ) -> None:
     import orjson
 
     rng, kind = random.Random(seed), {"Content-Type": "application/json"}
     with httpx.Client(base_url=url, timeout=60.0) as http:
         while time.monotonic() < until:
-            one, begun = rng.choice(asked), time.monotonic()
+            one, begun = rng.choice(plan_requests), time.monotonic()
             try:
                 answer = http.post("/plan", content=one.body, headers=kind)
             except httpx.HTTPError:
                 with lock:
-                    seen.lost += 1
+                    counts.lost += 1
                 continue
             record = orjson.loads(answer.content)
             right = record.get("waypoints") == one.expected and record.get("seed") == one.seed
             with lock:
-                seen.answers[answer.status_code] += 1
-                seen.wrong += answer.status_code == 200 and not right
-                seen.seconds.append(time.monotonic() - begun)
+                counts.answers[answer.status_code] += 1
+                counts.wrong += answer.status_code == 200 and not right
+                counts.seconds.append(time.monotonic() - begun)
 
 
-def load(url: str, asked: list[Asked], clients: int, seconds: float, meanwhile: Any) -> Seen:
+def load(
+    url: str, plan_requests: list[PlanRequest], clients: int, seconds: float, meanwhile: Any
+) -> ClientCounts:
     """What clients see in this time; `meanwhile` is called every second with the seconds since the start."""
-    seen, lock, begun = Seen(), threading.Lock(), time.monotonic()
+    counts, lock, begun = ClientCounts(), threading.Lock(), time.monotonic()
     threads = [
-        threading.Thread(target=run_client, args=(url, asked, i, begun + seconds, seen, lock))
+        threading.Thread(target=run_client, args=(url, plan_requests, i, begun + seconds, counts, lock))
         for i in range(clients)
     ]
     for thread in threads:
@@ -126,7 +135,7 @@ def load(url: str, asked: list[Asked], clients: int, seconds: float, meanwhile: 
     while any(thread.is_alive() for thread in threads):
         meanwhile(time.monotonic() - begun)
         time.sleep(1.0)
-    return seen
+    return counts
 
 
 def private_memory(process: int) -> float:
@@ -162,8 +171,8 @@ def main() -> None:
     arguments = parse(parser, **small)
     print(header("numpy", "numba", "fastapi", "uvicorn"), "\n")
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    asked = requests(arguments.planner, arguments.problems)
-    before = bare(asked, arguments.planner)
+    plan_requests = requests(arguments.planner, arguments.problems)
+    before = plan_alone(plan_requests, arguments.planner)
     command = ["serve", "--port", "0", "--workers", str(arguments.workers), "--queue", str(arguments.clients)]
     with subprocess.Popen(
         [sys.executable, "-m", "robotdiffuse", *command], stdout=subprocess.PIPE, text=True
@@ -174,7 +183,7 @@ def main() -> None:
         url = found.group()
         while httpx.get(f"{url}/health").json()["workers_ready"] < arguments.workers:
             time.sleep(0.2)
-        load(url, asked, arguments.clients, min(20.0, arguments.seconds / 4), lambda _: None)
+        load(url, plan_requests, arguments.clients, min(20.0, arguments.seconds / 4), lambda _: None)
         workers = workers_of(server.pid)
         rows: list[tuple[float, float, float]] = []
         at_first = {process: cpu_time(process) for process in (server.pid, *workers)}
@@ -182,7 +191,7 @@ def main() -> None:
         def watch(since: float) -> None:
             rows.append((since, private_memory(server.pid), max(map(private_memory, workers))))
 
-        seen = load(url, asked, arguments.clients, arguments.seconds, watch)
+        counts = load(url, plan_requests, arguments.clients, arguments.seconds, watch)
         used = {process: cpu_time(process) - at_first[process] for process in at_first}
         kills: list[float] = []
 
@@ -193,12 +202,12 @@ def main() -> None:
                     os.kill(random.choice(workers_of(server.pid)), signal.SIGKILL)
                     kills.append(since)
 
-        killed = load(url, asked, arguments.clients, 6.0 * arguments.kills + 10.0, kill)
+        killed = load(url, plan_requests, arguments.clients, 6.0 * arguments.kills + 10.0, kill)
         server.send_signal(signal.SIGTERM)
         status = server.wait(30)
-    after = bare(asked, arguments.planner)
-    alone = len(asked) / min(before[0], after[0]), len(asked) / min(before[1], after[1])
-    count = sum(seen.answers.values())
+    after = plan_alone(plan_requests, arguments.planner)
+    alone = len(plan_requests) / min(before[0], after[0]), len(plan_requests) / min(before[1], after[1])
+    count = sum(counts.answers.values())
     worked = sum(used[process] for process in workers)
     rates = {
         "planner alone": alone,
@@ -220,15 +229,15 @@ def main() -> None:
             for name, rate_of in rates.items()
         ],
     )
-    times = 1e3 * np.array(seen.seconds)
+    times = 1e3 * np.array(counts.seconds)
     print_table(
         f"What {arguments.clients} clients saw in {arguments.seconds:.0f} s",
         ("", "undisturbed", f"{len(kills)} workers killed"),
         [
-            ("answers", *(str(sum(of.answers.values())) for of in (seen, killed))),
-            ("by code", *(_codes(of) for of in (seen, killed))),
-            ("lost, without an answer", str(seen.lost), str(killed.lost)),
-            ("not the planner's path", str(seen.wrong), str(killed.wrong)),
+            ("answers", *(str(sum(of.answers.values())) for of in (counts, killed))),
+            ("by code", *(_codes(of) for of in (counts, killed))),
+            ("lost, without an answer", str(counts.lost), str(killed.lost)),
+            ("not the planner's path", str(counts.wrong), str(killed.wrong)),
             (
                 "seconds to an answer, median / 99 % / most",
                 " / ".join(f"{x / 1e3:.3f}" for x in (*np.percentile(times, (50, 99)), times.max())),
@@ -243,13 +252,13 @@ def main() -> None:
         [tuple(f"{value:.0f}" for value in row) for row in marks],
     )
     print(f"\nExit status after SIGTERM: {status}.")
-    failed = seen.lost or seen.wrong or killed.lost or killed.wrong or set(seen.answers) != {200}
+    failed = counts.lost or counts.wrong or killed.lost or killed.wrong or set(counts.answers) != {200}
     if failed or killed.answers[500] > len(kills) or status:
         sys.exit(1)
 
 
-def _codes(seen: Seen) -> str:
-    return ", ".join(f"{code}: {count}" for code, count in sorted(seen.answers.items()))
+def _codes(counts: ClientCounts) -> str:
+    return ", ".join(f"{code}: {count}" for code, count in sorted(counts.answers.items()))
 
 
 if __name__ == "__main__":

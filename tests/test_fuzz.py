@@ -28,7 +28,13 @@ COUNTS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+SLOW = {"settings", "socket"}
+"""These load PyTorch, or start a server."""
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.slow if kind in SLOW else ()) for kind in KINDS]
+)
 def test_damaged_inputs(kind: str, tmp_path: Path) -> None:
     faults = []
     for seed in range(COUNTS[kind]):

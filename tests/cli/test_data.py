@@ -50,7 +50,7 @@ def test_info_prints_figures_and_writes_the_page(folder, capsys):
 def test_check_of_clean_data(folder, capsys):
     assert run("data", "check", folder, "--workers", 1, "--no-pybullet", "--count", 4) == 0
     printed = capsys.readouterr().out
-    assert "panda: clean" in printed and re.search("validated .* 4 in", printed) and "not asked" in printed
+    assert "panda: clean" in printed and re.search("validated .* 4 in", printed) and "not checked" in printed
 
 
 def test_check_finds_a_collision(folder, capsys):

@@ -1,20 +1,16 @@
 """The command `train`: options, and data that are generated during the training."""
 
 import multiprocessing
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from robotdiffuse.cli.train_generate import generate_meanwhile
 
 from helpers.commands import run
-from robotdiffuse.datasets.manifest import read_manifest, write_manifest
-from robotdiffuse.datasets.shards import check_shard, shard_indices
+from robotdiffuse.datasets.manifest import write_manifest
 from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.factory import manifest_of
 from robotdiffuse.learning.denoisers.unet import UNetSettings
-from robotdiffuse.learning.diffusion import ScheduleSettings
 from robotdiffuse.learning.training.config import PlannerTraining
 from robotdiffuse.learning.training.configs import CONFIGS
 
@@ -42,10 +38,9 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         return {}
 
     monkeypatch.setattr("robotdiffuse.learning.training.planner.train_planner", train_planner)
-    parts = ["--objective", "velocity", "--sampler", "euler", "--schedule", "flow", "--waypoints", "64"]
-    spline = ["--parametrization", "b_spline", "--rows", "12", "--condition-drop", "0.2"]
-    spline += ["--target", "residual"]
-    assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, *spline, "--device", "cpu") == 0
+    parts = ["--objective", "noise", "--sampler", "ddim", "--waypoints", "64", "--condition-drop", "0.2"]
+    parts += ["--target", "residual"]
+    assert run(*TRAIN, "--config", "paper", "--denoiser", "unet", *parts, "--device", "cpu") == 0
     assert run(*TRAIN, "--config", "paper") == 0
     assert run(*TRAIN, "--config", "table2_unet", "--denoiser", "decoder_only") == 0
     changed, paper, row = trained
@@ -53,38 +48,14 @@ def test_parts_replace_those_of_the_config(monkeypatch: pytest.MonkeyPatch) -> N
         paper,
         denoiser="unet",
         denoiser_settings=UNetSettings.paper_size(),
-        objective="velocity",
-        sampler="euler",
-        schedule=ScheduleSettings(kind="flow"),
+        objective="noise",
+        sampler="ddim",
         target="residual",
         waypoints=64,
-        parametrization="b_spline",
-        rows=12,
         condition_drop=0.2,
         device="cpu",
     )
     assert row.denoiser == "decoder_only" and row.denoiser_settings is None
-
-
-def test_data_are_made_meanwhile(tmp_path: Path) -> None:
-    """The factory goes on by the manifest while the folder is used; it leaves whole shards and no process."""
-    out = tmp_path / "data"
-    settings = GenerationSettings(trajectories=10_000, shard=2, waypoints=16)
-    out.mkdir()
-    write_manifest(out, manifest_of(settings))
-    with generate_meanwhile(str(out), 1, "panda"):
-        first = len(shard_indices(out))
-        assert first > 0
-        end = time.monotonic() + 300
-        while len(shard_indices(out)) == first:
-            assert time.monotonic() < end
-            time.sleep(0.05)
-        assert len(multiprocessing.active_children()) == 1
-    assert not multiprocessing.active_children()
-    made = shard_indices(out)
-    assert not list(out.glob(".shard*")) and len(made) < settings.shards
-    for index in made:
-        check_shard(out, index, read_manifest(out))
 
 
 def test_data_that_cannot_be_made_meanwhile(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,6 +37,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return contents(out)
 
 
+@pytest.mark.slow
 def test_killed_at_a_random_moment_it_ends_in_the_same_data(
     undisturbed: dict[str, bytes], tmp_path: Path
 ) -> None:

@@ -22,6 +22,8 @@ os.environ["RAY_DEDUP_LOGS_SKIP_REGEX"] = "Raylet is terminated"
 ray: Any = pytest.importorskip("ray", reason="the extra `cluster` (ray) is not installed")
 cluster_utils: Any = pytest.importorskip("ray.cluster_utils")
 
+pytestmark = pytest.mark.cluster
+
 SETTINGS = GenerationSettings(trajectories=24, shard=2, waypoints=16)
 STORE = 80 * 2**20
 """Smallest object store of a node, about [bytes]."""

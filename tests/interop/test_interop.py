@@ -17,7 +17,7 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.interop import READERS, WRITERS, read_motion, write_motion
+from robotdiffuse.interop import READERS, TRAJECTORY_ENDINGS, WRITERS, read_motion, write_motion
 from robotdiffuse.interop.plain_messages import joint_trajectory, motion_from_record
 from robotdiffuse.interop.recorded_motion import checked_motion, motion_of_robot, problem_of_motion
 from robotdiffuse.problems.problem import Problem
@@ -172,7 +172,7 @@ def test_a_bag_is_not_read_from_a_pipe(planned: tuple[Problem, Trajectory], tmp_
         read_motion(bag)
 
 
-@pytest.mark.parametrize("ending", sorted([*WRITERS, *OWN]))
+@pytest.mark.parametrize("ending", sorted([*WRITERS, *TRAJECTORY_ENDINGS]))
 def test_a_disk_that_fills_up_is_one_line(
     planned: tuple[Problem, Trajectory], tmp_path: Path, ending: str
 ) -> None:

@@ -48,15 +48,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         "learning, anytime or restarts",
     )
     run.add_argument("--out", required=True, metavar="FOLDER", help="folder for problems and results")
+    run.add_argument("--time-limit", type=positive, metavar="S", help="time limit of a call [s] (default: 1)")
     run.add_argument(
-        "--time-limit", type=positive, default=1.0, metavar="S", help="time limit of a call [s] (default: 1)"
-    )
-    run.add_argument(
-        "--seeds",
-        type=count,
-        default=1,
-        metavar="N",
-        help="calls per problem, with different seeds (default: 1)",
+        "--seeds", type=count, metavar="N", help="calls per problem, with different seeds (default: 1)"
     )
     run.add_argument(
         "--count", type=count, metavar="N", help="problems per set (default: 100; all of a folder)"
@@ -178,8 +172,10 @@ def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
     out, workers = Path(arguments.out), arguments.workers or max(1, (os.cpu_count() or 1) // 2)
     problems = () if arguments.problems is None else tuple(arguments.problems.split(","))
     if arguments.preset is not None:
-        if arguments.planners is not None or arguments.cluster is not None or arguments.equal_time:
-            raise InputError("--preset cannot be combined with --planners, --cluster or --equal-time")
+        fixed = ("planners", "time_limit", "seeds", "equal_time", "cluster")
+        given = [f"--{name.replace('_', '-')}" for name in fixed if getattr(arguments, name)]
+        if given:
+            raise InputError(f"--preset cannot be combined with {', '.join(given)}: the preset fixes these")
         return preset_settings(arguments.preset, out, problems, arguments.count, workers)
     if arguments.planners is None or arguments.problems is None:
         raise InputError("name --planners and --problems, or a --preset")
@@ -188,8 +184,8 @@ def _bench_settings(arguments: argparse.Namespace) -> "list[BenchSettings]":
             planners=tuple(arguments.planners.split(",")),
             problems=problems,
             out=out,
-            time_limit=arguments.time_limit,
-            seeds=arguments.seeds,
+            time_limit=arguments.time_limit or 1.0,
+            seeds=arguments.seeds or 1,
             count=arguments.count,
             workers=workers,
             cluster=arguments.cluster,

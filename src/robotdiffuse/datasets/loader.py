@@ -81,11 +81,16 @@ class RopDataset(Dataset[dict[str, Tensor]]):
         robot: Robot | None = None,
         waypoints: int | None = None,
     ) -> None:
-        """split: train, validation or test; no scene is in two of them. points: of each cloud. sort_points:
-        whether points are sorted by x, then y, then z. view: "full" for points all around the obstacles,
-        "partial" for those that a camera at a random place sees. seed: of clouds and order. robot: the robot
-        that the data are used for. waypoints: resample to so many, evenly spaced along each path, in memory;
-        None: the stored ones.
+        """Open a data set.
+
+        split: train, validation or test; no scene is in two of them.
+        points: of each cloud.
+        sort_points: whether points are sorted by x, then y, then z.
+        view: "full" for points all around the obstacles, "partial" for those that a camera at a random place
+            sees.
+        seed: of clouds and order.
+        robot: the robot that the data are used for.
+        waypoints: resample to so many, evenly spaced along each path, in memory; None: the stored ones.
 
         Raises InputError for unknown names, a folder without data or with damaged shards, and data of
         another robot.

@@ -48,9 +48,9 @@ def read_rows(
 ) -> Iterator[Rows]:
     """Read the rows of all shards, each shard followed by its turned copies.
 
-    robot: the robot that the data are used for. waypoints: resample to so many, evenly spaced along each
-    path, in memory; shards are then fully checked. None: the
-        stored ones, mapped to memory; only their shapes are checked.
+    robot: the robot that the data are used for.
+    waypoints: resample to so many, evenly spaced along each path, in memory; shards are then fully checked.
+        None: the stored ones, mapped to memory; only their shapes are checked.
     turns: copies of the training rows, see `turned`; these need `waypoints` and a robot.
 
     Raises InputError, naming the shard, if data are missing, damaged or of another robot.

@@ -340,8 +340,11 @@ def row_of(
 ) -> Row:
     """The row of a motion q in a packed scene.
 
-    clearances: of the waypoints [m]. T_base_tip: the target. most_goals: rows for goals. The other arguments
-    are the values of the arrays of their names.
+    clearances: of the waypoints [m].
+    T_base_tip: the target.
+    most_goals: rows for goals.
+
+    The other arguments are the values of the arrays of their names.
     """
     missing = [(0, most_goals - len(goals)), (0, 0)]
     straight = float(np.linalg.norm(q[-1].astype(np.float64) - q[0]))

@@ -191,21 +191,21 @@ def sampled(draw: Draw, lengths: Callable[[ndarray], ndarray] = path_lengths) ->
 
 def from_network(
     sampler: ModelSampler,
-    seen: Callable[[Run], Problem] | None = None,
+    encoded: Callable[[Run], Problem] | None = None,
     hidden: bool = False,
 ) -> Draw:
     """Samples of the network: no refinement, no search, no shortcuts.
 
-    seen: the problem whose obstacles are encoded, in place of the run's own. hidden: whether the clearances
-    given to the denoiser are those without obstacles. Guidance knows the obstacles in
-        any case.
+    encoded: the problem whose obstacles are encoded, in place of the run's own.
+    hidden: whether the clearances given to the denoiser are those without obstacles; guidance knows the
+        obstacles in any case.
     """
 
     def draw(run: Run, checker: CollisionChecker) -> ndarray:
         problem, rng = run.problem, run.rng()
         model = sampler.model(problem.robot)
         assert model is not None
-        other = checker if seen is None else CollisionChecker(problem.robot, seen(run).scene)
+        other = checker if encoded is None else CollisionChecker(problem.robot, encoded(run).scene)
         code = encode(model, other, sampler.settings.points, rng)
         ends = problem.start, goal_of(problem)[None]
         clearances = clearances_without_obstacles(model) if hidden else None

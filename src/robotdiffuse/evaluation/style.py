@@ -75,8 +75,10 @@ def page(
 ) -> str:
     """The HTML of a page.
 
-    about: lines below the name. facts: figures and their captions. own: further style sheet. end: further
-    elements of the body, such as scripts.
+    about: lines below the name.
+    facts: figures and their captions.
+    own: further style sheet.
+    end: further elements of the body, such as scripts.
     """
     tiles = "".join(
         f'<div class="tile"><b>{html.escape(value)}</b><span>{html.escape(what)}</span></div>'

@@ -269,7 +269,8 @@ def tex(text: str) -> str:
 def html(table: Table, colors: Mapping[str, str] | None = None, ours: str = "") -> str:
     """An HTML table element, without the title; `style.STYLE` is its style sheet.
 
-    colors: of rows, by the text of their first cell. ours: the text of the row that is emphasized.
+    colors: of rows, by the text of their first cell.
+    ours: the text of the row that is emphasized.
     """
     head = "".join(f"<th>{markup.escape(column.title)}</th>" for column in table.columns)
     body, best = [], table.best

@@ -70,7 +70,7 @@ def write_motion(problem: "Problem", trajectory: "Trajectory", file: str | Path)
         WRITERS.load(path.suffix.lower())(problem, trajectory, path)
 
 
-def read_motion(file: str | Path, topic: str | None = None) -> "Recorded":
+def read_motion(file: str | Path, topic: str | None = None) -> "RecordedMotion":
     """Read a motion from a file of any program; a folder is read as a ROS 2 bag.
 
     Raises InputError for another ending, a file that is damaged or holds no motion, and a package that is not

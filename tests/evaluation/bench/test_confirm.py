@@ -12,6 +12,7 @@ from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.problem import JointGoal
 
 pytest.importorskip("pybullet", reason="the extra `sim` (pybullet) is not installed")
+pytestmark = pytest.mark.sim
 
 
 @pytest.fixture

@@ -36,9 +36,10 @@ def test_the_command_runs_every_stage(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_bad_input(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(InputError, match="unknown preset 'table2'; known: table1"):
+    with pytest.raises(InputError, match="unknown preset 'table2'; known: anytime"):
         preset_settings("table2", tmp_path)
     asked = ["bench", "run", "--out", str(tmp_path)]
     assert main([*asked, "--planners", "rrt_connect"]) == 2
     assert "name --planners and --problems, or a --preset" in capfd.readouterr().err
     assert main([*asked, "--preset", "table1", "--planners", "rrt_connect"]) == 2
+    assert "--preset cannot be combined with --planners" in capfd.readouterr().err

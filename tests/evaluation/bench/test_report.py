@@ -419,6 +419,7 @@ def test_the_paper_stands_beside_ours(small: Path) -> None:
     assert max(widths) == 12
 
 
+@pytest.mark.slow
 def test_the_command_writes_everything(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -52,6 +52,7 @@ def keys(records: list[Record]) -> Counter:
     return Counter(record.key for record in records)
 
 
+@pytest.mark.slow
 def test_records_hold_what_was_measured_and_are_not_made_twice(tmp_path: Path) -> None:
     plain, with_settings = "rrt_connect", "rrt_connect:optimize_time=0.05:tightenings=0"
     asked = replace(settings(tmp_path, f"{plain},{with_settings}", count=2), seeds=2)
@@ -85,6 +86,7 @@ def faulty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(PLANNERS, "faulty", faulty_planner.ENTRY)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("faulty")
 def test_failures_of_every_kind_are_records_and_the_run_goes_on(tmp_path: Path) -> None:
     asked = replace(settings(tmp_path, "faulty", count=1), seeds=5, time_limit=0.5)
@@ -120,6 +122,7 @@ def test_lines_that_come_at_once_are_told_apart(tmp_path: Path, monkeypatch: pyt
     process.close()
 
 
+@pytest.mark.slow
 def test_killed_run_completes_without_repeating_or_losing_a_result(tmp_path: Path) -> None:
     arguments = ["bench", "run", "--planners", "rrt_connect,shared_tree_rrt_star", "--problems", "rop"]
     arguments += ["--count", "3", "--time-limit", "2", "--workers", "2", "--out", str(tmp_path)]

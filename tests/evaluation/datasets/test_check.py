@@ -38,6 +38,7 @@ def found(folder: Path, **options) -> dict[str, int]:
     return {kind: n for kind, n in check_data(folder, ARM, **options).counts.items() if n}
 
 
+@pytest.mark.sim
 def test_what_is_right_passes(tmp_path, pybullet):
     write_motions(tmp_path, ARM, right(5), shard=2)
     seen = []
@@ -49,6 +50,7 @@ def test_what_is_right_passes(tmp_path, pybullet):
     assert check.least_clearance == min(row["clearance"] for row in right(5))
 
 
+@pytest.mark.sim
 def test_collision_is_found_by_both_validators(tmp_path, pybullet):
     write_motions(tmp_path, ARM, [*right(3), record(ARM, BALL, line(AWAY, BACK))], shard=3)
     check = check_data(tmp_path, ARM)
@@ -60,6 +62,7 @@ def test_collision_is_found_by_both_validators(tmp_path, pybullet):
     assert found(tmp_path, pybullet=False) == {"collision": 1}
 
 
+@pytest.mark.sim
 def test_collision_between_frames_is_found(tmp_path, pybullet):
     thin = Scene([Box([0.0, 1.1, 0.0], [0.01, 0.01, 0.01])])
     q = line(AWAY, BACK, waypoints=4)
@@ -69,11 +72,13 @@ def test_collision_between_frames_is_found(tmp_path, pybullet):
     assert found(tmp_path) == {"collision": 1, "pybullet": 1}
 
 
+@pytest.mark.sim
 def test_self_collision_is_found(tmp_path, pybullet):
     write_motions(tmp_path, ARM, [record(ARM, Scene([]), line(np.zeros(3), np.array([0.0, 2.7, 2.7])))])
     assert found(tmp_path) == {"collision": 1, "pybullet": 1}
 
 
+@pytest.mark.sim
 def test_limit_violation_is_found(tmp_path, pybullet):
     q = line(np.array([2.7, 0.0, 0.0]), np.array([2.7, 1.0, 0.0]))
     q[7, 0] = 2.801
@@ -84,6 +89,7 @@ def test_limit_violation_is_found(tmp_path, pybullet):
     assert example.where == "shard 0, row 1" and "j0 is 2.801 at waypoint 7" in example.message
 
 
+@pytest.mark.sim
 def test_start_out_of_limits_is_found(tmp_path, pybullet):
     q = line(np.array([2.9, 0.0, 0.0]), np.array([2.0, 0.0, 0.0]))
     write_motions(tmp_path, ARM, [record(ARM, Scene([]), q)])

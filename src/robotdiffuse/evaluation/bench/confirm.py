@@ -35,8 +35,8 @@ def confirm(
 ) -> dict[str, Confirmation]:
     """Check the returned motions in a folder of `bench run`; results by planner.
 
-    count: first problems of each set; None: all. progress: called with the numbers of problems done and in
-    all.
+    count: first problems of each set; None: all.
+    progress: called with the numbers of problems done and in all.
 
     Raises InputError if the folder holds no records or is damaged.
     """

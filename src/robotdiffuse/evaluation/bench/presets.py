@@ -90,7 +90,8 @@ def preset_settings(
 ) -> list[BenchSettings]:
     """The settings of each stage of a preset.
 
-    problems: sets beside those of the preset. count: most problems of each set; None: as the preset says.
+    problems: sets beside those of the preset.
+    count: most problems of each set; None: as the preset says.
 
     Raises InputError for an unknown preset, listing the known.
     """

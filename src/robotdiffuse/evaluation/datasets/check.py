@@ -114,12 +114,12 @@ class DataCheck:
         """A table of the result, and one of the first examples of each kind."""
         planned = f" of {self.planned:,} planned" if self.motions < self.planned else ""
         rate = self.checked / max(self.seconds, 1e-9)
-        asked = {kind: kind != "pybullet" or self.pybullet for kind in KINDS}
+        checked = {kind: kind != "pybullet" or self.pybullet for kind in KINDS}
         rows = [
             ("shards, motions", f"{self.shards:,}, {self.motions:,}{planned}"),
             ("validated", f"{self.checked:,} in {self.seconds:.1f} s ({rate:.0f}/s)"),
             *(
-                (name, f"{self.counts[kind]:,}" if asked[kind] else "not asked")
+                (name, f"{self.counts[kind]:,}" if checked[kind] else "not checked")
                 for kind, name in KINDS.items()
             ),
             ("least clearance recorded", f"{1e3 * self.least_clearance + 0.0:.3f} mm"),
@@ -146,8 +146,9 @@ def check_data(
     PyBullet checks collisions on meshes at and between the waypoints. Recorded values are compared with
     measured ones.
 
-    robot: that of the data; None: found by the name in the manifest. workers: processes; the motions and
-    findings do not depend on them. progress: called with the numbers of motions done and in all.
+    robot: that of the data; None: found by the name in the manifest.
+    workers: processes; the motions and findings do not depend on them.
+    progress: called with the numbers of motions done and in all.
 
     Raises InputError if there is no data set, for another robot than that of the data, and if PyBullet is
     asked for but not installed.
