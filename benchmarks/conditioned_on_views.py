@@ -56,11 +56,10 @@ from robotdiffuse.learning.training.planner import PlannerTrainee
 from robotdiffuse.learning.training.processes import Processes
 from robotdiffuse.learning.training.task import train
 from robotdiffuse.learning.weights_registry import BUNDLED
-from robotdiffuse.perception.assumptions import assumptions
 from robotdiffuse.perception.depth_view import AssumedPoints, DepthView, SeenPoints
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.planning.diffusion.diffusion import encode
-from robotdiffuse.planning.pipeline.unknown_space import with_assumption
+from robotdiffuse.planning.pipeline.unknown_space import assumptions_of, with_assumption
 from robotdiffuse.problems.held_out import goal_of, held_out_problem
 from robotdiffuse.problems.problem import PREDICTED, JointGoal, Problem
 from robotdiffuse.scenes.scene import Scene
@@ -79,7 +78,7 @@ def imagined_scene(problem: Problem, view: DepthView, goal: Float[ndarray, "dof"
     known = Scene(problem.scene.shapes[:1])
     seen = Problem(problem.robot, known, problem.start, problem.goal, views=[view], unknown=PREDICTED)
     volume = observe(seen.views, seen.robot, seen.start)
-    chosen = list(assumptions(seen, volume, predict(volume)))[assumption]
+    chosen = list(assumptions_of(seen, volume, predict(volume)))[assumption]
     return with_assumption(seen, chosen, goal[None]).scene
 
 

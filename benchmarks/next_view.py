@@ -22,7 +22,7 @@ from robotdiffuse.evaluation.statistics import compare
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.ray_caster import ray_cast
 from robotdiffuse.planning import context
-from robotdiffuse.planning.context import Request
+from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.next_view import next_view, poses_around
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
@@ -69,7 +69,7 @@ def _tried(problem: Problem, family: str, number: int) -> dict[str, Any]:
 def _planned(problem: Problem, *views: DepthView) -> tuple[Problem, PlanResult]:
     known = Scene(problem.scene.shapes[:1])
     partial = Problem(problem.robot, known, problem.start, problem.goal, views=views, unknown=PREDICTED)
-    return partial, plan_with_unknown_space(unknown.PLANNER, partial, unknown.LIMIT, 0, Request())
+    return partial, plan_with_unknown_space(unknown.PLANNER, partial, PlanRequest(unknown.LIMIT))
 
 
 def report(rows: list[dict[str, Any]]) -> None:

@@ -40,7 +40,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
 from robotdiffuse.core.types import Path as JointPath
 from robotdiffuse.planning import context
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal, PosesGoal, poses_of
@@ -101,7 +101,7 @@ def carried(folder: Path, places: int) -> Iterator[Asked]:
         for _ in range(TRIES):
             goal = PoseGoal(CAN, _place(scene, entry.problem.scene, rng), [0, 0, 0], [0, 0, np.pi])
             problem = Problem(holding, scene, q, goal)
-            if not isinstance(usable_start_goal(PlanningContext("places", problem, LOOKING, 0)), PlanResult):
+            if not isinstance(usable_start_goal(PlanningContext("places", problem, PlanRequest(LOOKING))), PlanResult):
                 yield Asked(f"{entry.name}-{kept}", problem)
                 kept += 1
             if kept == places:

@@ -91,7 +91,7 @@ class Arena:
     def shortened(self, found: Candidates) -> Iterator[ndarray]:
         """The shortest of the free candidates after shortcuts."""
         settings = self.planner.settings
-        for path in sorted(found.q[found.free], key=path_length)[: settings.shortened]:
+        for path in sorted(found.q[found.free], key=path_length)[: settings.max_simplified]:
             yield shortcut(self.space, path, SHORTCUTS, self.state)
 
 

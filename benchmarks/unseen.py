@@ -43,7 +43,7 @@ from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import DepthNoise, ray_cast
 from robotdiffuse.planning import context, load_planner
-from robotdiffuse.planning.context import Request
+from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
 from robotdiffuse.problems.held_out import SEED, held_out_problem, line_length
@@ -124,7 +124,7 @@ def tried(problem: Problem, partial: Problem, method: str, network: CompletionNe
     asked = replace(partial, unknown=METHODS.get(method, PREDICTED))
     left = LIMIT if network is None else LIMIT - (time.process_time() - began)
     planner = HYBRID_PLANNER if method == HYBRID else PLANNER
-    result = plan_with_unknown_space(planner, asked, left, 0, Request(), voxels)
+    result = plan_with_unknown_space(planner, asked, PlanRequest(left), voxels)
     spent = time.process_time() - began
     return {
         "method": method,

@@ -140,7 +140,7 @@ def test_collision_costs_add_up_to_the_checker_s() -> None:
 
 
 def test_a_further_cost_acts_between_the_compiled_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It draws the first joint to zero; ends stay, and costs that are compiled take no name in `further`."""
+    """It draws the first joint to zero; ends stay, and costs that are compiled take no name in `extra_costs`."""
     drawn = Cost(
         lambda _checker, q, strength: strength * (q[..., 0] ** 2).sum(1),
         lambda _checker, q, strength: q * np.where(np.arange(q.shape[2]) == 0, 1 - strength, 1),
@@ -148,15 +148,15 @@ def test_a_further_cost_acts_between_the_compiled_ones(monkeypatch: pytest.Monke
     monkeypatch.setitem(globals(), "DRAWN", drawn)
     monkeypatch.setitem(COSTS, "drawn", Entry(f"{__name__}:DRAWN", "for tests"))
     q = random_motions(5)
-    guidance = CollisionGuidance(CROWDED, replace(NOTHING, further={"drawn": 0.5}))
+    guidance = CollisionGuidance(CROWDED, replace(NOTHING, extra_costs={"drawn": 0.5}))
     moved, _ = guidance(q, 3, prefix=2)
     np.testing.assert_allclose(moved[:, 2:-1, 0], q[:, 2:-1, 0] / 8, rtol=1e-5)
     np.testing.assert_array_equal(moved[:, [0, 1, -1]], q[:, [0, 1, -1]])
     assert (guidance.costs(moved)["drawn"] < guidance.costs(q)["drawn"]).all()
-    with pytest.raises(InputError, match="further names length; it has a setting, length"):
-        replace(NOTHING, further={"length": 0.5})
+    with pytest.raises(InputError, match="extra_costs names length; it has a setting, length"):
+        replace(NOTHING, extra_costs={"length": 0.5})
     with pytest.raises(InputError, match="unknown guidance cost 'lenght'"):
-        replace(NOTHING, further={"lenght": 0.5})
+        replace(NOTHING, extra_costs={"lenght": 0.5})
 
 
 def test_together_they_reach_a_free_and_smooth_path_that_none_reaches_alone() -> None:

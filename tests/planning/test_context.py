@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.core.types import Status
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.shared_tree.planner import SharedTreeRRTStar, SharedTreeSettings
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
@@ -31,7 +31,7 @@ def blocked() -> Problem:
 
 
 def call_on(scene: Scene) -> PlanningContext:
-    return PlanningContext("test", problem(scene), time_limit=10.0, seed=0)
+    return PlanningContext("test", problem(scene), PlanRequest(time_limit=10.0))
 
 
 def test_progress_falls_and_ends_with_the_returned_path() -> None:
@@ -54,7 +54,7 @@ def test_returned_path_keeps_the_time_at_which_it_was_found() -> None:
 
 
 def test_failure_tells_what_the_validator_refused() -> None:
-    context = PlanningContext("test", blocked(), time_limit=10.0, seed=0)
+    context = PlanningContext("test", blocked(), PlanRequest(time_limit=10.0))
     assert context.unsolved().refused == ""
     assert context.finish(np.stack([START, turned(1.2)]), "test") is None
     assert context.unsolved().refused == "scene_collision"
@@ -63,9 +63,9 @@ def test_failure_tells_what_the_validator_refused() -> None:
 
 
 def test_a_search_that_ended_is_told_from_one_that_ran_out_of_time() -> None:
-    ended = PlanningContext("test", blocked(), time_limit=10.0, seed=0).unsolved()
+    ended = PlanningContext("test", blocked(), PlanRequest(time_limit=10.0)).unsolved()
     assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
-    late = PlanningContext("test", blocked(), time_limit=1e-9, seed=0).unsolved()
+    late = PlanningContext("test", blocked(), PlanRequest(time_limit=1e-9)).unsolved()
     assert late.status is Status.TIMEOUT and "longer time limit" in late.reason
 
 

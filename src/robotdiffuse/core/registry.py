@@ -19,6 +19,8 @@ class Entry:
     """Name of its settings class in the same module; empty if it has none."""
     kind: str = ""
     """What entries of one table are told apart by, e.g. search, learned, hybrid for planners."""
+    supports: frozenset[str] = frozenset()
+    """What not every entry of a table supports, e.g. path constraints for planners."""
 
 
 Added = dict[str, dict[str, Entry]]

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import END_MARGIN, StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -64,7 +64,7 @@ class AORRTCSearch:
         problem = Problem(
             checker.robot, checker.scene, start.astype(np.float64), JointGoal(goals.astype(np.float64))
         )
-        context = PlanningContext("aorrtc", problem, NO_LIMIT, int(state[0] >> np.uint64(32)))
+        context = PlanningContext("aorrtc", problem, PlanRequest(NO_LIMIT, int(state[0] >> np.uint64(32))))
         has = checker.link_clearances(np.stack([start, *goals]).astype(np.float32)).min(axis=1, initial=1.0)
         self._distances = _falling(settings, (float(has[0]), float(has[1:].max())))
         search = SearchSettings(range=settings.range, resolution=settings.resolution)

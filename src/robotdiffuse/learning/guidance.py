@@ -18,7 +18,7 @@ Gauss-Newton step); a kernel spreads the pushes over the neighbouring waypoints,
 al., ICRA 2011). These two move one waypoint after the other towards its optimum between its neighbours.
 
 Each is a file in `learning.costs` and a line in its table. A new one says its step down itself, and acts
-where `further` gives it a strength; the steps of these five are compiled, in `guidance_kernel.descend`. The
+where `extra_costs` gives it a strength; the steps of these five are compiled, in `guidance_kernel.descend`. The
 cost of a problem's path constraints, `learning.costs.path_constraints`, comes with the problem.
 """
 
@@ -55,15 +55,15 @@ class GuidanceSettings(Settings, name="guidance"):
     """Share by which waypoints move towards the least accelerations after the pushes; 0: it has no cost."""
     length: Share = 0.2
     """Share by which waypoints move towards the middle of their neighbours after that; 0: it has no cost."""
-    further: dict[str, float] = field(default_factory=dict)
+    extra_costs: dict[str, float] = field(default_factory=dict)
     """Strengths of costs that are not of these, by name in `learning.costs.COSTS`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in self.further:
+        for name in self.extra_costs:
             if COSTS.load(name).step is None:
                 raise InputError(
-                    f"guidance.further names {name}; it has a setting, {COSTS.load(name).setting}"
+                    f"guidance.extra_costs names {name}; it has a setting, {COSTS.load(name).setting}"
                 )
 
 
@@ -78,7 +78,7 @@ class CollisionGuidance:
     ) -> None:
         """`of_problem`: costs that the problem brings along, by name; their strength is the longest push."""
         self.checker, self.settings = checker, settings or GuidanceSettings()
-        each = {name: (COSTS.load(name), strength) for name, strength in self.settings.further.items()}
+        each = {name: (COSTS.load(name), strength) for name, strength in self.settings.extra_costs.items()}
         self._further: dict[str, tuple[Cost, float]] = {
             **each,
             **{name: (cost, self.settings.push) for name, cost in of_problem.items()},

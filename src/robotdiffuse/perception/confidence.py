@@ -18,8 +18,8 @@ BY_RISK: dict[str, tuple[float, float]] = {
     "predicted": (3.48, -0.81),
     "as seen": (0.98, -0.14),
 }
-"""Where voxels were predicted, for motions of predicted assumptions and for those as seen: the log odds of a motion
-that sweeps a probability of 1, and how they change with its logarithm."""
+"""Where voxels were predicted, for motions of predicted assumptions and for those as seen: the log odds of a
+motion that sweeps a probability of 1, and how they change with its logarithm."""
 LEAST_RISK = 0.2
 """Summed probabilities below this count as this."""
 

@@ -10,11 +10,11 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.perception.assumptions import FINE, fine, voxels_in
+from robotdiffuse.perception.assumptions import FINE_VOXEL_SIZE, refined, voxels_in
 from robotdiffuse.perception.observed_volume import LOW, observe
 from robotdiffuse.perception.ray_caster import looking_at
-from robotdiffuse.perception.unknown_space import UnknownSpace
 from robotdiffuse.perception.visibility_kernel import seen_weights
+from robotdiffuse.planning.pipeline.unknown_space import unknown_space_of
 from robotdiffuse.problems.problem import PREDICTED, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
@@ -54,8 +54,8 @@ def next_view(
 
     `poses`: those that can be reached, T_base_camera each; None: `poses_around`. A voxel counts as seen as
     far as nothing is likely to be in the way: neither what was seen, nor what is predicted, nor the arm at
-    the problem's start. With another policy than `predicted`, each unknown voxel that is swept counts the same.
-    Raises InputError without views, without a motion and without poses.
+    the problem's start. With another policy than `predicted`, each unknown voxel that is swept counts the
+    same. Raises InputError without views, without a motion and without poses.
     """
     if not problem.views:
         raise InputError("next_view: the problem has no views; it is for scenes that cameras saw")
@@ -72,7 +72,7 @@ def next_view(
         from robotdiffuse.learning.completion import predict
 
         predicted = predict(volume)
-    crossed = UnknownSpace(problem, volume, predicted).crossed(result.path)
+    crossed = unknown_space_of(problem, volume, predicted).crossed(result.path)
     likely = crossed.voxels.astype(np.float32)
     if crossed.probability is not None:
         likely *= crossed.probability
@@ -80,7 +80,7 @@ def next_view(
     weights = likely[tuple(at.T)]
     if not len(at):
         return NextView(candidates[0], 1.0)
-    filled = fine(volume.occupied).astype(np.float32)
+    filled = refined(volume.occupied).astype(np.float32)
     if predicted is not None:
         np.maximum(filled, predicted, out=filled)
     filled[voxels_in(placed_spheres(problem.robot, problem.start).astype(np.float32))] = 1.0
@@ -93,7 +93,7 @@ def next_view(
         weights,
         filled,
         np.array(LOW, np.float32),
-        np.float32(FINE),
+        np.float32(FINE_VOXEL_SIZE),
     )
     best = int(seen.argmax())
     return NextView(candidates[best], float(seen[best] / weights.sum()))

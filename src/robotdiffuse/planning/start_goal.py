@@ -151,8 +151,8 @@ def retreat(
     """A configuration nearby that the covering spheres call free, down the gradient of the collision cost.
 
     For a start or goal that the exact meshes call free while the spheres, which stick out, do not. None if no
-    free configuration was found within 1 rad, or it does not keep the constraints. The validator decides on the
-    motion there.
+    free configuration was found within 1 rad, or it does not keep the constraints. The validator decides on
+    the motion there.
     """
     robot, at = checker.robot, q.copy()
     for _ in range(RETREAT_STEPS):
@@ -203,7 +203,7 @@ def _usable_goals(
         return goals
     held = [q for q in goals if _too_heavy(context, q) is None]
     if not held:
-        reason = f"the payload cannot be held at the goal: {_too_heavy(call, goals[0])}"
+        reason = f"the payload cannot be held at the goal: {_too_heavy(context, goals[0])}"
         return context.fail(Status.INVALID_GOAL, reason)
     return goals if len(held) == len(goals) else np.stack(held)
 

@@ -24,7 +24,7 @@ from robotdiffuse.learning.networks.mpnet import (
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_code
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -81,7 +81,7 @@ def planning(weights: str, problem: Problem, **changes: object) -> NeuralPlannin
     settings = replace(MPNetPlannerSettings(weights), **changes)
     checker = CollisionChecker(problem.robot, problem.scene)
     start_goal = StartGoal(checker, problem.start, np.array([RIGHT]))
-    context, rng = PlanningContext("mpnet", problem, 60.0, 0), np.random.default_rng(1)
+    context, rng = PlanningContext("mpnet", problem, PlanRequest(60.0)), np.random.default_rng(1)
     return NeuralPlanning(context, start_goal, network(), settings, rng)
 
 

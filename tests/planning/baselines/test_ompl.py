@@ -196,9 +196,9 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
 
     with monkeypatch.context() as patched:
         patched.setattr(planners, "motions_free", broken)
-        patched.setattr(planners.lanes, "free_many", broken)
+        patched.setattr(planners.lane_collision, "free_many", broken)
         # what surrounds the search asks the kernel as well
-        patched.setattr("robotdiffuse.planning.planner.usable_ends", FreeEnds)
+        patched.setattr("robotdiffuse.planning.attempt.usable_start_goal", FreeEnds)
         with pytest.raises(RuntimeError, match="broken kernel"):
             planner().plan(problem(RIGHT), time_limit=120.0)
     assert plan(planner, problem(RIGHT)).solved

@@ -190,7 +190,8 @@ def test_batches_have_their_share_of_the_work(monkeypatch):
 
 
 def test_a_candidate_that_the_validator_refuses_is_not_returned(planner, monkeypatch):
-    """The compiled check is not the validator: candidates through the ball are called free here, and refused."""
+    """The compiled check is not the validator: candidates through the ball are called free here, and
+    refused."""
 
     def through(self, _model, _checker, _code, start, goals, _rng):
         line = start + np.linspace(0, 1, 48)[:, None] * (goals[0] - start)

@@ -200,9 +200,9 @@ def test_a_short_limit_is_a_time_out() -> None:
 
 def test_one_slow_validation_does_not_take_later_calls_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """A first call that loads code validated for a second; calls of a tenth of that then ended at once."""
-    monkeypatch.setitem(context._finishing, "panda", 1.0)
+    monkeypatch.setitem(context._validation_seconds, "panda", 1.0)
     assert AORRTC().plan(AROUND, 0.3, until="limit").solved
-    assert context._finishing["panda"] < 1.0
+    assert context._validation_seconds["panda"] < 1.0
 
 
 def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:

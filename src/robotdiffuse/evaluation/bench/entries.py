@@ -7,8 +7,12 @@ from typing import Any
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
-from robotdiffuse.planning.context import Request
+from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
+
+
+CALL_ARGUMENTS = [field.name for field in fields(PlanRequest) if field.name not in ("time_limit", "seed")]
+"""Arguments of a planner's calls that a contestant may set; the bench sets the others."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +24,7 @@ class Contestant:
     weights: str | None = None
     """A folder; None: those that come with the package."""
     settings: tuple[str, ...] = ()
-    """NAME=VALUE, other than the defaults: of the planner, and of what its calls ask for (`Request`)."""
+    """NAME=VALUE, other than the defaults: of the planner, and of what its calls ask for (`PlanRequest`)."""
 
     @classmethod
     def of(cls, text: str) -> "Contestant":
@@ -52,7 +56,8 @@ class Contestant:
 
     def request(self) -> dict[str, Any]:
         """What its calls ask for: until, clearance, ..."""
-        return vars(Request().changed(text for text in self.settings if _of_call(text)))
+        request = PlanRequest().changed(text for text in self.settings if _of_call(text))
+        return {name: getattr(request, name) for name in CALL_ARGUMENTS}
 
     def load(self) -> Planner:
         """Raises InputError as `load_planner`, and for a planner that a process of its own cannot import."""
@@ -72,4 +77,4 @@ class Contestant:
 
 
 def _of_call(text: str) -> bool:
-    return text.partition("=")[0] in {field.name for field in fields(Request)}
+    return text.partition("=")[0] in CALL_ARGUMENTS

@@ -14,4 +14,4 @@ COSTS = Registry(
     },
 )
 """Values of type `cost.Cost`. These five are compiled and have a setting each; others are given their
-strength by name in `GuidanceSettings.further`."""
+strength by name in `GuidanceSettings.extra_costs`."""

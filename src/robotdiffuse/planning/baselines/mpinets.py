@@ -11,8 +11,8 @@ Differences from the paper, besides those of the network:
   policy goes on. For a pose the goals are configurations by inverse kinematics.
 - The paper has one roll-out. The repetitions, which cost its success nothing, use the time that all planners
   have. They are spread over the goals, the nearest first, and end where the arm collides.
-- Nothing is repaired or shortened. A motion that the validator refuses is not a result; where nothing better was
-  found, the first one is handed to it, so that the result says what was wrong.
+- Nothing is repaired or shortened. A motion that the validator refuses is not a result; where nothing better
+  was found, the first one is handed to it, so that the result says what was wrong.
 """
 
 from dataclasses import dataclass

@@ -60,8 +60,8 @@ class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
     hybrid_range: Positive = 1.0
     """Longest extension of a tree of RRT-Connect [rad, joint-space L2]."""
     resolution: Positive = 0.03
-    """No point of the arm moves further than this between two checks of a motion [m]; the validator's certificate
-    covers the rest, and after a path that it refuses it is half of that."""
+    """No point of the arm moves further than this between two checks of a motion [m]; the validator's
+    certificate covers the rest, and after a path that it refuses it is half of that."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
 

@@ -9,7 +9,8 @@ every state and every motion; those answer with the compiled kernel that `rrt_co
 *First-solution planners* (RRT, RRT-Connect, PRM) end with their first path, which OMPL's PathSimplifier then
 shortens as in its SimpleSetup and in MoveIt. *Anytime planners* (RRT*, Informed RRT*, BIT*, AORRTC) minimize
 joint-space length until time runs out, or until the path is as short as the straight line. Whenever a path is
-IMPROVEMENT shorter than the last, the validator looks at it, so that a late path that it refuses costs no plan.
+IMPROVEMENT shorter than the last, the validator looks at it, so that a late path that it refuses costs no
+plan.
 
 *Seeds.* OMPL has one source of seeds for the whole process, which is set anew for each search, so that a seed
 gives a path again as long as time does not run out (anytime planners mostly end when it does). The exception
@@ -62,8 +63,9 @@ SAME = 1e-6
 @dataclass(frozen=True)
 class OmplSettings(Settings, name="ompl"):
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of a motion [m]; the validator's certificate
-    covers the rest, and after a path that it refuses the search begins anew at half the distance."""
+    """No point of the arm moves further than this between two checks of a motion [m]; the validator's
+    certificate covers the rest, and after a path that it refuses the search begins anew at half the
+    distance."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m], as for rrt_connect."""
     range: Positive | None = None
@@ -289,7 +291,7 @@ class _Search:
         attempt: int,
     ) -> None:
         # OMPL hands a seed from this source to each generator that it makes from here on; 0 is none
-        ou.RNG.setSeed(int(np.random.SeedSequence([context.seed, attempt]).generate_state(1)[0]) or 1)
+        ou.RNG.setSeed(int(np.random.SeedSequence([context.request.seed, attempt]).generate_state(1)[0]) or 1)
         self._call, self._robot = context, context.problem.robot
         self._watch = _Watch(context)
         space = search_space(

@@ -9,15 +9,15 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.diffusion.hybrid import WAYPOINTS, RobotDiffuse
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.learned import nearest_goals
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import Problem
 
-TIME = 1.0
-"""Limit for finding configurations of the goal [s]."""
+TIME_LIMIT = 1.0
+"""For finding configurations of the goal [s]."""
 BETWEEN = 4
 """Clearances are measured so many times from one waypoint to the next."""
 
@@ -41,7 +41,7 @@ def draw_candidates(problem: Problem, seed: int = 0) -> Candidates:
     """
     planner = _planner()
     model = planner.model(problem.robot)
-    context = PlanningContext(planner.name, problem, TIME, seed)
+    context = PlanningContext(planner.name, problem, PlanRequest(TIME_LIMIT, seed))
     start_goal = usable_start_goal(context)
     if isinstance(start_goal, PlanResult):
         raise InputError(f"nothing can be drawn: {start_goal.reason}")

@@ -1,10 +1,10 @@
 """The paper's method and nothing else: encoder, sampling, guidance.
 
 The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
-collision guidance; every sample goes to the validator as it is, and the shortest valid one is the answer. Where
-none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line, no
-search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance solve.
-Around it, `planning.diffusion.hybrid` puts what makes a motion dependable.
+collision guidance; every sample goes to the validator as it is, and the shortest valid one is the answer.
+Where none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line,
+no search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance
+solve. Around it, `planning.diffusion.hybrid` puts what makes a motion dependable.
 
 Path constraints are a further cost of guidance, and each waypoint of a sample is projected onto them before
 the validator, who proves them between the waypoints too, is asked. The network has never seen any.
@@ -32,9 +32,9 @@ from robotdiffuse.learning.costs.path_constraints import path_constraints
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.samplers import SAMPLERS
 from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.planning import PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
-from robotdiffuse.planning.planner import CONSTRAINTS
 from robotdiffuse.planning.search.constrained import SHARE, corner_kept
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
@@ -157,8 +157,8 @@ def encode(
 def _projected(
     constraints: PathConstraints, path: Float[ndarray, "waypoints dof"]
 ) -> Float[ndarray, "waypoints dof"]:
-    """The path with all waypoints between its ends on what the constraints leave; as it is, for the validator to
-    refuse, where one of them leads nowhere."""
+    """The path with all waypoints between its ends on what the constraints leave; as it is, for the validator
+    to refuse, where one of them leads nowhere."""
     between = constraints.projected(path[1:-1], SHARE)
     return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
 
@@ -168,7 +168,7 @@ class Diffusion(ModelSampler[DiffusionSettings]):
 
     name = "diffusion"
     settings_class = DiffusionSettings
-    keeps = frozenset({CONSTRAINTS})
+    supports = frozenset({PATH_CONSTRAINTS})
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -177,7 +177,7 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         code = encode(model, start_goal.checker, self.settings.points, rng)
         names, constraints = context.problem.robot.joint_names, context.validator.constraints
         costs = {} if constraints is None else {"path_constraints": path_constraints(constraints, SHARE)}
-        every, valid, until = list[Path](), list[Path](), context.time_limit
+        every, valid, until = list[Path](), list[Path](), context.request.time_limit
         while not every or context.elapsed < until:
             batch = self.draw(
                 model,
@@ -196,10 +196,11 @@ class Diffusion(ModelSampler[DiffusionSettings]):
             for path in passed:
                 context.improved(path.length)
             if passed and not valid:
-                until = min(context.elapsed + self.settings.optimize_time, context.time_limit)
+                until = min(context.elapsed + self.settings.optimize_time, context.request.time_limit)
             every, valid = every + paths, valid + passed
         reason = f"{len(valid)} of {len(every)} samples of the network are valid"
-        # where none is, the validator is asked about one once more, so that the result says what is wrong with it
+        # where none is, the validator is asked about one once more, so that the result says what is wrong
+        # with it
         for path in sorted(valid or every[-1:], key=lambda path: path.length):
             how = f"solved by network: {reason}"
             result = context.finish(path.positions, "network", how, keeps=partial(corner_kept, constraints))

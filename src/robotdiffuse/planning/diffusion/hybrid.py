@@ -33,11 +33,11 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.diffusion.diffusion import ModelSampler, SamplingSettings, encode
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.learned import nearest_goals
-from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS
 from robotdiffuse.planning.search.anytime import AnytimeSearch, anytime
 from robotdiffuse.planning.search.aorrtc import AORRTC, STEP, AORRTCSettings
 from robotdiffuse.planning.start_goal import StartGoal
@@ -65,7 +65,7 @@ class RobotDiffuseSettings(SamplingSettings, name="robotdiffuse"):
     benchmarks/results/guidance.txt."""
     refinement_steps: Natural = 40
     """Most gradient steps on the sampled trajectories that still collide."""
-    shortened: Count = 6
+    max_simplified: Count = 6
     """Most candidates of a batch that are simplified."""
     network_share: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
     """Share of the work that goes to batches, of the network or of smooth noise; a batch counts as BATCH_WORK
@@ -78,7 +78,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
     name = "robotdiffuse"
     settings_class = RobotDiffuseSettings
-    keeps = frozenset({CONSTRAINTS, CLEARANCE})
+    supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
 
     def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
         """Raises InputError if the folder that the settings name holds no weights."""
@@ -91,8 +91,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         """What they took of late [s]: the last one, or more if those before did."""
 
     def prepare(self, robot: Robot) -> None:
-        """See `planning.planner.Planner`: given weights. Those of the package are loaded in a call's own time,
-        if it has LOAD_SECONDS left for that, else by `warm_up` and `load_wanted`."""
+        """See `planning.planner.Planner`: given weights. Those of the package are loaded in a call's own
+        time, if it has LOAD_SECONDS left for that, else by `warm_up` and `load_wanted`."""
         if self.settings.weights is not None:
             self._load(robot)
 
@@ -102,8 +102,8 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         if self.weights(robot) in self.wanted:
             self._load(robot)
 
-    def _load_rarer(self, robot: Robot) -> None:
-        super()._load_rarer(robot)
+    def _load_rarely_needed(self, robot: Robot) -> None:
+        super()._load_rarely_needed(robot)
         self._load(robot)
 
     def weights(self, robot: Robot) -> FilePath | None:
@@ -209,7 +209,7 @@ class _Batches:
 
     def _take(self, q: Float[ndarray, "count waypoints dof"], stage: str) -> bool:
         """Offer the shortest ones that are free in the space of the search; whether there were any."""
-        space, most = self.search.space, self.planner.settings.shortened
+        space, most = self.search.space, self.planner.settings.max_simplified
         ordered = sorted(np.ascontiguousarray(q, np.float32), key=path_length)
         paths = list(islice((path for path in ordered if motions_free(space, path).all()), most))
         for path in paths:

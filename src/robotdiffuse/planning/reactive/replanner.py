@@ -1,11 +1,11 @@
 """Reacting to obstacles of which only the position now and a greatest speed are known, at 50 Hz.
 
 **What is promised.** Whatever `Replanner.step` returns is a motion that ends at rest, and that is certified
-until it rests: no point of the arm comes near a place where an obstacle can be by then, wherever it goes
-from where it was last seen, no faster than its greatest speed (`collision/moving_obstacles.py`); the path itself passed
-the validator among what stands still and of the arm with itself. When no such motion goes on, the last one is
-kept, which was certified too. An arm at rest may be run into: what comes is told to be no slower than it
-likes, and may corner any arm. The loop gives way before that where it sees it coming.
+until it rests: no point of the arm comes near a place where an obstacle can be by then, wherever it goes from
+where it was last seen, no faster than its greatest speed (`collision/moving_obstacles.py`); the path itself
+passed the validator among what stands still and of the arm with itself. When no such motion goes on, the last
+one is kept, which was certified too. An arm at rest may be run into: what comes is told to be no slower than
+it likes, and may corner any arm. The loop gives way before that where it sees it coming.
 
 **What is guessed.** Which way to go is settled by where the obstacles will be if they keep the velocity that
 was last seen. Nothing that is promised rests on it.
@@ -31,7 +31,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import inverse, rotation_angle, transform
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.reactive.timed_path import Course, Speeds
 from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
@@ -68,16 +68,16 @@ class ReplannerSettings(Settings, name="replanner"):
     """Kept to where the obstacles can be [m], by the covering spheres."""
     horizon: Positive = 2.5
     """How far ahead guesses go [s]."""
-    hold: Positive = 1.0
+    rest_time: Positive = 1.0
     """Where the arm stops it is to be left alone for so long, by the guess [s]."""
-    berth: NotNegative = 0.2
+    safety_margin: NotNegative = 0.2
     """Guesses keep away from obstacles as far as these can get at their greatest speed in so long [s], where
     that is possible: nearer to one the arm has hardly any motion that is certified to stop in time."""
     iterations: Count = 600
     """Of a search for a path; there is at most one a step."""
-    dodges: Count = 24
+    evasions: Count = 24
     """Directions in which a way out is looked for, when the arm rests where something comes."""
-    dodge: Positive = 0.8
+    evasion_radius: Positive = 0.8
     """Length of the ways out [rad, joint-space L2]."""
     sample_time: Annotated[float, Bound(least=1e-3, most=0.1)] = 0.01
     """Time between the rows of what a step returns [s]."""
@@ -159,7 +159,7 @@ class Replanner:
 
     def _begun(self) -> tuple[Course, Float[ndarray, "k dof"], Space]:
         """The first course, the configurations of the goal, and what motions are checked in."""
-        context = PlanningContext("replanner", self._still, FIRST_TIME, self.seed)
+        context = PlanningContext("replanner", self._still, PlanRequest(FIRST_TIME, self.seed))
         start_goal = usable_start_goal(context)
         if isinstance(start_goal, PlanResult):
             raise InputError(f"the replanner cannot begin: {start_goal.reason}")
@@ -191,7 +191,7 @@ class Replanner:
         here = self._course.at(float(self._left.s[0]))
         guess = _Ahead(self._robot, moving, self._now)
         for share in BERTHS:
-            wide = guess.wider(share * self.settings.berth * speeds)
+            wide = guess.wider(share * self.settings.safety_margin * speeds)
             if wide.comes(here, self._now, self.settings.period) is None:
                 return wide
         return guess
@@ -214,7 +214,7 @@ class Replanner:
             found.rows(found.onwards(0.0, 0.0), COARSE_TIME), rest_time, settings
         ):
             self._next = found
-        elif not moving and guess.comes(rest, rest_time, settings.hold) is not None:
+        elif not moving and guess.comes(rest, rest_time, settings.rest_time) is not None:
             self._next = self._dodge(guess, rest, rest_time) or self._next
         return clear
 
@@ -242,8 +242,9 @@ class Replanner:
         if not usable[0] or not usable[1:].any():
             return None
         chosen = np.array([root for root, free in zip(roots, usable[1:], strict=True) if free])
-        request = Request(clearance=float(guess.berth.min()) + settings.clearance)
-        context = PlanningContext("replanner", self._still, FIRST_TIME, self.seed + self._searches, request)
+        clearance = float(guess.margin.min()) + settings.clearance
+        request = PlanRequest(FIRST_TIME, self.seed + self._searches, clearance=clearance)
+        context = PlanningContext("replanner", self._still, request)
         search = AnytimeSearch(
             context, StartGoal(checker, start, chosen), SearchSettings(), "replanner", bounded=False
         )
@@ -256,8 +257,8 @@ class Replanner:
     def _dodge(self, guess: "_Ahead", rest: Float[ndarray, "dof"], time: float) -> Course | None:
         """A straight way to where nothing comes for longest, by the guess; None where that is here."""
         settings, robot = self.settings, self._robot
-        ways = self._rng.normal(size=(settings.dodges, robot.dof))
-        ways *= settings.dodge / np.linalg.norm(ways, axis=1, keepdims=True)
+        ways = self._rng.normal(size=(settings.evasions, robot.dof))
+        ways *= settings.evasion_radius / np.linalg.norm(ways, axis=1, keepdims=True)
         start_goal = np.clip(rest + ways, robot.lower, robot.upper)
         best, best_time = None, guess.comes(rest, time, settings.horizon) or np.inf
         for end in start_goal:
@@ -293,7 +294,7 @@ class Replanner:
             further = course.on_then_rest(s, speed, periods * settings.period)
             motion = course.rows(further, settings.sample_time)
             rests = self._since + motion.duration
-            left_alone = clear or guess.comes(motion.positions[-1], rests, settings.hold) is None
+            left_alone = clear or guess.comes(motion.positions[-1], rests, settings.rest_time) is None
             certified = grown.near(motion, self._since, settings.clearance) is None
             if certified and (left_alone or not course.to_goal):
                 self._left = further
@@ -350,13 +351,13 @@ class _Ahead:
     def __init__(self, robot: Robot, moving: list[MovingObstacle], since: float) -> None:
         self._moving, self._since = moving, since
         self._collision = MovingCollision(robot, moving, 0.0, 0.0)
-        self.berth = np.zeros(len(moving))
+        self.margin = np.zeros(len(moving))
 
-    def wider(self, berth: Float[ndarray, "obstacles"]) -> "_Ahead":
+    def wider(self, margin: Float[ndarray, "obstacles"]) -> "_Ahead":
         """The same, each obstacle larger by so much [m]."""
         other = copy(self)
-        other.berth = self.berth + berth
-        other._collision = self._collision.wider(berth)
+        other.margin = self.margin + margin
+        other._collision = self._collision.wider(margin)
         return other
 
     def shapes(self, time: float) -> list[Shape]:
@@ -383,5 +384,5 @@ class _Ahead:
         """Whether nothing comes to the arm up to the horizon, or until it has rested at the end for a bit."""
         soon = max(int(np.searchsorted(motion.times, settings.horizon)), 1)
         times = motion.times[:soon] + begins
-        hold = settings.hold if soon == len(motion.times) else 0.0
+        hold = settings.rest_time if soon == len(motion.times) else 0.0
         return self.comes_to(motion.positions[:soon], times, hold + 1e-3) is None

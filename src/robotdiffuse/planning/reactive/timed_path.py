@@ -68,7 +68,8 @@ class Course:
     def certified(
         robot: Robot, validator: Verifier, waypoints: Float[ndarray, "n dof"], to_goal: bool
     ) -> "Course | None":
-        """The course through waypoints; None where the validator does not find them free, or all are the same."""
+        """The course through waypoints; None where the validator does not find them free, or all are the
+        same."""
         path = Path(robot.joint_names, waypoints)
         if path.length < APART or not validator.collision_free(path):
             return None

@@ -31,8 +31,8 @@ LOOSER = 1.15
 """The bound of rounds, times the length of the best path: what trees hold is not simplified yet, and where it
 is tight they hold no path as short as a simplified one that goes the long way round."""
 VALIDATE_AFTER = 4_000
-"""Iterations between two shorter paths that are validated on the way: at the end of the time, what the validator
-refuses would cost all that was found since the last path that passed."""
+"""Iterations between two shorter paths that are validated on the way: at the end of the time, what the
+validator refuses would cost all that was found since the last path that passed."""
 SLICE = 100
 """Iterations between two looks at the clock."""
 NEAR = 1.05
@@ -48,8 +48,8 @@ class SearchSettings(Settings):
     range: Positive = 0.7
     """Longest extension of a tree [rad, joint-space L2]: longer ones are in vain more often."""
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of a motion [m]; the validator's certificate
-    covers the rest, and after a path that it refuses the search looks twice as closely."""
+    """No point of the arm moves further than this between two checks of a motion [m]; the validator's
+    certificate covers the rest, and after a path that it refuses the search looks twice as closely."""
     smoothings: Natural = 1
     """Rounds of smoothing of each path that is found."""
     tightenings: Natural = 200
@@ -105,7 +105,7 @@ class AnytimeSearch:
         self._lengths = list[tuple[int, float]]()
         self._loose = False
         """Whether the best path is the first one, which is tightened once there is time to improve it."""
-        self._state = random_state(context.seed)
+        self._state = random_state(context.request.seed)
         self._round: _Round | None = None
         self._grown: rrt_kernel.Trees | None = None
         """Those that found the shortest path of the search, or that grow."""
@@ -205,8 +205,8 @@ class AnytimeSearch:
         return bool(motions_free(self.space, rows).all())
 
     def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
-        """Look twice as closely from now on, since the validator refused the best path; in its place is the last
-        that it accepted."""
+        """Look twice as closely from now on, since the validator refused the best path; in its place is the
+        last that it accepted."""
         self.settings = replace(self.settings, resolution=finer(self.settings.resolution))
         self.best = accepted
         self.length = np.float32(np.inf if accepted is None else path_length(accepted))
@@ -272,14 +272,14 @@ class Answers:
         self._validated_at = 0
 
     def due(self, search: AnytimeSearch) -> bool:
-        """Whether a path is to be validated before the search goes on: the first one, and then shorter ones, now
-        and then."""
+        """Whether a path is to be validated before the search goes on: the first one, and then shorter ones,
+        now and then."""
         rested = search.work >= self._validated_at + VALIDATE_AFTER
         return self.best is None or (rested and search.best is not self._path)
 
     def take(self, search: AnytimeSearch) -> bool:
-        """Whether the best path of the search passes the validator; if not, the search goes on from the last that
-        did."""
+        """Whether the best path of the search passes the validator; if not, the search goes on from the last
+        that did."""
         assert search.best is not None
         self._validated_at = search.work
         if search.best is self._path:
@@ -315,12 +315,12 @@ def anytime(
     """
 
     def ended() -> bool:
-        done = context.until == FIRST or search.shortest or context.remaining <= 0
-        return done or (context.until == SHORT and not pays())
+        done = context.request.until == FIRST or search.shortest or context.remaining <= 0
+        return done or (context.request.until == SHORT and not pays())
 
     answers = Answers(context, start_goal)
     while search.first(context.search_until, help_out):
-        if ended() or (context.ample and answers.due(search)):
+        if ended() or (context.validates_early and answers.due(search)):
             if answers.take(search) and ended():
                 break
             if answers.best is None and context.remaining <= 0:

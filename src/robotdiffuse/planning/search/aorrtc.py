@@ -9,8 +9,9 @@ from typing import Annotated
 
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS, Planner
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, anytime
 from robotdiffuse.planning.start_goal import StartGoal
 
@@ -31,7 +32,7 @@ class AORRTC(Planner[AORRTCSettings]):
 
     name = "aorrtc"
     settings_class = AORRTCSettings
-    keeps = frozenset({CONSTRAINTS, CLEARANCE})
+    supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS, Planner
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.search.anytime import SLICE, AnytimeSearch, SearchSettings, anytime
 from robotdiffuse.planning.start_goal import StartGoal
 
@@ -25,7 +26,7 @@ class RRTConnect(Planner[RRTConnectSettings]):
 
     name = "rrt_connect"
     settings_class = RRTConnectSettings
-    keeps = frozenset({CONSTRAINTS, CLEARANCE})
+    supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""

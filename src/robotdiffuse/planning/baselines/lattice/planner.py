@@ -66,8 +66,8 @@ class LatticeSettings(Settings):
     max_nodes: Annotated[int, Bound(least=1.0, below=2.0**31 - 1)] = 2_000_000
     """Most nodes that are kept; some 60 to 80 bytes each, and more with `joints_per_move`."""
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of an edge [m]; a path that the validator
-    refuses is searched again at half the distance."""
+    """No point of the arm moves further than this between two checks of an edge [m]; a path that the
+    validator refuses is searched again at half the distance."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
 
@@ -379,8 +379,8 @@ class _LatticePlanner(Planner[Own]):
             if path is None:
                 status = Status.TIMEOUT if outcome is Outcome.GOING else Status.NO_PATH
                 return context.fail(status, _reason(outcome, settings, search))
-            done = f"solved by {context.planner}: {search.expansions} expansions"
-            result = context.finish(start_goal.complete(path), context.planner, reason=done)
+            done = f"solved by {context.planner_name}: {search.expansions} expansions"
+            result = context.finish(start_goal.complete(path), context.planner_name, reason=done)
             if result is not None:
                 return result
             if settings.resolution <= FINEST:

@@ -225,7 +225,7 @@ class SharedTreeRRTStar(Planner[SharedTreeSettings]):
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
         for settings, attempt in ever_finer(context, self.settings):
-            state = random_state(context.seed, attempt)
+            state = random_state(context.request.seed, attempt)
             search = SharedTreeSearch(start_goal.checker, *start_goal.rows(), settings, state)
 
             def out_of_time(search: SharedTreeSearch = search) -> bool:
