@@ -82,7 +82,7 @@ class AORRTCSearch:
         while search.best is None and search.work < most and not stop():
             search.first(inf, work=STEP)
         while search.best is not None and not (search.shortest or stop()):
-            if not search.pays(settings.gain, settings.patience):
+            if not search.improves(settings.gain, settings.patience):
                 break
             search.improve(inf, STEP)
         if search.best is not None:

@@ -23,7 +23,7 @@ from robotdiffuse.planning.diffusion.hybrid import (
     _Batches,
     unlearned_starts,
 )
-from robotdiffuse.planning.search.anytime import SLICE, AnytimeSearch
+from robotdiffuse.planning.search.anytime import CLOCK_INTERVAL, AnytimeSearch
 from robotdiffuse.planning.search.aorrtc import AORRTCSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
@@ -51,9 +51,9 @@ def no_search(monkeypatch):
     """Search counts its iterations and finds nothing, so that the network's batches are the only help."""
 
     def idle(self):
-        self.work, self._tried = self.work + SLICE, self._tried + SLICE
+        self.work, self._tried = self.work + CLOCK_INTERVAL, self._tried + CLOCK_INTERVAL
 
-    monkeypatch.setattr(AnytimeSearch, "_slice", idle)
+    monkeypatch.setattr(AnytimeSearch, "_iterate", idle)
 
 
 def test_the_network_solves_and_the_validator_agrees(planner, no_search):
@@ -246,13 +246,13 @@ def test_smooth_noise_shortens_and_the_validator_agrees(monkeypatch):
     """Search finds one long way round and then nothing."""
 
     def detour(self):
-        self.work, self._tried = self.work + SLICE, self._tried + SLICE
+        self.work, self._tried = self.work + CLOCK_INTERVAL, self._tried + CLOCK_INTERVAL
         if self.best is None:
             up = np.array([0.0, -1.0, 0.0, -1.9, 0.0, 2.2, 0.785])
             path = np.array([LEFT, up, RIGHT], np.float32)
             self._take(path, float(path_length(path)), "aorrtc")
 
-    monkeypatch.setattr(AnytimeSearch, "_slice", detour)
+    monkeypatch.setattr(AnytimeSearch, "_iterate", detour)
     settings = RobotDiffuseSettings(search=AORRTCSettings(patience=5 * BATCH_WORK))
     result = RobotDiffuse(settings).plan(STRANGER, time_limit=10.0)
     assert result.stage == "smooth_noise" and result.path is not None and verify(STRANGER, result.path).valid

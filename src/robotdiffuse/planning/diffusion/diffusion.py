@@ -1,16 +1,16 @@
-"""The paper's method and nothing else: encoder, sampling, guidance.
+"""The paper's method alone: encoder, sampling, guidance.
 
 The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
 collision guidance; every sample goes to the validator as it is, and the shortest valid one is the answer.
 Where none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line,
 no search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance
-solve. Around it, `planning.diffusion.hybrid` puts what makes a motion dependable.
+solve. The hybrid planner (`planning.diffusion.hybrid`) surrounds it with a search.
 
-Path constraints are a further cost of guidance, and each waypoint of a sample is projected onto them before
-the validator, who proves them between the waypoints too, is asked. The network has never seen any.
+Path constraints are one more cost of guidance, and each waypoint of a sample is projected onto them before
+validation, which proves them between the waypoints too. The network was trained without constraints.
 
-Unless the settings say otherwise, the weights are used with the sampler and the steps that they name, and
-without guidance this is the network alone: `guidance_steps` 0.
+The weights name the sampler and the number of steps, unless the settings do. With `guidance_steps` 0 the
+network runs without guidance.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ from robotdiffuse.learning.weights_registry import weights_for
 from robotdiffuse.planning import PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
-from robotdiffuse.planning.search.constrained import SHARE, corner_kept
+from robotdiffuse.planning.search.constrained import TOLERANCE_FRACTION, corner_kept
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.robots.robot import Robot
@@ -47,12 +47,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SamplingSettings(LearnedSettings):
-    """How batches of trajectories are drawn from a trained model."""
+    """Settings for drawing batches of trajectories from a trained model."""
 
     samples: Count = 16
     """Trajectories per batch."""
     sampling_steps: Count | None = None
-    """Calls of the denoiser per batch; None: as many as the weights name."""
+    """Calls of the denoiser per batch; None: as the weights name."""
     sampler: Annotated[str, OneOf(SAMPLERS)] | None = None
     """Name in `learning.samplers.SAMPLERS`; None: the one that the weights name."""
     eta: Share = 0.0
@@ -60,27 +60,26 @@ class SamplingSettings(LearnedSettings):
     guidance_steps: Natural = 8
     """Gradient steps at each guided denoising step."""
     guided_share: Share = 0.5
-    """Share of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
+    """Part of the denoising steps that are guided, the last ones: 0 none, 1 all (the paper's)."""
     points: Count = 320
-    """Points of the cloud that the encoder sees (paper: 1,400), unless it wants clouds of its own size."""
+    """Points of the cloud for the encoder (paper: 1,400), unless the encoder has a fixed size."""
     guidance: GuidanceSettings = field(default_factory=GuidanceSettings)
 
 
 @dataclass(frozen=True)
 class DiffusionSettings(SamplingSettings, name="diffusion"):
     guidance_scale: float = 1.0
-    """Of classifier-free guidance: 1 is the network's prediction itself, more follows the condition further,
-    0 hides it. Other than 1 needs weights that were trained with a condition_drop above 0."""
+    """Scale of classifier-free guidance: 1 is the network's own prediction, more follows the condition more
+    strongly, 0 ignores it. Values other than 1 need weights trained with a condition_drop above 0."""
     optimize_time: NotNegative = 0.0
-    """Time in which further batches are drawn after the first that has a valid sample [s]; the shortest of
-    all is the answer."""
+    """Time for more batches after the first one with a valid sample [s]; the shortest of all is returned."""
 
 
-Own = TypeVar("Own", bound=SamplingSettings)
+SamplerSettings = TypeVar("SamplerSettings", bound=SamplingSettings)
 
 
-class ModelSampler(LearnedPlanner[Own]):
-    """What planners around the diffusion model share: to load it, and to draw batches by the settings."""
+class ModelSampler(LearnedPlanner[SamplerSettings]):
+    """Base of the planners that use the diffusion model: loads it, and draws batches by the settings."""
 
     network_name = "model"
 
@@ -105,12 +104,12 @@ class ModelSampler(LearnedPlanner[Own]):
         of_problem: Mapping[str, Cost] = MappingProxyType({}),
         guidance_scale: float = 1.0,
     ) -> Float[ndarray, "count waypoints dof"]:
-        """A batch of samples under guidance, shared out among the nearest goals.
+        """A batch of samples under guidance, divided among the nearest goals.
 
-        code: as by `encode`; None: hidden, as all of the condition, from weights that can do without it.
-        clearances: what the model is told of the obstacles; None: what is true.
-        guidance_scale: of classifier-free guidance, see `MotionModel.denoise_guided`.
-        of_problem: as for `CollisionGuidance`.
+        code: the scene, as by `encode`; None: the condition is hidden, for weights that allow it.
+        clearances: the model's clearance inputs; None: the true ones of the checker's scene.
+        guidance_scale: scale of classifier-free guidance, see `MotionModel.denoise_guided`.
+        of_problem: costs of the problem, as for `CollisionGuidance`.
         """
         from robotdiffuse.learning.clearance_features import link_clearances
 
@@ -146,20 +145,20 @@ class ModelSampler(LearnedPlanner[Own]):
 def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
-    """z of a scene: its point cloud through the frozen encoder; of so many points, unless the encoder wants
-    clouds of its own size."""
-    assert model.encoder is not None  # a prior is no network of these planners
-    told = model.encoder.settings
-    count = points if model.encoder.any_size else told.cloud
-    return model.encode(sample_surface(checker.scene, count, rng, told.region), rng)
+    """The encoding z of a scene: its point cloud of `points` points through the frozen encoder, unless the
+    encoder has a fixed size."""
+    assert model.encoder is not None  # unconditional priors are not used by these planners
+    of_encoder = model.encoder.settings
+    count = points if model.encoder.any_size else of_encoder.cloud
+    return model.encode(sample_surface(checker.scene, count, rng, of_encoder.region), rng)
 
 
 def _projected(
     constraints: PathConstraints, path: Float[ndarray, "waypoints dof"]
 ) -> Float[ndarray, "waypoints dof"]:
-    """The path with all waypoints between its ends on what the constraints leave; as it is, for the validator
-    to refuse, where one of them leads nowhere."""
-    between = constraints.projected(path[1:-1], SHARE)
+    """The path with its inner waypoints projected onto the constraints; the path itself, for the validator to
+    refuse, if the projection of one fails."""
+    between = constraints.projected(path[1:-1], TOLERANCE_FRACTION)
     return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
 
 
@@ -176,7 +175,11 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         start, goals = start_goal.rows()
         code = encode(model, start_goal.checker, self.settings.points, rng)
         names, constraints = context.problem.robot.joint_names, context.validator.constraints
-        costs = {} if constraints is None else {"path_constraints": path_constraints(constraints, SHARE)}
+        costs = (
+            {}
+            if constraints is None
+            else {"path_constraints": path_constraints(constraints, TOLERANCE_FRACTION)}
+        )
         every, valid, until = list[Path](), list[Path](), context.request.time_limit
         while not every or context.elapsed < until:
             batch = self.draw(
