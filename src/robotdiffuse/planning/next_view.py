@@ -42,20 +42,21 @@ class NextView(Value):
 def poses_around() -> list[Float[ndarray, "4 4"]]:
     """Camera poses around the base, looking at the arm."""
     angles = 2 * np.pi * np.arange(POSES_PER_RING) / POSES_PER_RING
-    places = [(RING_RADIUS * np.cos(a), RING_RADIUS * np.sin(a), height) for height in RING_HEIGHTS for a in angles]
+    ring = RING_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+    places = [(x, y, height) for height in RING_HEIGHTS for x, y in ring]
     return [looking_at(np.array(place), np.array(TARGET)) for place in places]
 
 
 def next_view(
     problem: Problem, result: PlanResult, poses: Sequence[Float[ndarray, "4 4"]] | None = None
 ) -> NextView:
-        """The pose from which a camera like that of the first view sees most of the probability that the motion of a
-    result sweeps.
+    """The pose from which a camera like that of the first view sees most of the probability that the motion
+    of a result sweeps.
 
     poses: camera poses to choose from, T_base_camera each; None: `poses_around`.
 
-    A voxel counts by the chance that nothing hides it: neither what was seen, nor what is predicted, nor the arm at
-    the problem's start. With a policy other than "predicted", all swept unknown voxels count the same.
+    A voxel counts by the chance that nothing hides it: neither what was seen, nor what is predicted, nor the
+    arm at the problem's start. With a policy other than "predicted", all swept unknown voxels count the same.
 
     Raises InputError without views, without a motion and without poses.
     """

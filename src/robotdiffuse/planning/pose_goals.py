@@ -23,10 +23,11 @@ SAMPLED_POSE_SETTINGS = InverseKinematicsSettings(max_rounds=2, patience=1)
 CONSTRAINED_SETTINGS = InverseKinematicsSettings(max_rounds=8, patience=2)
 """Under path constraints, which no configuration may keep; and for each of several poses."""
 TOLERANCE_FRACTION, MIN_HALF_BOX = 0.9, 2e-4
-"""Part of the tolerances that projected goals keep; smallest half edge of the box that they are kept in [m]."""
+"""Part of the tolerances that projected goals keep; smallest half edge of the box that they are kept in
+[m]."""
 COMBINATIONS, MAX_ROUNDS, PATIENCE = 64, 8, 2
-"""For several poses: combinations of the configurations of each that are tried in a round, most rounds, and most
-rounds in a row without a new configuration."""
+"""For several poses: combinations of the configurations of each that are tried in a round, most rounds, and
+most rounds in a row without a new configuration."""
 MIN_DIFFERENCE = 0.1
 """Configurations for several poses differ by more than this in at least one joint [rad] or [m]."""
 
@@ -82,8 +83,8 @@ def _with_constraints(
     rng: np.random.Generator,
     accept: Accept | None,
 ) -> Float[ndarray, "k dof"]:
-    """`pose_configurations` under path constraints: for a pose with tolerances, configurations are projected onto the
-    constraints, and kept if they are still within the tolerances."""
+    """`pose_configurations` under path constraints: for a pose with tolerances, configurations are projected
+    onto the constraints, and kept if they are still within the tolerances."""
     found = np.zeros((0, problem.robot.dof))
 
     def keeps(q: ndarray) -> ndarray:
@@ -143,8 +144,8 @@ def _at_poses(
 ) -> Float[ndarray, "k dof"]:
     """Configurations with all links exactly at their poses, by combining configurations for each pose alone.
 
-    That is enough for arms that share no joint. Where they share joints, a combination takes these from one of the
-    poses, and Newton steps for all poses and constraints together start from there.
+    That is enough for arms that share no joint. Where they share joints, a combination takes these from one
+    of the poses, and Newton steps for all poses and constraints together start from there.
     """
     robot, start = problem.robot, problem.start
     each = [

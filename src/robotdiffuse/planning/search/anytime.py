@@ -20,15 +20,18 @@ from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.simplification import simplify, tighten
 
 MIN_CLEARANCE = 0.002
-"""Clearance that is tried even if none is requested [m]: telling contact from near contact is costly, and paths are hardly longer."""
+"""Clearance that is tried even if none is requested [m]: telling contact from near contact is costly, and
+paths are hardly longer."""
 ITERATIONS_PER_CLEARANCE = 400
 """Iterations at a clearance before the next lower one is tried."""
 FALLBACK_INTERVAL = 8_000
 """Iterations without a path between two calls of the fallback."""
 BOUND_FACTOR = 1.15
-"""The length bound of a round is this factor of the best length: unsimplified tree paths are longer than simplified ones, so with a tight bound the trees would miss shorter ways than a long detour."""
+"""The length bound of a round is this factor of the best length: unsimplified tree paths are longer than
+simplified ones, so with a tight bound the trees would miss shorter ways than a long detour."""
 VALIDATION_INTERVAL = 4_000
-"""Iterations between two validations of shorter paths. Validating only at the end could lose everything found since the last valid path."""
+"""Iterations between two validations of shorter paths. Validating only at the end could lose everything found
+since the last valid path."""
 CLOCK_INTERVAL = 100
 """Iterations between two readings of the clock."""
 TIGHTENING_FACTOR = 1.05
@@ -156,8 +159,8 @@ class AnytimeSearch:
         return self.best is not None
 
     def improve(self, until: float, work: float = np.inf) -> None:
-        """Search for shorter paths until `until` [s since the call], for at most `work` more iterations, or until
-        the path is optimal."""
+        """Search for shorter paths until `until` [s since the call], for at most `work` more iterations, or
+        until the path is optimal."""
         enough = self.work + work
         if self._untightened and self.best is not None:
             self.offer(self.best, self.stage)
@@ -174,8 +177,8 @@ class AnytimeSearch:
         return bool(half[-1] - self.length >= gain * half[-1])
 
     def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
-        """Simplify a path from the start to a goal, free in `space`, and keep it if it is the shortest so far;
-        returns whether it was."""
+        """Simplify a path from the start to a goal, free in `space`, and keep it if it is the shortest so
+        far; returns whether it was."""
         path = for_kernels(path, np.float32)
         settings = self.settings
         path = simplify(self.space, path, settings.smoothings)
@@ -204,7 +207,8 @@ class AnytimeSearch:
         return bool(motions_free(self.space, rows).all())
 
     def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
-        """Halve the resolution after the validator refused the best path, and go back to the last accepted one."""
+        """Halve the resolution after the validator refused the best path, and go back to the last accepted
+        one."""
         self.settings = replace(self.settings, resolution=finer(self.settings.resolution))
         self.best = accepted
         self.length = np.float32(np.inf if accepted is None else path_length(accepted))
@@ -216,7 +220,8 @@ class AnytimeSearch:
         self.space = self.start_goal.space(self.settings.resolution, self.clearance)
 
     def _lower_clearance(self, fallback: Callable[[], None] | None) -> None:
-        """Go to the next lower clearance, at which the trees stay valid; call the fallback after the lowest one."""
+        """Go to the next lower clearance, at which the trees stay valid; call the fallback after the lowest
+        one."""
         if self._level < len(self._clearances) - 1:
             self._set_level(self._level + 1)
             self._try_straight_lines()
@@ -276,7 +281,8 @@ class _Validation:
 
     @property
     def due(self) -> bool:
-        """Whether to validate now: the first path at once, shorter ones every VALIDATION_INTERVAL iterations."""
+        """Whether to validate now: the first path at once, shorter ones every VALIDATION_INTERVAL
+        iterations."""
         rested = self.search.work >= self._validated_at + VALIDATION_INTERVAL
         return self.best is None or (rested and self.search.best is not self._path)
 

@@ -1,7 +1,7 @@
 """Search under path constraints: RRT-Connect with projected nodes, and simplification, in the anytime loop.
 
-The planners aorrtc, rrt_connect and robotdiffuse use it for problems with constraints. The search keeps a little
-more than the tolerances, which rounding of corners and numbers needs; the validator proves the result.
+The planners aorrtc, rrt_connect and robotdiffuse use it for problems with constraints. The search keeps a
+little more than the tolerances, which rounding of corners and numbers needs; the validator proves the result.
 """
 
 import numpy as np
@@ -19,7 +19,8 @@ STAGE = "constrained_rrt_connect"
 CLOCK_INTERVAL = 20
 """Iterations between two readings of the clock; they take longer than those without constraints."""
 TOLERANCE_FRACTION, END_MARGIN = 0.95, 1e-6
-"""The search keeps this part of each tolerance; or the value at the start or a goal, plus the margin, if larger."""
+"""The search keeps this part of each tolerance; or the value at the start or a goal, plus the margin, if
+larger."""
 PATHS_TO_FIND = 2
 """With until "short": number of paths to find; the shortest is returned."""
 SHORTCUTS = 60
@@ -103,7 +104,7 @@ class ConstrainedSearch(AnytimeSearch):
 
 
 def corner_kept(constraints: PathConstraints | None, q: Float[ndarray, "n dof"]) -> bool:
-    """Whether the polyline through configurations, such as a rounded corner, keeps the constraints as closely as the
-    search does."""
+    """Whether the polyline through configurations, such as a rounded corner, keeps the constraints as closely
+    as the search does."""
     rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
     return constraints is None or constraints.first(rows, share=TOLERANCE_FRACTION) is None

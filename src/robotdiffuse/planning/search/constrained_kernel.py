@@ -32,8 +32,8 @@ MIN_APPROACH = 0.95
 MAX_STEP_FACTOR = 2.0
 """A step is at most this many times as long as the straight line that it replaces."""
 SHORTCUT_GAIN, MAX_FAILED_SHORTCUTS = 0.99, 20
-"""A shortcut counts if it leaves at most this part of the length; after this many in a row that do not, no more
-are tried."""
+"""A shortcut counts if it leaves at most this part of the length; after this many in a row that do not, no
+more are tried."""
 MIN_CORNER_MOVE = 0.005
 """Smoothing leaves corners that it would move by less than this [rad]."""
 MAX_INITIAL_PIECE = 0.15
@@ -118,8 +118,8 @@ def length(path):
 
 @njit(cache=True)
 def _straight(limits, a, b, memory):
-    """Whether the straight piece between two configurations is proved to keep the constraints, with values little
-    above those at its ends."""
+    """Whether the straight piece between two configurations is proved to keep the constraints, with values
+    little above those at its ends."""
     rows, work = limits.rows, memory.rows
     evaluate(rows, a, 0, work)
     evaluate(rows, b, 1, work)
@@ -136,7 +136,8 @@ def _usable(limits, a, b, memory):
 
 @njit(cache=True)
 def between(limits, a, b, most, memory):
-    """Find a motion from a to b, which keep the constraints, as straight pieces; write their ends to memory.out.
+    """Find a motion from a to b, which keep the constraints, as straight pieces; write their ends to
+    memory.out.
 
     Returns their number; 0 if none was found, or it is longer than `most` [rad].
     """
@@ -274,8 +275,8 @@ def _joined(nodes, parents, tree, here, there):
 
 @njit(cache=True, nogil=True)
 def simplify(limits, path, rounds, tries, state):
-    """A path with the same ends that is no longer: try shortcuts between random places, `tries` of them; then in
-    each of `rounds` rounds smooth the corners and leave out waypoints that a straight piece can skip."""
+    """A path with the same ends that is no longer: try shortcuts between random places, `tries` of them; then
+    in each of `rounds` rounds smooth the corners and leave out waypoints that a straight piece can skip."""
     memory = _memory(limits)
     points, lost = _finer(path), 0
     for _ in range(tries):

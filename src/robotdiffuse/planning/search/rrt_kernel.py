@@ -29,7 +29,8 @@ class Trees(NamedTuple):
     nodes: np.ndarray
     """[2, capacity, dof]"""
     columns: np.ndarray
-    """[2 * dof, capacity in full lanes] the nodes by joint, for the nearest-node search; _NOWHERE beyond the last."""
+    """[2 * dof, capacity in full lanes] the nodes by joint, for the nearest-node search; _NOWHERE beyond the
+    last."""
     costs: np.ndarray
     """[2, capacity in full lanes] path lengths from the roots [rad]; roots come first and have 0."""
     parents: np.ndarray
@@ -62,8 +63,8 @@ def search(space, trees, goals, bound, longest, iterations, state):
     longest: largest extension [rad].
     bound: infinite for RRT-Connect.
 
-    Returns the waypoints [n, dof] from the start to a goal; n = 0 if none was found yet. Stops early when a tree
-    is full.
+    Returns the waypoints [n, dof] from the start to a goal; n = 0 if none was found yet. Stops early when a
+    tree is full.
     """
     nodes, costs, parents, sizes = trees.nodes, trees.costs, trees.parents, trees.sizes
     dof, bounded = nodes.shape[2], bound < np.float32(np.inf)
@@ -147,8 +148,8 @@ def _to_roots(nodes, tree, roots, q):
 def _nearest(trees, tree, q, allowed):
     """The nearest node, by position and cost, of those that reach q at a cost of at most `allowed`.
 
-    The cost of q is taken to be `allowed`. Without a bound, the nearest node by position; if no node reaches q,
-    the nearest root.
+    The cost of q is taken to be `allowed`. Without a bound, the nearest node by position; if no node reaches
+    q, the nearest root.
     """
     bounded = allowed < np.float32(np.inf)
     best, where = np.float32(np.inf), -1
@@ -191,7 +192,8 @@ def _squared(trees, tree, part, q):
 
 @njit(cache=True)
 def _cheaper(space, trees, tree, roots, near, cost, new, block, work, state):
-    """A parent that reaches `new` at a lower cost, and that cost: draws cheaper ones until an edge collides."""
+    """A parent that reaches `new` at a lower cost, and that cost: draws cheaper ones until an edge
+    collides."""
     least = _to_roots(trees.nodes, tree, roots, new)
     while cost > least:
         allowed = least + random(state) * (cost - least)
@@ -226,8 +228,8 @@ def _shares(start, goals, bound):
 
 @njit(cache=True)
 def _sample_within(space, start, goals, shares, bound, q, state):
-    """Sample q uniformly in the prolate hyperspheroid of paths from the start to a goal shorter than `bound`, clamped
-    to the limits; the goal is drawn by `shares`."""
+    """Sample q uniformly in the prolate hyperspheroid of paths from the start to a goal shorter than `bound`,
+    clamped to the limits; the goal is drawn by `shares`."""
     dof, u, g = len(q), random(state), 0
     while g < len(goals) - 1 and u > shares[g]:
         g += 1
