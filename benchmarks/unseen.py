@@ -9,11 +9,11 @@
 Problems are held-out ones of the families that the straight line does not solve and a search in the true
 scene does. Cameras stand where a person would place them, 1.4 to 1.8 m away, in front more often than behind;
 the floor is known, all else is seen. Every method plans with AORRTC, but for the one that is said to plan
-with the hybrid, and the same CPU time. A motion is free if the validator finds path and timed motion valid in the
-true scene. What was tried is kept in a file of records and not tried again; `--report` prints the tables that
-are kept in benchmarks/results/unseen.txt, and `--fit` the constants of perception/confidence.py, from the
-calibration half: problems with even numbers. Settings were chosen on them, too; `--odd` leaves them out of
-the report. `--weights` adds the chain 'predicted' with other weights of the completing network, folders of
+with the hybrid, and the same CPU time. A motion is free if the validator finds path and timed motion valid in
+the true scene. What was tried is kept in a file of records and not tried again; `--report` prints the tables
+that are kept in benchmarks/results/unseen.txt, and `--fit` the constants of perception/confidence.py, from
+the calibration half: problems with even numbers. Settings were chosen on them, too; `--odd` leaves them out
+of the report. `--weights` adds the chain 'predicted' with other weights of the completing network, folders of
 `train completion`, as methods that are named by the folder: those of a training that left families out are
 tried on these families. `--times` prints what the network takes of a core.
 """
@@ -38,7 +38,7 @@ from robotdiffuse.learning.checkpoint import load_completion
 from robotdiffuse.learning.completion import bundled, predict
 from robotdiffuse.learning.completion.network import CompletionNetwork
 from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
-from robotdiffuse.perception.confidence import LEAST_RISK, confidence
+from robotdiffuse.perception.confidence import MIN_RISK, confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import DepthNoise, ray_cast
@@ -332,7 +332,7 @@ def fit(rows: list[Row]) -> None:
             print(
                 "BY_RISK",
                 "as seen" if seen else "predicted",
-                _logistic(np.log(np.maximum(risk, LEAST_RISK)), free),
+                _logistic(np.log(np.maximum(risk, MIN_RISK)), free),
             )
 
 

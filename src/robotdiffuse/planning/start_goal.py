@@ -22,10 +22,11 @@ if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 MAX_IK_ROUNDS, IK_TIME_FRACTION = 100, 0.5
-"""Most rounds of inverse kinematics for a pose whose configurations all collide, and the part of the time left that
-they may take."""
+"""Most rounds of inverse kinematics for a pose whose configurations all collide, and the part of the time
+left that they may take."""
 END_MARGIN = 0.0005
-"""Near a start or goal with less than the requested clearance, paths keep its clearance less this margin [m]."""
+"""Near a start or goal with less than the requested clearance, paths keep its clearance less this margin
+[m]."""
 RETREAT_STEP = 0.01
 """Step length out of contact of the covering spheres [rad]."""
 RETREAT_STEPS = 100
@@ -36,8 +37,8 @@ MAX_OVERTURN = np.pi / 2
 class StartGoal:
     """The start and the goals of a search, and configurations nearby where the covering spheres are free.
 
-    The start of a continuous joint is within half a turn here; `complete` adds its whole turns back. Each goal is
-    replaced by its images, see `images`.
+    The start of a continuous joint is within half a turn here; `complete` adds its whole turns back. Each
+    goal is replaced by its images, see `images`.
     """
 
     def __init__(
@@ -67,7 +68,8 @@ class StartGoal:
         return self.start_lead.astype(np.float32), np.array(self.goal_leads, np.float32)
 
     def kept_clearance(self, wanted: float) -> float:
-        """The clearance that a path can keep: the wanted one, or half that of the start or a goal if less [m]."""
+        """The clearance that a path can keep: the wanted one, or half that of the start or a goal if less
+        [m]."""
         start, goals = self.rows()
         leads = np.concatenate([start[None], goals])
         return min(wanted, 0.5 * float(self.checker.link_clearances(leads).min(initial=wanted)))
@@ -75,8 +77,8 @@ class StartGoal:
     def space(self, resolution: float, clearance: float) -> Space:
         """The space in which searches check motions, at a resolution [m] and a clearance [m].
 
-        Near a start or goal with less clearance, the clearance is reduced to its own, and grows with the distance
-        from it (`collision.kernels.motions.padding_near`).
+        Near a start or goal with less clearance, the clearance is reduced to its own, and grows with the
+        distance from it (`collision.kernels.motions.padding_near`).
         """
         start, goals = self.rows()
         start_goal = np.concatenate([start[None], goals])
@@ -95,7 +97,8 @@ class StartGoal:
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
     def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
-        """The path of a search in float64, with the exact start and goal in place of its ends, or added to them."""
+        """The path of a search in float64, with the exact start and goal in place of its ends, or added to
+        them."""
         assert self.start_lead is not None
         path = path.astype(np.float64)
         errors = [np.abs(path[-1] - lead).max() for lead in self.goal_leads]
@@ -113,8 +116,8 @@ def images(
 ) -> list[Float[ndarray, "dof"]]:
     """The goal with whole turns added to continuous joints: a search does not wrap them.
 
-    First the image nearest to the start, then those with one continuous joint turned the other way: an obstacle
-    may block the short way.
+    First the image nearest to the start, then those with one continuous joint turned the other way: an
+    obstacle may block the short way.
     """
     nearest = goal - robot.turns(goal - start)
     found = [nearest]
@@ -128,8 +131,8 @@ def images(
 def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
     """The start and the goals for a search of this call, or the result that says why there are none.
 
-    For poses, up to `pose_goals.GOAL_COUNT` configurations by inverse kinematics. Goals whose covering spheres are
-    free are preferred; if there are none, those whose exact meshes are free are used.
+    For poses, up to `pose_goals.GOAL_COUNT` configurations by inverse kinematics. Goals whose covering
+    spheres are free are preferred; if there are none, those whose exact meshes are free are used.
     """
     checker = CollisionChecker(context.problem.robot, context.problem.scene)
     goals = _usable_goals(context, checker)
@@ -149,7 +152,7 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
 def retreat(
     checker: CollisionChecker, q: Float[ndarray, "dof"], constraints: "PathConstraints | None" = None
 ) -> Float[ndarray, "dof"] | None:
-        """A configuration nearby whose covering spheres are free, found down the gradient of the collision cost.
+    """A configuration nearby whose covering spheres are free, found down the gradient of the collision cost.
 
     For a start or goal whose exact meshes are free while the spheres around them are not. None if no free
     configuration was found within 1 rad, or it does not keep the constraints. The motion to it is left to the
@@ -168,7 +171,8 @@ def retreat(
 
 
 def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
-    """A message that says where the covering spheres penetrate deepest, for a configuration whose meshes are free."""
+    """A message that says where the covering spheres penetrate deepest, for a configuration whose meshes are
+    free."""
     clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
     worst = int(clearances.argmin())
     link, other = [*((link, None) for link in checker.links), *checker.pairs][worst]
@@ -217,7 +221,8 @@ def _too_heavy(context: PlanningContext, q: Float[ndarray, "dof"]) -> str | None
 def _goals(
     context: PlanningContext, goal: Goal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    """The free configurations of a goal, or of any of several goals; or the result that says why there are none."""
+    """The free configurations of a goal, or of any of several goals; or the result that says why there are
+    none."""
     if isinstance(goal, AnyGoal):
         each = [_goals(context, one, checker) for one in goal.goals]
         found = [goals for goals in each if not isinstance(goals, PlanResult)]
@@ -299,7 +304,8 @@ def _pose_goals(
 
 
 def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:
-    """The goals and their copies with whole turns: a pose does not say how often a continuous joint has turned."""
+    """The goals and their copies with whole turns: a pose does not say how often a continuous joint has
+    turned."""
     robot, start = context.problem.robot, context.problem.start
     return np.concatenate([robot.same_stance(q, start) for q in goals])
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from robotdiffuse.learning.checkpoint import load_model
-from robotdiffuse.planning.diffusion.smooth_noise import SPREAD, MAX_HALF_RANGE, smooth_noise
+from robotdiffuse.planning.diffusion.smooth_noise import MAX_HALF_RANGE, SPREAD, smooth_noise
 from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")
