@@ -1,4 +1,4 @@
-"""A planner that fails in every way that one can, by its seed."""
+"""A planner that fails in a way chosen by its seed."""
 
 import os
 import signal

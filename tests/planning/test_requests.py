@@ -1,5 +1,5 @@
-"""The whole table: whatever a problem or a call may ask for, every planner does it or refuses it by one line
-that names the planner and what it cannot do."""
+"""Every planner fulfils each kind of request, or refuses it with one line that names the planner and what it
+does not support."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -35,7 +35,7 @@ class Asked(NamedTuple):
     problem: Callable[[], Problem]
     request: Mapping[str, Any] = MappingProxyType({})
     needs: tuple[str, ...] = ()
-    """What a planner must be able to keep."""
+    """What a planner must support."""
 
 
 def _goal(goal: object) -> Callable[[], Problem]:
@@ -158,7 +158,9 @@ def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> N
     planner, problem, (_, request, needs) = planner_named(name), problem_of(asked), ASKED[asked]
     lacking = next((what for what in needs if what not in planner.supports), None)
     if lacking is not None:
-        with pytest.raises(InputError, match=f"planner {name} cannot keep {lacking}; these can: ") as refused:
+        with pytest.raises(
+            InputError, match=f"planner {name} does not support {lacking}; these do: "
+        ) as refused:
             planner.plan(problem, time_limit=3.0, **request)
         assert "\n" not in str(refused.value)
         return
@@ -168,7 +170,7 @@ def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> N
 
 
 @pytest.mark.parametrize("what", [PATH_CONSTRAINTS, CLEARANCE])
-def test_the_planners_that_can_are_those_that_messages_name(what: str) -> None:
+def test_messages_name_the_planners_that_support_a_request(what: str) -> None:
     able = {
         name for name in PLANNERS if not name.startswith("ompl_") and what in planner_named(name).supports
     }

@@ -1,4 +1,4 @@
-"""Smooth noise: the ends are held, the limits kept, and it is as wide as the Panda's own noise."""
+"""Smooth noise: fixed ends, joint limits, and the covariance of the noise in the Panda's weights."""
 
 import numpy as np
 
@@ -20,7 +20,7 @@ def test_ends_and_limits_are_kept() -> None:
 
 
 def test_its_covariance_is_about_that_of_the_pandas_weights() -> None:
-    """The eigenvalues within a hundredth of their sum, and the standard deviation on average."""
+    """Eigenvalues agree to a hundredth of their sum, and the standard deviation on average."""
     q = smooth_noise(MIDDLE, MIDDLE[None], 4000, 48, PANDA, np.random.default_rng(1)) - MIDDLE
     half = np.minimum(0.5 * (PANDA.upper - PANDA.lower), MAX_HALF_RANGE)
     rows = np.moveaxis(q / half, 1, 2).reshape(-1, 48)

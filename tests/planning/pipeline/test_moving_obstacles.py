@@ -1,4 +1,4 @@
-"""Planning among obstacles that move, motions that begin moving, and the reactive loop."""
+"""Planning among moving obstacles, and motions from a start velocity."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ from robotdiffuse.validation.validator import verify_trajectory
 PANDA = rd.load_robot("panda")
 START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
 CROSSING = rd.MovingObstacle(rd.Sphere([0.95, 0.0, 0.45], 0.12, name="ball"), velocity=[-0.15, 0, 0])
-"""In the way when the arm would come by at full speed; it then goes on over the base."""
+"""Crosses the path when the arm would pass at full speed, then goes on over the base."""
 PASSING = rd.MovingObstacle(rd.Box([0.55, -0.5, 0.4], [0.1, 0.1, 0.8], name="cart"), velocity=[0, 0.3, 0])
 
 
@@ -57,22 +57,23 @@ def test_any_planner_finds_the_path(name: str) -> None:
     assert known.get(name, name) in PLANNERS
 
 
-def test_start_that_is_hit_at_once() -> None:
+def test_a_start_that_is_hit_at_once_is_invalid() -> None:
     at = rd.MovingObstacle(rd.Sphere([0.3, -0.45, 0.45], 0.2, name="ball"), velocity=[0, 0, 0.1])
     found = rd.load_planner("rrt_connect").plan(problem(at))
     assert found.status is Status.INVALID_START
     assert "touches ball" in found.reason
 
 
-def test_no_way_by_a_wall_that_comes() -> None:
+def test_a_wall_that_comes_cannot_be_passed() -> None:
     wall = rd.MovingObstacle(rd.Box([0, 2.0, 0.5], [4, 0.1, 4], name="wall"), velocity=[0, -2.5, 0])
     found = rd.load_planner("rrt_connect").plan(problem(wall), 0.5)
     assert found.status is Status.TIMEOUT
     assert "moving obstacles" in found.reason
 
 
-def test_earliest_waits_for_what_passes() -> None:
-    """Three configurations in a row, the middle one taken at ticks 1 to 3, both ends of a step checked."""
+def test_the_earliest_schedule_waits_for_a_passing_obstacle() -> None:
+    """Three configurations in a row; the middle one is occupied at ticks 1 to 3; both ends of a step are
+    checked."""
     clear = np.ones((3, 10), bool)
     clear[1, 1:4] = False
     args = np.array([0, 2]), np.array([0]), np.array([1]), np.array([0, 3]), np.array([0, 1, 2])
@@ -87,7 +88,7 @@ VELOCITIES = [np.eye(7)[0] * 2.0, np.array([0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6]), 
 
 
 @pytest.mark.parametrize("velocity", VELOCITIES)
-def test_motion_begins_moving(velocity: np.ndarray) -> None:
+def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
     task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
     found = rd.load_planner("rrt_connect").plan(task, 5.0)
     assert found.status is Status.SOLVED, found.reason
@@ -109,7 +110,7 @@ def test_motion_begins_moving(velocity: np.ndarray) -> None:
         ([9.0, 0, 0, 0, 0, 0, 0], "start_velocity: panda_joint1 is 9; its velocity limit is 2.17"),
     ],
 )
-def test_start_velocities_that_are_none(velocity: list[float], message: str) -> None:
+def test_invalid_start_velocities_are_refused(velocity: list[float], message: str) -> None:
     with pytest.raises(InputError, match=message):
         rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
 
@@ -127,7 +128,7 @@ def test_start_velocity_beyond_what_scaling_leaves() -> None:
     task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=np.eye(7)[0] * 2.0)
     with pytest.raises(InputError, match=r"velocity_scaling leaves it 1\.08"):
         rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
-    with pytest.raises(InputError, match="jerk cannot be limited beside start_velocity"):
+    with pytest.raises(InputError, match="jerk cannot be combined with start_velocity"):
         rd.load_planner("rrt_connect").plan(task, jerk=100.0)
 
 
@@ -141,7 +142,7 @@ BESIDE: dict[str, dict[str, object]] = {
 
 
 @pytest.mark.parametrize("asked", BESIDE)
-def test_what_else_is_asked_holds_among_moving_obstacles(asked: str) -> None:
+def test_other_requests_hold_among_moving_obstacles(asked: str) -> None:
     if asked == "payload":
         pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
     obstacle = PASSING if asked == "waypoints" else CROSSING
@@ -165,7 +166,8 @@ def test_what_else_is_asked_holds_among_moving_obstacles(asked: str) -> None:
 
 
 def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
-    """The waypoint is on the straight line, where nothing would stop the motion; a ball is there first."""
+    """The waypoint is on the straight line, where the motion would not stop by itself; a ball is there
+    first."""
     middle = (START + END) / 2
     at = link_pose(PANDA, middle, "panda_hand")[:3, 3]
     ball = rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3])
@@ -177,8 +179,8 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
     assert alone is not None and found.trajectory.duration > alone.duration
 
 
-def test_the_loop_says_what_it_does_not_know() -> None:
+def test_the_replanner_refuses_what_it_does_not_support() -> None:
     ball = rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1, name="ball"), max_speed=0.1)
     for more in BESIDE.values():
-        with pytest.raises(InputError, match=r"problem\.\w+: the replanner knows of none"):
+        with pytest.raises(InputError, match=r"problem\.\w+: the replanner does not support it"):
             rd.Replanner(problem(ball, **more))

@@ -1,5 +1,5 @@
-"""Policies for unknown space: assumptions only add obstacles, carved free at the ends; what results say of
-it."""
+"""Policies for unknown space: assumptions only add obstacles, with start and goal carved free; what results
+say."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -44,7 +44,7 @@ PANDA = load_robot("panda")
 START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 GOAL = np.array([0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 DEEP = Scene([Box([0.55, 0.0, 0.3], [0.5, 0.2, 0.6])])
-"""A box that goes from far ahead to close to the arm; a camera ahead sees its front."""
+"""A deep box in front of the arm; a camera ahead sees only its front."""
 AHEAD = looking_at(np.array([1.7, 0.0, 0.3]), np.array([0.0, 0.0, 0.3]))
 REQUEST = PlanRequest(4.0)
 
@@ -80,7 +80,7 @@ def test_solved_means_free_of_what_was_seen(planner: Planner, unknown: str) -> N
 
 
 def test_predicted_obstacles_are_kept_clear_of(planner: Planner) -> None:
-    """As seen, the way leads through the back of the box; with its voxels predicted, past it."""
+    """As seen, the path leads through the back of the box; with its voxels predicted, past it."""
     truth = Problem(PANDA, DEEP, START, GOAL)
     through = planner.plan(partial("optimistic"), time_limit=2.0)
     assert through.path is not None and not verify(truth, through.path).valid
@@ -183,7 +183,7 @@ def test_confidence_falls_with_the_probability_that_is_swept() -> None:
     assert all(0 < confidence(assumption) < 1 for assumption in RATES)
 
 
-def test_files_of_results_keep_it(planner: Planner, tmp_path: Path) -> None:
+def test_result_files_keep_the_assumption_and_its_confidence(planner: Planner, tmp_path: Path) -> None:
     result = plan_with_unknown_space(planner, partial("predicted"), REQUEST, true_voxels())
     result.save(tmp_path / "result.json")
     again = load_result(tmp_path / "result.json").result

@@ -70,14 +70,14 @@ def search(space, trees, goals, bound, longest, iterations, state):
     dof, bounded = nodes.shape[2], bound < np.float32(np.inf)
     work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
     sample, new = np.empty(dof, np.float32), np.empty(dof, np.float32)
-    shares = _shares(nodes[0, 0], goals, bound) if bounded else np.empty(0, np.float32)
+    shares = goal_shares(nodes[0, 0], goals, bound) if bounded else np.empty(0, np.float32)
     for _ in range(iterations):
         tree = 0 if sizes[0] <= sizes[1] else 1
         other = 1 - tree
         if sizes[tree] >= nodes.shape[1] or sizes[other] >= nodes.shape[1]:
             break
         if bounded:
-            _sample_within(space, nodes[0, 0], goals, shares, bound, sample, state)
+            sample_within(space, nodes[0, 0], goals, shares, bound, sample, state)
         else:
             _sample_box(space, sample, state)
         roots, other_roots = (len(goals), 1) if tree else (1, len(goals))
@@ -214,7 +214,7 @@ def _sample_box(space, q, state):
 
 
 @njit(cache=True)
-def _shares(start, goals, bound):
+def goal_shares(start, goals, bound):
     """Cumulative shares of the samples for each goal, by the volumes of their hyperspheroids."""
     shares, total = np.empty(len(goals), np.float32), _ZERO
     for g in range(len(goals)):
@@ -227,7 +227,7 @@ def _shares(start, goals, bound):
 
 
 @njit(cache=True)
-def _sample_within(space, start, goals, shares, bound, q, state):
+def sample_within(space, start, goals, shares, bound, q, state):
     """Sample q uniformly in the prolate hyperspheroid of paths from the start to a goal shorter than `bound`,
     clamped to the limits; the goal is drawn by `shares`."""
     dof, u, g = len(q), random(state), 0

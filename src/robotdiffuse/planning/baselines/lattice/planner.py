@@ -137,7 +137,7 @@ def _make_graph(
         )
     strides = np.concatenate([[1], np.cumprod(counts[:-1])]).astype(np.int64)
     origin = start - spacing * below
-    half = _moves(robot.dof, settings.joints_per_move)
+    half = lattice_moves(robot.dof, settings.joints_per_move)
     moves = np.concatenate([half, -half])
     goals_at = (goals.astype(np.float64) - origin) / spacing
     lattice = Lattice(
@@ -155,7 +155,7 @@ def _make_graph(
     return _Graph(lattice, lower, upper, int(below @ strides))
 
 
-def _moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
+def lattice_moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
     """One of each pair of opposite moves, that in which the first moving joint moves up; those of few joints
     first."""
     if joints == 1:
