@@ -81,19 +81,19 @@ class StartGoal:
         distance from it (`collision.kernels.motions.padding_near`).
         """
         start, goals = self.rows()
-        start_goal = np.concatenate([start[None], goals])
+        states = np.concatenate([start[None], goals])
         if clearance <= 0:
-            return self._within(search_space(self.checker, resolution), start_goal)
-        has = self.checker.link_clearances(start_goal).min(axis=1, initial=1.0)
+            return self._within(search_space(self.checker, resolution), states)
+        has = self.checker.link_clearances(states).min(axis=1, initial=1.0)
         close = has < clearance + END_MARGIN
-        near = np.column_stack([start_goal[close], np.maximum(has[close] - END_MARGIN, 0.0)])
-        return self._within(search_space(self.checker, resolution, clearance, near), start_goal)
+        near = np.column_stack([states[close], np.maximum(has[close] - END_MARGIN, 0.0)])
+        return self._within(search_space(self.checker, resolution, clearance, near), states)
 
-    def _within(self, space: Space, start_goal: Float[ndarray, "k dof"]) -> Space:
+    def _within(self, space: Space, states: Float[ndarray, "k dof"]) -> Space:
         """The space with continuous joints limited to MAX_OVERTURN beyond the range of start and goals."""
         turning = self._robot.continuous
-        lower = np.where(turning, np.maximum(space.lower, start_goal.min(axis=0) - MAX_OVERTURN), space.lower)
-        upper = np.where(turning, np.minimum(space.upper, start_goal.max(axis=0) + MAX_OVERTURN), space.upper)
+        lower = np.where(turning, np.maximum(space.lower, states.min(axis=0) - MAX_OVERTURN), space.lower)
+        upper = np.where(turning, np.minimum(space.upper, states.max(axis=0) + MAX_OVERTURN), space.upper)
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
     def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:

@@ -268,11 +268,11 @@ class Replanner:
     ) -> TimedPath | None:
         """A straight path to where the next obstacle is predicted latest; None if that is here."""
         settings, robot = self.settings, self._robot
-        ways = self._rng.normal(size=(settings.evasions, robot.dof))
-        ways *= settings.evasion_radius / np.linalg.norm(ways, axis=1, keepdims=True)
-        start_goal = np.clip(rest + ways, robot.lower, robot.upper)
+        directions = self._rng.normal(size=(settings.evasions, robot.dof))
+        directions *= settings.evasion_radius / np.linalg.norm(directions, axis=1, keepdims=True)
+        ends = np.clip(rest + directions, robot.lower, robot.upper)
         best, best_time = None, predicted.comes(rest, time, settings.horizon) or np.inf
-        for end in start_goal:
+        for end in ends:
             lasts = float((np.abs(end - rest) / robot.velocity).max()) + EVASION_OVERHEAD
             comes = predicted.comes_to(
                 np.stack([rest, end]), np.array([time, time + lasts]), settings.horizon
