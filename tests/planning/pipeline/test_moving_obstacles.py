@@ -1,4 +1,4 @@
-"""Planning among moving obstacles, and motions from a start velocity."""
+"""Planning among moving obstacles."""
 
 from dataclasses import replace
 
@@ -8,7 +8,6 @@ import pytest
 import robotdiffuse as rd
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.pipeline.moving_obstacles_kernel import WAITED, earliest
@@ -84,54 +83,6 @@ def test_the_earliest_schedule_waits_for_a_passing_obstacle() -> None:
     assert not earliest(clear, *args)[1]
 
 
-VELOCITIES = [np.eye(7)[0] * 2.0, np.array([0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6]), -np.eye(7)[0]]
-
-
-@pytest.mark.parametrize("velocity", VELOCITIES)
-def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
-    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
-    found = rd.load_planner("rrt_connect").plan(task, 5.0)
-    assert found.status is Status.SOLVED, found.reason
-    assert found.trajectory is not None
-    assert np.allclose(found.trajectory.velocities[0], velocity, atol=1e-9)
-    assert (np.abs(found.trajectory.velocities) <= PANDA.velocity * (1 + 1e-6)).all()
-    assert (np.abs(found.trajectory.accelerations) <= PANDA.acceleration * (1 + 1e-3)).all()
-    assert verify_trajectory(task, found.trajectory).valid
-    at_rest = verify_trajectory(replace(task, start_velocity=None), found.trajectory).violation
-    assert at_rest is not None
-    assert at_rest.kind in ("rest", "acceleration")
-
-
-@pytest.mark.parametrize(
-    ("velocity", "message"),
-    [
-        ([0.1] * 6, "start_velocity is .*; it must be 7 finite numbers"),
-        ([np.nan] * 7, "start_velocity is .*; it must be 7 finite numbers"),
-        ([9.0, 0, 0, 0, 0, 0, 0], "start_velocity: panda_joint1 is 9; its velocity limit is 2.17"),
-    ],
-)
-def test_invalid_start_velocities_are_refused(velocity: list[float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
-
-
-def test_start_velocity_into_a_limit() -> None:
-    start = START.copy()
-    start[0] = PANDA.upper[0] - 0.01
-    task = rd.Problem(PANDA, rd.Scene(), start, END, start_velocity=np.eye(7)[0] * 2.0)
-    found = rd.load_planner("rrt_connect").plan(task)
-    assert found.status is Status.INVALID_START
-    assert "panda_joint1 cannot stop" in found.reason
-
-
-def test_start_velocity_beyond_what_scaling_leaves() -> None:
-    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=np.eye(7)[0] * 2.0)
-    with pytest.raises(InputError, match=r"velocity_scaling leaves it 1\.08"):
-        rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
-    with pytest.raises(InputError, match="jerk cannot be combined with start_velocity"):
-        rd.load_planner("rrt_connect").plan(task, jerk=100.0)
-
-
 UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
 BESIDE: dict[str, dict[str, object]] = {
     "waypoints": {"waypoints": [(START + END) / 2 - [0, 0.3, 0, 0, 0, 0, 0], START]},
@@ -177,10 +128,3 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
     assert verify_trajectory(task, found.trajectory).valid
     alone = rd.load_planner("rrt_connect").plan(replace(task, moving=()), 20.0).trajectory
     assert alone is not None and found.trajectory.duration > alone.duration
-
-
-def test_the_replanner_refuses_what_it_does_not_support() -> None:
-    ball = rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1, name="ball"), max_speed=0.1)
-    for more in BESIDE.values():
-        with pytest.raises(InputError, match=r"problem\.\w+: the replanner does not support it"):
-            rd.Replanner(problem(ball, **more))

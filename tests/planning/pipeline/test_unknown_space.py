@@ -23,11 +23,11 @@ from robotdiffuse.perception.assumptions import (
     Voxels,
     voxels_in,
 )
-from robotdiffuse.perception.confidence import RATES, confidence
+from robotdiffuse.perception.confidence import RATES
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
-from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, surface, sweep
+from robotdiffuse.perception.swept_voxels_kernel import sweep
 from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.attempt import attempt
 from robotdiffuse.planning.context import PlanRequest
@@ -162,27 +162,6 @@ def test_later_assumptions_have_fewer_voxels() -> None:
     assert all((b <= a).all() and b.sum() < a.sum() for a, b in pairwise(occupied))
 
 
-def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:
-    path = np.stack([START, GOAL]).astype(np.float32)
-    swept = np.zeros(SHAPE, np.bool_)
-    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(VOXEL), swept)
-    centres = (np.argwhere(np.ones(SHAPE)) + 0.5) * VOXEL + LOW
-    moving = {link for link in PANDA.spheres if PANDA.link_frame(link) > 0}
-    fixed = sum(len(spheres) for link, spheres in PANDA.spheres.items() if link not in moving)
-    for t in (0.0, 0.5, 1.0):
-        spheres = placed_spheres(PANDA, START + t * (GOAL - START))[fixed:]
-        distances = np.linalg.norm(centres[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
-        within = (distances < -0.002).any(axis=1).reshape(SHAPE)
-        assert within.any() and swept[within].all()
-
-
-def test_confidence_falls_with_the_probability_that_is_swept() -> None:
-    for assumption in ("predicted, p > 0.1", AS_SEEN):
-        stated = [confidence(assumption, risk) for risk in (0.0, 0.1, 1.0, 10.0, 1000.0)]
-        assert all(0 <= b <= a <= 1 for a, b in pairwise(stated))
-    assert all(0 < confidence(assumption) < 1 for assumption in RATES)
-
-
 def test_result_files_keep_the_assumption_and_its_confidence(planner: Planner, tmp_path: Path) -> None:
     result = plan_with_unknown_space(planner, partial("predicted"), REQUEST, true_voxels())
     result.save(tmp_path / "result.json")
@@ -190,20 +169,3 @@ def test_result_files_keep_the_assumption_and_its_confidence(planner: Planner, t
     for name in ("assumption", "confidence", "swept_probability", "unknown_region"):
         assert getattr(again, name) == getattr(result, name)
     assert again.unknown_region is not None and len(again.unknown_region[0]) == 3
-
-
-def test_the_part_that_weighs_most_is_boxed() -> None:
-    marked, weights = np.zeros((6, 7, 8), np.bool_), np.ones((6, 7, 8), np.float32)
-    marked[0, 0, :3], marked[5, 6, 7], marked[3:5, 3, 3] = True, True, True
-    assert heaviest_part(marked, weights).tolist() == [[0, 0, 0], [1, 1, 3]]
-    weights[5, 6, 7] = 4.0
-    assert heaviest_part(marked, weights).tolist() == [[5, 6, 7], [6, 7, 8]]
-    assert summed(weights, marked) == 9.0
-    assert not heaviest_part(np.zeros_like(marked), weights).any()
-
-
-def test_the_surface_is_what_has_a_face_outside() -> None:
-    marked = np.zeros((5, 5, 5), np.bool_)
-    marked[1:4, 1:4, 1:4] = True
-    assert len(surface(marked)) == 26 and [2, 2, 2] not in surface(marked).tolist()
-    assert len(surface(np.ones((3, 3, 3), np.bool_))) == 0

@@ -1,5 +1,7 @@
 """The replanner: every motion ends at rest before an obstacle can reach the arm."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -145,3 +147,19 @@ def test_replanners_that_cannot_begin() -> None:
     )
     with pytest.raises(InputError, match="the replanner cannot begin: the start is in collision"):
         rd.Replanner(inside)
+
+
+UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
+UNSUPPORTED: dict[str, dict[str, Any]] = {
+    "waypoints": {"waypoints": [rd.JointGoal((START + END) / 2)]},
+    "constraints": {"constraints": [UPRIGHT]},
+    "payload": {"payload": rd.Payload(0.5, link="panda_hand")},
+}
+
+
+@pytest.mark.parametrize("what", UNSUPPORTED)
+def test_the_replanner_refuses_what_it_does_not_support(what: str) -> None:
+    ball = rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1, name="ball"), max_speed=0.1)
+    problem = rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], **UNSUPPORTED[what])
+    with pytest.raises(InputError, match=rf"problem\.{what}: the replanner does not support it"):
+        rd.Replanner(problem)
