@@ -46,12 +46,12 @@ from robotdiffuse.learning.checkpoint import load_completion
 from robotdiffuse.learning.completion import bundled, predict
 from robotdiffuse.learning.completion.network import CompletionNetwork
 from robotdiffuse.learning.completion.samples import CameraPlaces, pack, true_voxels
-from robotdiffuse.perception.confidence import LEAST_RISK, confidence
+from robotdiffuse.perception.confidence import MIN_RISK, confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import DepthNoise, ray_cast
-from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.context import Request
+from robotdiffuse.planning import context, load_planner
+from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.next_view import next_view, poses_around
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
 from robotdiffuse.problems.families import FAMILIES
@@ -129,7 +129,7 @@ def plan(problem: Problem, partial: Problem, method: str, network: CompletionNet
     asked = replace(partial, unknown=METHODS.get(method, PREDICTED))
     left = LIMIT if network is None else LIMIT - (time.process_time() - began)
     planner = HYBRID_PLANNER if method == HYBRID else PLANNER
-    result = plan_with_unknown_space(planner, asked, left, 0, Request(), voxels)
+    result = plan_with_unknown_space(planner, asked, PlanRequest(left), voxels)
     spent = time.process_time() - began
     return {
         "method": method,
@@ -307,7 +307,7 @@ def fit(rows: list[Row]) -> None:
             print(
                 "BY_RISK",
                 "as seen" if seen else "predicted",
-                _logistic(np.log(np.maximum(risk, LEAST_RISK)), free),
+                _logistic(np.log(np.maximum(risk, MIN_RISK)), free),
             )
 
 

@@ -1,4 +1,4 @@
-"""RRT-Connect that dies of a scene whose first shape is called deadly, and knows no robot "unknown"."""
+"""RRT-Connect that kills its process in scenes with a shape named deadly, and refuses the robot "unknown"."""
 
 import os
 import signal

@@ -1,4 +1,4 @@
-"""A planner that fails in every way that one can, by its seed."""
+"""A planner that fails in a way chosen by its seed."""
 
 import os
 import signal
@@ -6,7 +6,7 @@ import time
 
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning import Entry
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.problems.problem import Problem
 
@@ -24,7 +24,7 @@ class Faulty(RRTConnect):
             os.kill(os.getpid(), signal.SIGKILL)
         while seed == HANGS:
             time.sleep(1.0)
-        context = PlanningContext(self.name, problem, time_limit, seed)
+        context = PlanningContext(self.name, problem, PlanRequest(time_limit, seed))
         while seed == SEARCHES and context.remaining > -time_limit:
             time.sleep(0.01)
         if seed == TALKS:

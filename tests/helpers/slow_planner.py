@@ -1,4 +1,4 @@
-"""A planner that answers when it is told to."""
+"""A planner that returns when the test lets it."""
 
 import threading
 
@@ -6,16 +6,16 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.planning.search.aorrtc import AORRTC
 from robotdiffuse.problems.problem import Problem
 
-PATIENCE = 300.0
-"""[s]"""
+MAX_WAIT = 300.0
+"""Longest wait for `go` [s]."""
 
 
 class SlowPlanner(AORRTC):
-    """AORRTC whose answers wait for `go`; it breaks at an obstacle named broken."""
+    """AORRTC that waits for `go` before it returns, and raises an error for an obstacle named broken."""
 
     name = "slow"
     calls: list[Problem] = []  # noqa: RUF012
-    """What it was asked for, and has found."""
+    """The problems that it was called with and has planned for."""
     go = threading.Semaphore(0)
 
     def warm_up(self, problem: Problem, until: str = "first") -> list[PlanResult]:
@@ -26,5 +26,5 @@ class SlowPlanner(AORRTC):
             raise RuntimeError("no such luck")
         result = super().plan(problem, 2.0)
         self.calls.append(problem)
-        assert self.go.acquire(timeout=PATIENCE)
+        assert self.go.acquire(timeout=MAX_WAIT)
         return result

@@ -1,4 +1,4 @@
-"""What a call of a planner notes on the way: shorter and shorter paths, and what the validator refused."""
+"""What a call of a planner records: shorter and shorter paths, refusals of the validator, compile time."""
 
 import subprocess
 import sys
@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from robotdiffuse.core.types import Status
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.shared_tree.planner import SharedTreeRRTStar, SharedTreeSettings
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
@@ -30,13 +30,13 @@ def blocked() -> Problem:
     return problem(Scene([Sphere((0.4, 0.3, 0.6), 0.15)]))
 
 
-def call_on(scene: Scene) -> PlanningContext:
-    return PlanningContext("test", problem(scene), time_limit=10.0, seed=0)
+def context_for(scene: Scene) -> PlanningContext:
+    return PlanningContext("test", problem(scene), PlanRequest(time_limit=10.0))
 
 
 def test_progress_falls_and_ends_with_the_returned_path() -> None:
-    context = call_on(Scene([]))
-    for length in (5.0, 3.0, 4.0, 0.9):  # 4 is no improvement; 0.9 is shorter than what is returned
+    context = context_for(Scene([]))
+    for length in (5.0, 3.0, 4.0, 0.9):  # 4 is no improvement; 0.9 is shorter than the returned path
         context.improved(length)
     result = context.finish(np.stack([START, turned(1.2)]), "test")
     assert result is not None and result.path is not None
@@ -46,15 +46,15 @@ def test_progress_falls_and_ends_with_the_returned_path() -> None:
 
 
 def test_returned_path_keeps_the_time_at_which_it_was_found() -> None:
-    context = call_on(Scene([]))
+    context = context_for(Scene([]))
     context.improved(1.2)
     result = context.finish(np.stack([START, turned(1.2)]), "test")
     assert result is not None
     assert len(result.progress) == 1 and result.progress[0][0] < result.planning_time
 
 
-def test_failure_tells_what_the_validator_refused() -> None:
-    context = PlanningContext("test", blocked(), time_limit=10.0, seed=0)
+def test_failures_name_what_the_validator_refused() -> None:
+    context = PlanningContext("test", blocked(), PlanRequest(time_limit=10.0))
     assert context.unsolved().refused == ""
     assert context.finish(np.stack([START, turned(1.2)]), "test") is None
     assert context.unsolved().refused == "scene_collision"
@@ -62,10 +62,10 @@ def test_failure_tells_what_the_validator_refused() -> None:
     assert context.unsolved().refused == "goal"
 
 
-def test_a_search_that_ended_is_told_from_one_that_ran_out_of_time() -> None:
-    ended = PlanningContext("test", blocked(), time_limit=10.0, seed=0).unsolved()
+def test_a_search_that_ended_differs_from_one_that_ran_out_of_time() -> None:
+    ended = PlanningContext("test", blocked(), PlanRequest(time_limit=10.0)).unsolved()
     assert ended.status is Status.NO_PATH and "the search ended" in ended.reason
-    late = PlanningContext("test", blocked(), time_limit=1e-9, seed=0).unsolved()
+    late = PlanningContext("test", blocked(), PlanRequest(time_limit=1e-9)).unsolved()
     assert late.status is Status.TIMEOUT and "longer time limit" in late.reason
 
 
@@ -80,7 +80,7 @@ def test_anytime_planner_reports_its_progress() -> None:
 
 def test_compiling_takes_no_time_of_the_call_and_is_noted() -> None:
     began = time.perf_counter()
-    context = call_on(Scene([]))
+    context = context_for(Scene([]))
     before = context.elapsed
     njit(lambda x: x + 1)(1)
     waited, counted = time.perf_counter() - began, context.elapsed - before
@@ -90,7 +90,7 @@ def test_compiling_takes_no_time_of_the_call_and_is_noted() -> None:
 
 
 def test_a_solved_call_imports_no_toppra_and_no_matplotlib() -> None:
-    """toppra, which imports matplotlib, once cost the first call over a second; it is for who selects it."""
+    """Regression: importing toppra, and with it matplotlib, cost the first call over a second."""
     code = (
         "import sys, numpy as np, robotdiffuse as rd\n"
         f"start = np.array({START.tolist()})\n"

@@ -1,11 +1,16 @@
-"""What holds of every planner in the table: solved means verified, anything else comes with a reason."""
+"""Properties of every planner in the table: solved means verified, anything else comes with a reason."""
+
+import inspect
+from dataclasses import fields
 
 import numpy as np
 import pytest
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
-from robotdiffuse.planning import PLANNERS, SEARCH, load_planner
+from robotdiffuse.planning import PLANNERS, SEARCH, load_planner, plan
+from robotdiffuse.planning.context import PlanRequest
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.held_out import held_out_problem
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -46,7 +51,7 @@ def test_nothing_in_the_way_is_solved_by_all(name: str) -> None:
     assert result.path_length is not None and result.path_length >= np.linalg.norm(GOAL - START) - 1e-6
 
 
-def test_buried_goal_is_told(name: str) -> None:
+def test_a_goal_in_collision_is_reported(name: str) -> None:
     problem = Problem(load_robot("panda"), Scene([Sphere((0.2, 0.5, 0.5), 0.3)]), START, GOAL)
     result = load_planner(name).plan(problem, time_limit=1.0)
     assert result.status is Status.INVALID_GOAL and "in collision" in result.reason
@@ -72,3 +77,13 @@ def test_weights_are_for_learned_planners_alone(name: str) -> None:
     learned = PLANNERS[name].kind != SEARCH
     with pytest.raises(InputError, match="nowhere" if learned else "has no weights"):
         load_planner(name, weights="nowhere").plan(Problem(load_robot("panda"), Scene([]), START, GOAL))
+
+
+def test_plan_takes_the_fields_of_a_request() -> None:
+    """`Planner.plan` and `rd.plan` name the arguments for help(); names and defaults are those of
+    PlanRequest."""
+    request = [(field.name, field.default) for field in fields(PlanRequest)]
+    for function in (plan, Planner.plan):
+        arguments = list(inspect.signature(function).parameters.values())
+        arguments = [argument for argument in arguments if argument.name not in ("self", "problem")]
+        assert [(argument.name, argument.default) for argument in arguments] == request

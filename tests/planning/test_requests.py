@@ -1,5 +1,5 @@
-"""The whole table: whatever a problem or a call may ask for, every planner does it or refuses it by one line
-that names the planner and what it cannot do."""
+"""Every planner fulfils each kind of request, or refuses it with one line that names the planner and what it
+does not support."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -14,8 +14,8 @@ import robotdiffuse as rd
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast
-from robotdiffuse.planning import PLANNERS, load_planner
-from robotdiffuse.planning.planner import ABLE, CLEARANCE, CONSTRAINTS, Planner
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, PLANNERS, load_planner, planners_that_support
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.validation.validator import verify, verify_trajectory
@@ -35,7 +35,7 @@ class Asked(NamedTuple):
     problem: Callable[[], Problem]
     request: Mapping[str, Any] = MappingProxyType({})
     needs: tuple[str, ...] = ()
-    """What a planner must be able to keep."""
+    """What a planner must support."""
 
 
 def _goal(goal: object) -> Callable[[], Problem]:
@@ -91,17 +91,17 @@ ASKED: dict[str, Asked] = {
     "no clearance": Asked(lambda: PLAIN, {"clearance": 0.0}),
     "clearance": Asked(lambda: PLAIN, {"clearance": 0.03}, (CLEARANCE,)),
     "clearance of the problem": Asked(lambda: replace(PLAIN, clearance=0.03), {}, (CLEARANCE,)),
-    "cone": Asked(_constrained(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2)), {}, (CONSTRAINTS,)),
-    "box": Asked(_constrained(rd.PositionBox(HAND, [0, -1, 0], [1, 1, 1])), {}, (CONSTRAINTS,)),
-    "plane": Asked(_constrained(rd.OnPlane(HAND, T_GOAL[:3, 3], [0, 0, 1], 0.05)), {}, (CONSTRAINTS,)),
+    "cone": Asked(_constrained(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2)), {}, (PATH_CONSTRAINTS,)),
+    "box": Asked(_constrained(rd.PositionBox(HAND, [0, -1, 0], [1, 1, 1])), {}, (PATH_CONSTRAINTS,)),
+    "plane": Asked(_constrained(rd.OnPlane(HAND, T_GOAL[:3, 3], [0, 0, 1], 0.05)), {}, (PATH_CONSTRAINTS,)),
     "line": Asked(
         _constrained(
             rd.OnLine(HAND, T_GOAL[:3, 3], T_GOAL[:3, 3] - link_pose(PANDA, START, HAND)[:3, 3], 0.01)
         ),
         {},
-        (CONSTRAINTS,),
+        (PATH_CONSTRAINTS,),
     ),
-    "Cartesian line": Asked(_constrained(rd.CartesianLine(HAND, 0.002, 0.05, 0.2)), {}, (CONSTRAINTS,)),
+    "Cartesian line": Asked(_constrained(rd.CartesianLine(HAND, 0.002, 0.05, 0.2)), {}, (PATH_CONSTRAINTS,)),
 }
 
 
@@ -121,7 +121,7 @@ def _all_of_it() -> Problem:
     )
 
 
-ASKED["all of it"] = Asked(_all_of_it, {"clearance": 0.02, "jerk": 100.0}, (CONSTRAINTS, CLEARANCE))
+ASKED["all of it"] = Asked(_all_of_it, {"clearance": 0.02, "jerk": 100.0}, (PATH_CONSTRAINTS, CLEARANCE))
 PASSING = rd.MovingObstacle(rd.Sphere([0.9, -0.6, 0.5], 0.1, name="ball"), velocity=[0.0, 0.8, 0.0])
 ASKED["moving"] = Asked(lambda: replace(PLAIN, moving=(PASSING,)))
 ASKED["moving and waypoints"] = Asked(
@@ -130,11 +130,13 @@ ASKED["moving and waypoints"] = Asked(
 ASKED["moving and a cone"] = Asked(
     lambda: replace(PLAIN, moving=(PASSING,), constraints=(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2),)),
     {},
-    (CONSTRAINTS,),
+    (PATH_CONSTRAINTS,),
 )
 ASKED["start velocity"] = Asked(lambda: replace(PLAIN, start_velocity=[0.1, 0, 0, 0, 0, 0, 0]))
 ASKED["views and a cone"] = Asked(
-    lambda: replace(_seen(), constraints=(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2),)), {}, (CONSTRAINTS,)
+    lambda: replace(_seen(), constraints=(rd.AxisCone(HAND, [0, 0, 1], [0, 0, -1], 0.2),)),
+    {},
+    (PATH_CONSTRAINTS,),
 )
 
 
@@ -154,9 +156,11 @@ def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> N
     if name.startswith("ompl_"):
         pytest.importorskip("ompl", reason="the extra `baselines` (ompl) is not installed")
     planner, problem, (_, request, needs) = planner_named(name), problem_of(asked), ASKED[asked]
-    lacking = next((what for what in needs if what not in planner.keeps), None)
+    lacking = next((what for what in needs if what not in planner.supports), None)
     if lacking is not None:
-        with pytest.raises(InputError, match=f"planner {name} cannot keep {lacking}; these can: ") as refused:
+        with pytest.raises(
+            InputError, match=f"planner {name} does not support {lacking}; these do: "
+        ) as refused:
             planner.plan(problem, time_limit=3.0, **request)
         assert "\n" not in str(refused.value)
         return
@@ -165,7 +169,9 @@ def test_every_request_is_met_or_refused_by_one_line(name: str, asked: str) -> N
     assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
 
 
-@pytest.mark.parametrize("what", [CONSTRAINTS, CLEARANCE])
-def test_the_planners_that_can_are_those_that_messages_name(what: str) -> None:
-    able = {name for name in PLANNERS if not name.startswith("ompl_") and what in planner_named(name).keeps}
-    assert able == set(ABLE[what].split(", "))
+@pytest.mark.parametrize("what", [PATH_CONSTRAINTS, CLEARANCE])
+def test_messages_name_the_planners_that_support_a_request(what: str) -> None:
+    able = {
+        name for name in PLANNERS if not name.startswith("ompl_") and what in planner_named(name).supports
+    }
+    assert able == set(planners_that_support(what))

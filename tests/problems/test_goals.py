@@ -117,7 +117,7 @@ def test_one_motion_stops_at_waypoints_in_their_order() -> None:
     assert verify(problem, result.path).valid and verify_trajectory(problem, result.trajectory).valid
     assert stops(result.trajectory, np.array(MIDDLE)) and stops(result.trajectory, np.array(END))
     assert (np.diff(result.trajectory.times) > 0).all()
-    assert "4 legs" in result.reason
+    assert "4 segments" in result.reason
     other = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[way[1], way[0], END, START])
     found = verify(other, result.path).violation
     assert found is not None and found.kind == "waypoint" and "waypoints[1]" in found.message
@@ -168,7 +168,7 @@ def test_each_waypoint_has_its_own_blend() -> None:
     )
     result = rd.plan(problem, time_limit=10.0)
     assert result.trajectory is not None and verify_trajectory(problem, result.trajectory).valid
-    assert stops(result.trajectory, np.array(MIDDLE)) and "4 legs" in result.reason
+    assert stops(result.trajectory, np.array(MIDDLE)) and "4 segments" in result.reason
     middle = result.trajectory.times[[0, -1]].mean()
     moving = np.linalg.norm(result.trajectory.velocities, axis=1) > 1e-3
     resting = result.trajectory.times[~moving]
@@ -189,7 +189,7 @@ def test_the_leg_that_fails_is_named() -> None:
     )
     problem = rd.Problem(ROBOT, rd.Scene([POST]), START, END, waypoints=[MIDDLE, blocked])
     result = rd.plan(problem, time_limit=1.0)
-    assert result.status is Status.INVALID_GOAL and result.reason.startswith("leg 2 of 3: all")
+    assert result.status is Status.INVALID_GOAL and result.reason.startswith("segment 2 of 3: all")
 
 
 def test_files_keep_goals_and_waypoints(tmp_path: Path) -> None:

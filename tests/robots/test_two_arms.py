@@ -23,7 +23,7 @@ from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import reach_bound
 from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.core.errors import InputError
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.robots.fingerprint import robot_fingerprint
 from robotdiffuse.robots.fitting.covering_spheres import cover
 from robotdiffuse.robots.inertias import Payload, inertia_of
@@ -242,7 +242,7 @@ def test_the_first_robot_of_several_arms_compiles_which_is_said_and_takes_no_tim
     problem = rd.Problem(robot=robot, scene=rd.Scene(), start=q, goal=q)
     load_and_plan(problem, "rrt_connect", time_limit=20.0)
     assert "the first robot of several arms compiles first" in shown[0]
-    began, call = time.perf_counter(), PlanningContext("test", problem, time_limit=20.0, seed=0)
+    began, call = time.perf_counter(), PlanningContext("test", problem, PlanRequest(time_limit=20.0))
     before = call.elapsed
     njit(lambda parents: parent_of(parents, 3))(robot.branching)
     waited = time.perf_counter() - began

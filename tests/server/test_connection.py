@@ -210,7 +210,7 @@ def test_a_cancelled_call_is_left_when_it_checks_its_time(monkeypatch: pytest.Mo
     worker.accept({}, 1.0, shared)
 
     def planning(*_: object) -> worker.Answer:
-        call = PlanningContext("aorrtc", Problem(box_arm(), Scene(), np.zeros(3), np.ones(3)), 1.0, 0)
+        call = PlanningContext("aorrtc", Problem(box_arm(), Scene(), np.zeros(3), np.ones(3)))
         assert call.remaining > 0
         shared.cancelled = 7
         assert call.remaining > 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import robotdiffuse as rd
-from robotdiffuse.planning.reactive.timed_path import Course, Speeds
+from robotdiffuse.planning.reactive.timed_path import SpeedProfile, TimedPath
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
 
 PANDA = rd.load_robot("panda")
@@ -15,7 +15,7 @@ def test_steps_keep_limits_and_end_at_rest(seed: int) -> None:
     rng = np.random.default_rng(seed)
     waypoints = np.cumsum(rng.normal(size=(6, 7)) * 0.4, axis=0)
     line = BlendedPolyline(waypoints, half_widths(waypoints, np.full(4, 0.1)))
-    course, left = Course(PANDA, line, True), Speeds(np.zeros(2), np.zeros(2))
+    course, left = TimedPath(PANDA, line, True), SpeedProfile(np.zeros(2), np.zeros(2))
     for k in range(400):
         s, speed = float(left.s[0]), float(left.speeds[0])
         if s >= course.end:
@@ -39,4 +39,4 @@ def test_fastest_motion_to_the_end_is_that_of_the_timing() -> None:
     waypoints = np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)])
     line = BlendedPolyline(waypoints, half_widths(waypoints, np.array([0.1])))
     fastest = timed_piece(PANDA, line, TimingSettings())[0][-1]
-    assert Course(PANDA, line, True).onwards(0.0, 0.0).duration == pytest.approx(fastest, rel=0.05)
+    assert TimedPath(PANDA, line, True).onwards(0.0, 0.0).duration == pytest.approx(fastest, rel=0.05)

@@ -19,6 +19,8 @@ class Entry:
     """Name of its settings class in the same module; empty for none."""
     kind: str = ""
     """Category within its registry, e.g. search, learned or hybrid for planners."""
+    supports: frozenset[str] = frozenset()
+    """Features that not every entry of the registry supports, e.g. path constraints for planners."""
 
 
 AddedEntries = dict[str, dict[str, Entry]]

@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.core.settings import Bound, Count, Natural, NotNegative, Positive, Settings
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings
 from robotdiffuse.planning.start_goal import END_MARGIN, StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
@@ -67,7 +67,7 @@ class AORRTCSearch:
         problem = Problem(
             checker.robot, checker.scene, start.astype(np.float64), JointGoal(goals.astype(np.float64))
         )
-        context = PlanningContext("aorrtc", problem, NO_TIME_LIMIT, int(state[0] >> np.uint64(32)))
+        context = PlanningContext("aorrtc", problem, PlanRequest(NO_TIME_LIMIT, int(state[0] >> np.uint64(32))))
         has = checker.link_clearances(np.stack([start, *goals]).astype(np.float32)).min(axis=1, initial=1.0)
         self._distances = _descending_distances(settings, (float(has[0]), float(has[1:].max())))
         search = SearchSettings(range=settings.range, resolution=settings.resolution)
@@ -85,7 +85,7 @@ class AORRTCSearch:
         while search.best is None and search.work < most and not stop():
             search.first(inf, work=ITERATIONS_PER_STEP)
         while search.best is not None and not (search.shortest or stop()):
-            if not search.pays(settings.gain, settings.patience):
+            if not search.improves(settings.gain, settings.patience):
                 break
             search.improve(inf, ITERATIONS_PER_STEP)
         if search.best is not None:

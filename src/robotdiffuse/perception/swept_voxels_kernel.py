@@ -1,28 +1,28 @@
-"""Which voxels an arm sweeps, in compiled code."""
+"""The voxels that an arm sweeps, in compiled code."""
 
 import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.distance import frames_of, placed
 
-STEP = np.float32(0.05)
-"""Largest motion of a joint between two looks [rad], [m] where it slides."""
-STILL = np.float32(0.1)
-"""A sphere that moved by no more since it was last looked at has not moved, as a share of a voxel's edge."""
+JOINT_STEP = np.float32(0.05)
+"""Largest motion of a joint between two samples [rad], [m] for prismatic joints."""
+MIN_MOVE = np.float32(0.1)
+"""A sphere is marked again once it has moved by more than this, as a fraction of a voxel's edge."""
 
 
 @njit(cache=True, nogil=True)
 def sweep(robot, path, low, voxel, swept):
-    """Mark the voxels whose centres a moving covering sphere passes over; `swept` is bool[nx, ny, nz].
+    """Mark the voxels with centres that the moving covering spheres pass over; `swept` is bool[nx, ny, nz].
 
     robot: RobotArrays; path float32[n, dof]; low [3] corner of the voxels and `voxel`, their edge [m].
     """
     dof = path.shape[1]
     frames, q = np.zeros((dof + 1, 12), np.float32), np.empty(dof, np.float32)
-    last, still = np.full((len(robot.spheres), 3), np.inf, np.float32), (STILL * voxel) ** 2
+    last, still = np.full((len(robot.spheres), 3), np.inf, np.float32), (MIN_MOVE * voxel) ** 2
     for i in range(max(len(path) - 1, 1)):
         a, b = path[i], path[min(i + 1, len(path) - 1)]
-        steps = max(int(np.ceil(np.abs(b - a).max() / STEP)), 1)
+        steps = max(int(np.ceil(np.abs(b - a).max() / JOINT_STEP)), 1)
         for step in range(steps + 1):
             for j in range(dof):
                 q[j] = a[j] + np.float32(step / steps) * (b[j] - a[j])
@@ -42,7 +42,7 @@ def sweep(robot, path, low, voxel, swept):
 
 @njit(cache=True, nogil=True)
 def mark(spheres, low, voxel, marked):
-    """Mark the voxels whose centres are in one of the spheres [n, 4]."""
+    """Mark the voxels with centres in one of the spheres [n, 4]."""
     for s in range(len(spheres)):
         _mark(spheres[s, 0], spheres[s, 1], spheres[s, 2], spheres[s, 3], low, voxel, marked)
 
@@ -87,7 +87,7 @@ def _mark(x, y, z, radius, low, voxel, marked):
 
 @njit(cache=True, nogil=True, fastmath=True)
 def summed(weights, marked):
-    """The sum of the weights of what is marked; both [nx, ny, nz]."""
+    """The sum of the weights of the marked voxels; both [nx, ny, nz]."""
     total, weight, mark = 0.0, weights.ravel(), marked.ravel()
     for i in range(len(mark)):
         total += weight[i] if mark[i] else np.float32(0.0)
@@ -96,20 +96,20 @@ def summed(weights, marked):
 
 @njit(cache=True, nogil=True)
 def heaviest_part(marked, weights):
-    """Corners int64[2, 3] of the box around the connected part of what is marked that weighs most: first and
-    one beyond the last voxel. Voxels are connected that share a face."""
+    """Bounding box int64[2, 3] of the connected part of the marked voxels with the largest sum of weights:
+    first voxel and one beyond the last. Voxels that share a face are connected."""
     todo, left = np.empty((marked.sum(), 3), np.int64), marked.copy()
     best, most = np.zeros((2, 3), np.int64), -1.0
     for i, j, k in np.argwhere(marked):
-        count, done, weight = _also(i, j, k, left, todo, 0), 0, 0.0
+        count, done, weight = _push(i, j, k, left, todo, 0), 0, 0.0
         while done < count:
             x, y, z = todo[done, 0], todo[done, 1], todo[done, 2]
             done += 1
             weight += weights[x, y, z]
             for way in (-1, 1):
-                count = _also(x + way, y, z, left, todo, count)
-                count = _also(x, y + way, z, left, todo, count)
-                count = _also(x, y, z + way, left, todo, count)
+                count = _push(x + way, y, z, left, todo, count)
+                count = _push(x, y + way, z, left, todo, count)
+                count = _push(x, y, z + way, left, todo, count)
         if weight > most and count:
             most = weight
             for axis in range(3):
@@ -118,8 +118,8 @@ def heaviest_part(marked, weights):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _also(i, j, k, left, todo, count):
-    """Put a voxel that is left on the list; how many there are now."""
+def _push(i, j, k, left, todo, count):
+    """Move a voxel from `left` to the list `todo`; returns the length of the list."""
     nx, ny, nz = left.shape
     if 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and left[i, j, k]:
         left[i, j, k] = False

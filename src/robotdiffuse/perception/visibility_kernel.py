@@ -1,17 +1,18 @@
-"""What cameras would see of voxels behind others that may be filled, in compiled code."""
+"""Which voxels a camera would see through voxels that may be occupied, in compiled code."""
 
 import numpy as np
 from numba import njit
 
-AWAY = np.float32(2.0)
-"""How far from a voxel what hides it begins, in edges: its neighbours are as unknown as it is."""
-OPAQUE = np.float32(0.02)
-"""Chance of seeing through that counts as none."""
+OCCLUSION_START = np.float32(2.0)
+"""Voxels nearer to a voxel than this do not hide it, in edges: its neighbours are as unknown as it is."""
+MIN_VISIBILITY = np.float32(0.02)
+"""Smaller probabilities of seeing through count as zero."""
 
 
 @njit(cache=True, nogil=True)
 def seen_weights(poses, intrinsics, size, voxels, weights, filled, low, edge):
-    """For each camera the sum of the weights of the voxels that it sees, each by the chance that it does.
+    """For each camera the sum of the weights of the voxels, each times the probability that the camera sees
+    it.
 
     poses [m, 4, 4]: T_base_camera; intrinsics fx, fy, cx, cy; size: height and width of the image; voxels
     int64[n, 3]; weights [n]; filled [nx, ny, nz]: the probability that a voxel hides what is behind; low
@@ -36,8 +37,8 @@ def seen_weights(poses, intrinsics, size, voxels, weights, filled, low, edge):
                 continue
             far = np.sqrt(dx * dx + dy * dy + dz * dz)
             dx, dy, dz = dx / far, dy / far, dz / far
-            chance, way = one, AWAY
-            while way < far and chance > OPAQUE:
+            chance, way = one, OCCLUSION_START
+            while way < far and chance > MIN_VISIBILITY:
                 i, j, k = (
                     int(np.floor(x + way * dx)),
                     int(np.floor(y + way * dy)),
@@ -47,5 +48,5 @@ def seen_weights(poses, intrinsics, size, voxels, weights, filled, low, edge):
                     break
                 chance *= one - filled[i, j, k]
                 way += one
-            out[c] += weights[n] * chance if chance > OPAQUE else 0.0
+            out[c] += weights[n] * chance if chance > MIN_VISIBILITY else 0.0
     return out

@@ -17,11 +17,13 @@ if TYPE_CHECKING:
 
 
 SEARCH, LEARNED, HYBRID = "search", "learned", "hybrid"
-"""Kinds of planners: without a network; a network's motions alone, with guidance or without; both."""
+"""Kinds of planners: without a network; only a network's motions, with or without guidance; both."""
+PATH_CONSTRAINTS, CLEARANCE = "path constraints", "a requested clearance"
+"""What not every planner supports."""
 
 
-def _entry(location: str, settings: str, kind: str, description: str) -> Entry:
-    return Entry(f"robotdiffuse.planning.{location}", description, settings, kind)
+def _entry(location: str, settings: str, kind: str, description: str, *supports: str) -> Entry:
+    return Entry(f"robotdiffuse.planning.{location}", description, settings, kind, frozenset(supports))
 
 
 def _ompl(algorithm: str, description: str) -> Entry:
@@ -35,25 +37,32 @@ PLANNERS = Registry(
             "diffusion.hybrid:RobotDiffuse",
             "RobotDiffuseSettings",
             HYBRID,
-            "the diffusion model under guidance, refinement, and search around them (the default)",
+            "the diffusion model with guidance and refinement, and a search around them (the default)",
+            PATH_CONSTRAINTS,
+            CLEARANCE,
         ),
         "diffusion": _entry(
             "diffusion.diffusion:Diffusion",
             "DiffusionSettings",
             LEARNED,
-            "the paper's method alone: encoder, sampling, guidance; no search, nothing shortened",
+            "the paper's method alone: encoder, sampling, guidance; no search, no simplification",
+            PATH_CONSTRAINTS,
         ),
         "aorrtc": _entry(
             "search.aorrtc:AORRTC",
             "AORRTCSettings",
             SEARCH,
-            "two trees below a bound that falls: the shortest paths for the time",
+            "two trees below a falling bound on path length: the shortest paths for the time",
+            PATH_CONSTRAINTS,
+            CLEARANCE,
         ),
         "rrt_connect": _entry(
             "search.rrt_connect:RRTConnect",
             "RRTConnectSettings",
             SEARCH,
             "two trees grown towards each other, then simplification; restarts while time is left",
+            PATH_CONSTRAINTS,
+            CLEARANCE,
         ),
         "shared_tree_rrt_star": _entry(
             "search.shared_tree.planner:SharedTreeRRTStar",
@@ -92,7 +101,7 @@ PLANNERS = Registry(
             "baselines.lattice.planner:DStarLite",
             "DStarLiteSettings",
             SEARCH,
-            "D* Lite on a lattice of joint values; mends its search when the scene changes",
+            "D* Lite on a lattice of joint values; repairs its search when the scene changes",
         ),
         "ompl_rrt": _ompl("RRT", "RRT, then its path simplifier"),
         "ompl_rrt_connect": _ompl("RRTConnect", "RRT-Connect, then its path simplifier"),
@@ -107,13 +116,13 @@ DEFAULT_PLANNER = "robotdiffuse"
 
 
 def load_planner(name: str, settings: object | None = None, weights: str | None = None) -> "Planner":
-    """A planner by name, with the given settings (its own dataclass) or its default ones.
+    """The planner of a name, with the given settings (of its own dataclass) or its default ones.
 
-    weights: folder of a learned planner's own weights, in place of those that come with the package; not
-    beside settings, which name them too.
+    weights: folder with weights for a learned planner, in place of those that come with the package. With
+    settings, name the folder there instead.
 
-    Raises InputError for an unknown name, settings of another planner, weights that cannot be read or for a
-    planner that has none.
+    Raises InputError for an unknown name, for settings of another planner, for both settings and weights, for
+    weights that cannot be read, and for weights for a planner that takes none.
     """
     if weights is not None:
         if settings is not None:
@@ -126,14 +135,19 @@ def load_planner(name: str, settings: object | None = None, weights: str | None 
 
 
 def planner_settings(name: str, assignments: Iterable[str]) -> Settings:
-    """The settings of a planner with some replaced: "range=0.5", "guidance.margin=0.02".
+    """The default settings of a planner with some replaced: "range=0.5", "guidance.margin=0.02".
 
-    Raises InputError for an unknown planner, a setting that it does not have and a value that it cannot be.
+    Raises InputError for an unknown planner, an unknown setting and a value out of bounds.
     """
     kind = PLANNERS.settings(name)
     if kind is None:
         raise InputError(f"planner {name} has no settings")
     return kind().changed(assignments)
+
+
+def planners_that_support(what: str) -> list[str]:
+    """The names of the planners that support PATH_CONSTRAINTS or CLEARANCE."""
+    return [name for name, entry in PLANNERS.items() if what in entry.supports]
 
 
 @cache
@@ -151,10 +165,10 @@ def plan(
     acceleration_scaling: float = 1.0,
     jerk: float | None = None,
 ) -> "PlanResult":
-    """Plan with the default planner, which is loaded once; the arguments are those of
-    `planning.planner.Planner.plan`.
+    """Plan with the default planner, which is loaded once.
 
-    The result holds a verified motion or a status that says why there is none.
+    The arguments, and what they mean, are those of `planning.planner.Planner.plan`. The result holds a
+    verified motion, or a status and a reason why there is none.
     """
     limits = velocity_scaling, acceleration_scaling, jerk
     return _default().plan(problem, time_limit, seed, until, clearance, *limits)

@@ -1,4 +1,4 @@
-"""One call of a planner: its clock, its random numbers, and the results that it can end with."""
+"""What a call of a planner asks for, and the call itself: its clock, its random numbers and its results."""
 
 import time
 from collections.abc import Callable
@@ -15,9 +15,9 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.deadline import OutOfTimeError, check_left, deadline
-from robotdiffuse.core.errors import InputError, shown
+from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.core.settings import Bound, OneOf, Settings
+from robotdiffuse.core.settings import Bound, Natural, OneOf, Settings
 from robotdiffuse.core.types import CONVERGED, UNTIL, Path, Status, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.trajectories.speed_limits import (
@@ -32,24 +32,26 @@ from robotdiffuse.trajectories.speed_limits import (
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.validator import Report, Verifier, Violation, verifier
 
-CLEARANCE = 0.01
-"""What neither call nor problem says [m]."""
-
-CLOSE_ROWS = 0.002
-"""Time between the rows of motions under path constraints, whose corners are many and near to each other
-[s]."""
-AMPLE = 5.0
-"""Times that a path could be validated and timed in the time left, where the first one found is at once."""
-MOST_RESERVED = 0.5
-"""Share of the time limit that is kept back at most before a path is validated."""
-_finishing: dict[str, float] = {}
-"""What validating and timing took of late, by robot [s]: so much of a call's time is kept back for it."""
+DEFAULT_CLEARANCE = 0.01
+"""Clearance where neither the request nor the problem sets one [m]."""
+CONSTRAINED_SAMPLE_TIME = 0.002
+"""Time between the rows of motions under path constraints [s]: their paths have many corners, close
+together."""
+EARLY_VALIDATION_FACTOR = 5.0
+"""The first path is validated at once if at least this many validations still fit in the time left."""
+MAX_RESERVED_FRACTION = 0.5
+"""Largest part of the time limit that is reserved for validation and timing."""
+_validation_seconds: dict[str, float] = {}
+"""Running mean of the time that validating and timing a path takes, by robot name [s]."""
 
 
 @dataclass(frozen=True)
-class Request(Settings):
-    """What a call may ask for beyond its time limit and seed; see `planning.planner.Planner.plan`."""
+class PlanRequest(Settings):
+    """What a call of a planner asks for besides its problem: the arguments of `Planner.plan`, which documents
+    them."""
 
+    time_limit: Annotated[float, Bound(above=0.0, most=1e9)] = 1.0
+    seed: Natural = 0
     until: Annotated[str, OneOf(UNTIL)] = CONVERGED
     clearance: Annotated[float, Bound(least=0.0, most=MAX_COORDINATE)] | None = None
     velocity_scaling: Scaling = 1.0
@@ -58,67 +60,58 @@ class Request(Settings):
 
 
 @lru_cache
-def _timing(request: Request, constrained: bool) -> TimingSettings:
-    """Checked once for equal requests: it takes longer than to use them."""
+def _timing(
+    velocity_scaling: float, acceleration_scaling: float, jerk: float | None, constrained: bool
+) -> TimingSettings:
+    """The timing settings of a request, cached because checking them takes longer than using them."""
     return TimingSettings(
-        sample_time=CLOSE_ROWS if constrained else DEFAULT.sample_time,
-        velocity_scale=request.velocity_scaling,
-        acceleration_scale=request.acceleration_scaling,
-        jerk=request.jerk,
+        sample_time=CONSTRAINED_SAMPLE_TIME if constrained else DEFAULT.sample_time,
+        velocity_scale=velocity_scaling,
+        acceleration_scale=acceleration_scaling,
+        jerk=jerk,
     )
 
 
-def check_asked(problem: object, time_limit: object, seed: object) -> None:
-    """Raises InputError for what is no problem, a time limit that is not positive and a seed that is no
-    whole number from 0 on."""
-    check_problem(problem)
-    if not isinstance(time_limit, Real) or not 0 < float(time_limit) < float("inf"):
-        raise InputError(f"time_limit is {shown(time_limit)}; it must be a positive number of seconds")
-    if not isinstance(seed, Integral) or seed < 0:
-        raise InputError(f"seed is {shown(seed)}; it must be a whole number, at least 0")
-
-
 class PlanningContext:
-    """One call of plan(); see the head of this file."""
+    """One call of a planner: the problem, the request, the clock, and the ways to end with a result.
 
-    def __init__(
-        self,
-        planner: str,
-        problem: Problem,
-        time_limit: float,
-        seed: int,
-        request: Request = Request(),
-    ) -> None:
-        """Starts the clock. Raises InputError as `check_asked`."""
+    A planner reads `remaining`, draws from `rng`, reports lengths to `improved`, and returns the result of
+    `finish` for a path or of `unsolved` without one.
+    """
+
+    def __init__(self, planner_name: str, problem: Problem, request: PlanRequest = PlanRequest()) -> None:
+        """Starts the clock. Raises InputError if `problem` is not a Problem."""
         self.started, self._compiled = time.perf_counter(), compile_seconds()
-        check_asked(problem, time_limit, seed)
-        self.planner, self.problem, self.time_limit, self.seed = planner, problem, time_limit, seed
-        self.until = request.until
-        wanted = (request.clearance, problem.clearance, CLEARANCE)
+        check_problem(problem)
+        self.planner_name, self.problem, self.request = planner_name, problem, request
+        wanted = (request.clearance, problem.clearance, DEFAULT_CLEARANCE)
         self.clearance = next(value for value in wanted if value is not None)
-        """Distance to obstacles that is to be kept where it can be [m]."""
-        self.timing = _timing(request, constrained=bool(problem.constraints))
-        self._reserved = min(_finishing.get(problem.robot.name, 0.0), MOST_RESERVED * time_limit)
+        """Distance to obstacles that paths keep where they can [m]."""
+        scalings = request.velocity_scaling, request.acceleration_scaling
+        self.timing = _timing(*scalings, request.jerk, constrained=bool(problem.constraints))
+        expected = _validation_seconds.get(problem.robot.name, 0.0)
+        self._reserved = min(expected, MAX_RESERVED_FRACTION * request.time_limit)
         self.validator = verifier(problem)
         self.notes = list(problem.notes)
-        """What the result will say was changed or ignored; planners may add to it."""
+        """Notes of the result, on what was changed or ignored; planners may add to them."""
         self._progress: list[tuple[float, float]] = []
         self._refused = ""
         self._ended: tuple[Status, str] | None = None
 
     @cached_property
     def rng(self) -> np.random.Generator:
-        """Random numbers of what is not compiled."""
-        return np.random.default_rng(self.seed)
+        """The random generator of this call, for code that is not compiled."""
+        return np.random.default_rng(self.request.seed)
 
     def improved(self, length: float) -> None:
-        """Note that a path of this joint-space length [rad] was just found; longer ones are passed over."""
+        """Note the joint-space length [rad] of a path that was just found; ignored unless it is the
+        shortest."""
         if not self._progress or length < self._progress[-1][1]:
             self._progress.append((self.elapsed, length))
 
     @property
     def elapsed(self) -> float:
-        """Wall time since the call began, less what compiling took, once on a machine [s]."""
+        """Wall time since the call began, without the time for compiling kernels, once on a machine [s]."""
         check_left()
         return time.perf_counter() - self.started - self._compiling
 
@@ -128,7 +121,7 @@ class PlanningContext:
 
     @property
     def _all_notes(self) -> tuple[str, ...]:
-        """With what was not counted."""
+        """The notes, and how long compiling took, which does not count as planning time."""
         if self._compiling == 0:
             return tuple(self.notes)
         spent = f"compiled for {self._compiling:.1f} s, once on this machine, which does not count as time"
@@ -136,34 +129,36 @@ class PlanningContext:
 
     @property
     def search_until(self) -> float:
-        """When searching must end so that there is time left for `finish` [s since the call]."""
-        return self.time_limit - self._reserved
+        """When searching must end to leave time for `finish` [s since the call]."""
+        return self.request.time_limit - self._reserved
 
     @property
-    def ample(self) -> bool:
-        """Whether validating a first path takes a small part of the time that is left."""
-        return self._reserved > 0 and self.remaining > AMPLE * self._reserved
+    def validates_early(self) -> bool:
+        """Whether there is time to validate paths while the search goes on."""
+        return self._reserved > 0 and self.remaining > EARLY_VALIDATION_FACTOR * self._reserved
 
     @property
     def remaining(self) -> float:
-        """Wall time left for searching [s]; negative when it has run out, or is too short for the validator."""
+        """Wall time left for searching [s]; negative once it has run out, or once no path can be finished any
+        more."""
         return -1.0 if self._ended else self.search_until - self.elapsed
 
     def fail(self, status: Status, reason: str) -> PlanResult:
-        """A result without a motion."""
+        """The result of a call that found no motion."""
         return PlanResult(
             status=status,
             reason=reason,
-            planner=self.planner,
+            planner=self.planner_name,
             robot=self.problem.robot.name,
             planning_time=self.elapsed,
-            seed=self.seed,
+            seed=self.request.seed,
             notes=self._all_notes,
             refused=self._refused,
         )
 
     def unsolved(self, reason: str = "") -> PlanResult:
-        """A result without a path: TIMEOUT if time has run out, else NO_PATH, for a search that ended."""
+        """The result of a search without a path: TIMEOUT if time has run out, NO_PATH if the search ended by
+        itself."""
         if self._ended:
             return self.fail(*self._ended)
         if self.remaining <= 0:
@@ -175,20 +170,20 @@ class PlanningContext:
         return self.fail(Status.NO_PATH, reason or ended)
 
     def deadline(self) -> AbstractContextManager[None]:
-        """The call's time holds for steps far below while this lasts: they raise OutOfTimeError."""
-        return deadline(lambda: self.time_limit - self.elapsed)
+        """A context manager within which long steps raise OutOfTimeError when the call's time runs out."""
+        return deadline(lambda: self.request.time_limit - self.elapsed)
 
     def out_of_time(self, error: OutOfTimeError) -> PlanResult:
-        """A result for a scene whose preparation, or a motion whose timing, takes longer than it may."""
+        """The result of a call that ran out of time while preparing the scene or timing a motion."""
         return self.fail(Status.TIMEOUT, self._too_short(error))
 
     def _too_short(self, error: OutOfTimeError) -> str:
-        limit = f"the time limit of {self.time_limit:g} s is too short {error.what}"
+        limit = f"the time limit of {self.request.time_limit:g} s is too short {error.what}"
         return f"{limit}: there was no time for {error}"
 
     @property
     def ended(self) -> bool:
-        """Whether no path can be finished any more; `unsolved` says why."""
+        """Whether no path can be finished in this call any more; `unsolved` gives the reason."""
         return self._ended is not None
 
     def finish(
@@ -200,10 +195,11 @@ class PlanningContext:
         keeps: Callable[[ndarray], bool] = lambda _: True,
         deviations: Float[ndarray, "n"] | None = None,
     ) -> PlanResult | None:
-        """Validate the path through the waypoints and time it; None if it or its motion does not pass.
+        """Validate the path through the waypoints and time it; None if the path or its motion is refused.
 
-        `stage` is the part of the planner that the waypoints come from; `notes` are on this path alone;
-        `keeps` and `deviations` as in `time_parameterize`.
+        stage: the part of the planner that found the waypoints.
+        notes: notes on this path, added to those of the call.
+        keeps, deviations: as in `time_parameterize`.
         """
         began = self.elapsed
         try:
@@ -213,8 +209,8 @@ class PlanningContext:
             self._ended = Status.TIMEOUT, self._too_short(error)
             return None
         took = self.elapsed - began
-        before = _finishing.get(self.problem.robot.name, took)
-        _finishing[self.problem.robot.name] = before + 0.5 * (took - before)
+        before = _validation_seconds.get(self.problem.robot.name, took)
+        _validation_seconds[self.problem.robot.name] = before + 0.5 * (took - before)
         self._reserved = max(self._reserved, took)
         return result
 
@@ -247,12 +243,12 @@ class PlanningContext:
         )
         timed = motion.report(trajectory)
         if timed.violation is not None:
-            if timed.violation.kind == "time":  # too long to be validated, as any other motion here would be
+            if timed.violation.kind == "time":  # too long to validate, like any other motion of this problem
                 self._ended = Status.NO_PATH, timed.violation.message
             return self._refuse(timed.violation)
         scene = _least(report.scene_clearance, timed.scene_clearance)
         itself = _least(report.self_clearance, timed.self_clearance)
-        # found when the search had it, if it noted that; what it had shorter was refused
+        # the time at which the search noted this length; the shorter paths that it noted were refused
         whole = path.length
         same = whole * 1e-3
         longer = [(at, length) for at, length in self._progress if length > whole + same]
@@ -260,10 +256,10 @@ class PlanningContext:
         return PlanResult(
             status=Status.SOLVED,
             reason=reason or f"solved by {stage}",
-            planner=self.planner,
+            planner=self.planner_name,
             robot=problem.robot.name,
             planning_time=planning_time,
-            seed=self.seed,
+            seed=self.request.seed,
             stage=stage,
             path=path,
             trajectory=trajectory,
@@ -277,7 +273,8 @@ class PlanningContext:
 
     @property
     def beside(self) -> Beside:
-        """The speeds that constraints bound, and the torques of a payload."""
+        """Limits on timing besides the joint limits: speeds that constraints bound, torques with a
+        payload."""
         constraints, pace = self.validator.constraints, None
         if constraints is not None and len(constraints.paced):
             pace = Pace(constraints.speeds, constraints.most_speeds)
@@ -294,7 +291,7 @@ def _least(*clearances: float | None) -> float:
 
 
 class _TimedMotion:
-    """Validates trajectories and remembers the last verdict: the one that is kept was mostly just validated."""
+    """Validates trajectories and caches the last report: the final trajectory was usually just validated."""
 
     def __init__(self, validator: Verifier) -> None:
         self.validator = validator

@@ -1,4 +1,4 @@
-"""What all planners around a network share: its weights."""
+"""The base class of planners with a network: finds and loads the weights."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, TypeVar
@@ -13,44 +13,45 @@ from robotdiffuse.planning.planner import Planner
 from robotdiffuse.robots.robot import Robot
 
 SAMPLES_PER_GOAL = 4
-"""So many samples are drawn at least for each goal that has a share of a batch."""
+"""Smallest number of samples for each goal of a batch."""
 
 
 @dataclass(frozen=True)
 class LearnedSettings(Settings):
     weights: str | None = None
-    """Folder of trained weights; None: those that were trained here for the robot, or
-    come with the package."""
+    """Folder of trained weights; None: those trained on this machine for the robot, or those of the
+    package."""
 
 
-Own = TypeVar("Own", bound=LearnedSettings)
+LearnedPlannerSettings = TypeVar("LearnedPlannerSettings", bound=LearnedSettings)
 
 
-class LearnedPlanner(Planner[Own]):
+class LearnedPlanner(Planner[LearnedPlannerSettings]):
     """A planner that needs the weights of a network."""
 
     network_name: ClassVar[str]
-    """In NETWORKS."""
+    """Its name in `learning.NETWORKS`."""
 
-    def __init__(self, settings: Own | None = None) -> None:
+    def __init__(self, settings: LearnedPlannerSettings | None = None) -> None:
         """Raises InputError if the folder that the settings name holds no weights."""
         super().__init__(settings)
         check_weights(self.network_name, self.settings.weights)
 
     def network(self, robot: Robot) -> Any:
-        """The trained network for a robot. Raises InputError, naming the command that trains it, without."""
-        from robotdiffuse.learning.checkpoint import load_network  # which loads PyTorch
+        """The trained network for a robot. Raises InputError, naming the command that trains one, if there is
+        none."""
+        from robotdiffuse.learning.checkpoint import load_network  # imports PyTorch
 
         return load_network(self.network_name, self.settings.weights, robot)
 
     def prepare(self, robot: Robot) -> None:
-        """See `planning.planner.Planner`."""
+        """Load the network. Raises InputError if there are no weights for the robot."""
         self.network(robot)
 
 
 def nearest_goals(
     start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], samples: int
 ) -> Float[ndarray, "n dof"]:
-    """Those that have a share of a batch of so many samples, the nearest first."""
+    """The goals that a batch of `samples` samples is divided among: the nearest ones, nearest first."""
     order = np.argsort(np.linalg.norm(goals - start, axis=1))
     return goals[order[: max(samples // SAMPLES_PER_GOAL, 1)]]

@@ -1,4 +1,4 @@
-"""Where to look next: the camera pose that sees most of what a motion may run into."""
+"""The next best view: the camera pose that sees most of the unknown space that a motion crosses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,39 +10,40 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import Value, rigid_transform
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.perception.assumptions import FINE, fine, voxels_in
+from robotdiffuse.perception.assumptions import FINE_VOXEL_SIZE, refined, voxels_in
 from robotdiffuse.perception.observed_volume import LOW, observe
 from robotdiffuse.perception.ray_caster import looking_at
-from robotdiffuse.perception.unknown_space import UnknownSpace
 from robotdiffuse.perception.visibility_kernel import seen_weights
+from robotdiffuse.planning.pipeline.unknown_space import unknown_space_of
 from robotdiffuse.problems.problem import PREDICTED, Problem, check_problem
 from robotdiffuse.robots.kinematics import placed_spheres
 
-RING = 1.6
-"""Distance of the camera poses that are tried by themselves from the base's axis [m] ..."""
-HEIGHTS = (0.5, 0.95, 1.4)
-"""... their heights [m] ..."""
-BEARINGS = 16
-"""... how many of each height ..."""
+RING_RADIUS = 1.6
+"""Distance of the default camera poses from the base's axis [m]."""
+RING_HEIGHTS = (0.5, 0.95, 1.4)
+"""Heights of the default camera poses [m]."""
+POSES_PER_RING = 16
+"""Number of default camera poses at each height."""
 TARGET = (0.0, 0.0, 0.3)
-"""... and what they look at [m]."""
-LEAST = 1e-3
-"""Voxels that are less likely occupied do not count."""
+"""The point that the default camera poses look at [m]."""
+MIN_PROBABILITY = 1e-3
+"""Voxels less likely occupied than this are ignored."""
 
 
 @dataclass(frozen=True, eq=False)
 class NextView(Value):
-    """A camera pose, and what it is worth."""
+    """A camera pose, and how much of the crossed unknown space it sees."""
 
     T_base_camera: Float[ndarray, "4 4"]
     seen: float
-    """The share of what the motion may run into that a camera there sees, as far as is known."""
+    """Expected part of the summed probability that a camera there sees, from 0 to 1."""
 
 
 def poses_around() -> list[Float[ndarray, "4 4"]]:
     """Camera poses around the base, looking at the arm."""
-    angles = 2 * np.pi * np.arange(BEARINGS) / BEARINGS
-    places = [(RING * np.cos(a), RING * np.sin(a), height) for height in HEIGHTS for a in angles]
+    angles = 2 * np.pi * np.arange(POSES_PER_RING) / POSES_PER_RING
+    ring = RING_RADIUS * np.column_stack([np.cos(angles), np.sin(angles)])
+    places = [(x, y, height) for height in RING_HEIGHTS for x, y in ring]
     return [looking_at(np.array(place), np.array(TARGET)) for place in places]
 
 
@@ -52,9 +53,11 @@ def next_view(
     """The pose from which a camera like that of the first view sees most of the probability that the motion
     of a result sweeps.
 
-    `poses`: those that can be reached, T_base_camera each; None: `poses_around`. A voxel counts as seen as
-    far as nothing is likely to be in the way: neither what was seen, nor what is predicted, nor the arm at
-    the problem's start. With another policy than `predicted`, each unknown voxel that is swept counts the same.
+    poses: camera poses to choose from, T_base_camera each; None: `poses_around`.
+
+    A voxel counts by the chance that nothing hides it: neither what was seen, nor what is predicted, nor the
+    arm at the problem's start. With a policy other than "predicted", all swept unknown voxels count the same.
+
     Raises InputError without views, without a motion and without poses.
     """
     check_problem(problem)
@@ -74,15 +77,15 @@ def next_view(
         from robotdiffuse.learning.completion import predict
 
         predicted = predict(volume)
-    crossed = UnknownSpace(problem, volume, predicted).crossed(result.path)
+    crossed = unknown_space_of(problem, volume, predicted).crossed(result.path)
     likely = crossed.voxels.astype(np.float32)
     if crossed.probability is not None:
         likely *= crossed.probability
-    at = np.argwhere(likely > LEAST)
+    at = np.argwhere(likely > MIN_PROBABILITY)
     weights = likely[tuple(at.T)]
     if not len(at):
         return NextView(candidates[0], 1.0)
-    filled = fine(volume.occupied).astype(np.float32)
+    filled = refined(volume.occupied).astype(np.float32)
     if predicted is not None:
         np.maximum(filled, predicted, out=filled)
     filled[voxels_in(placed_spheres(problem.robot, problem.start).astype(np.float32))] = 1.0
@@ -95,7 +98,7 @@ def next_view(
         weights,
         filled,
         np.array(LOW, np.float32),
-        np.float32(FINE),
+        np.float32(FINE_VOXEL_SIZE),
     )
     best = int(seen.argmax())
     return NextView(candidates[best], float(seen[best] / weights.sum()))

@@ -1,4 +1,4 @@
-"""Many problems at once, over processes of this machine."""
+"""Planning for many problems at once, over processes of this machine."""
 
 import os
 import queue
@@ -15,10 +15,13 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import DEFAULT_PLANNER, load_planner
-from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.robot import Robot
+
+PlannerArguments = tuple[str, Settings | None, str | None]
+"""Of `load_planner`: name, settings, weights."""
 
 
 def plan_many(
@@ -29,19 +32,19 @@ def plan_many(
     workers: int | None = None,
     **request: Any,
 ) -> Iterator[PlanResult]:
-    """The results of problems in their order, each as soon as those before it are there.
+    """Yield the results of problems in their order, each as soon as those before it are there.
 
     planner, settings, weights: as of `load_planner`.
-    workers: processes; None: as many as there are cores.
+    workers: number of processes; None: one for each core.
     request: arguments of `Planner.plan`, the same for all problems: time_limit, seed, until, ...
 
-    A problem that raises an error, or whose process dies of it, has a result with status ERROR; the others go
-    on. Processes import the main script: without the line `if __name__ == "__main__":` above what it does,
-    all results have status ERROR. A process compiles or loads its code before its first problem, outside the
+    A problem that raises an error, or kills its process, has a result with status ERROR; the others continue.
+    Processes import the main script: without the line `if __name__ == "__main__":` above what it does, all
+    results have status ERROR. Each process compiles or loads its kernels before its first problem, outside the
     time limit.
 
-    Raises InputError for an unknown planner, settings or weights that it cannot have, arguments that are
-    wrong, and a number of workers below 1.
+    Raises InputError at once for an unknown planner, settings or weights that do not fit it, unknown
+    arguments or arguments out of bounds, and a number of workers below 1.
     """
     check_not_importing()
     if isinstance(problems, str) or not isinstance(problems, Iterable):
@@ -51,28 +54,19 @@ def plan_many(
         check_problem(problem, f"problems[{i}]")
     if workers is not None and not (isinstance(workers, Integral) and workers >= 1):
         raise InputError(f"workers is {shown(workers)}; it must be a whole number, at least 1")
-    unknown = set(request) - ARGUMENTS
+    known = {field.name for field in fields(PlanRequest)}
+    unknown = set(request) - known
     if unknown:
-        raise InputError(f"unknown argument {shown(min(unknown))}; known: {', '.join(sorted(ARGUMENTS))}")
+        raise InputError(f"unknown argument {shown(min(unknown))}; known: {', '.join(sorted(known))}")
     load_planner(planner, settings, weights)
-    asked = dict(request)
-    if problems:
-        PlanningContext(
-            planner, problems[0], asked.pop("time_limit", 1.0), asked.pop("seed", 0), Request(**asked)
-        )
     count = min(workers or os.cpu_count() or 1, len(problems))
-    return _planned(problems, (planner, settings, weights), count, request)
-
-
-ARGUMENTS = {"time_limit", "seed", *(field.name for field in fields(Request))}
-"""Of a request."""
-Loaded = tuple[str, Settings | None, str | None]
+    return _planned(problems, (planner, settings, weights), count, PlanRequest(**request))
 
 
 def _planned(
-    problems: list[Problem], loaded: Loaded, workers: int, request: dict[str, Any]
+    problems: list[Problem], loaded: PlannerArguments, workers: int, request: PlanRequest
 ) -> Iterator[PlanResult]:
-    # robots go to a process once, without what was compiled of them, and keep there what it compiles
+    # each robot is sent to a process once, without its compiled arrays; the process keeps those it compiles
     robots = list(dict.fromkeys(problem.robot for problem in problems))
     number = {robot: i for i, robot in enumerate(robots)}
     bare = [replace(robot) for robot in robots]
@@ -94,7 +88,9 @@ def _planned(
             not_started.append(error)
             return _error(loaded[0], problem, str(error), request)
         except BrokenProcessPool:
-            return _error(loaded[0], problem, "the process of the planner died of this problem", request)
+            return _error(
+                loaded[0], problem, "the process of the planner died while planning this problem", request
+            )
         except Exception as error:
             return _error(loaded[0], problem, f"{type(error).__name__}: {error}", request)
         finally:
@@ -109,23 +105,23 @@ def _planned(
         threads.shutdown(cancel_futures=True)
 
 
-def _error(planner: str, problem: Problem, reason: str, request: dict[str, Any]) -> PlanResult:
-    return PlanResult(Status.ERROR, reason, planner, problem.robot.name, 0.0, request.get("seed", 0))
+def _error(planner: str, problem: Problem, reason: str, request: PlanRequest) -> PlanResult:
+    return PlanResult(Status.ERROR, reason, planner, problem.robot.name, 0.0, request.seed)
 
 
 class _State(NamedTuple):
-    """What a process keeps between problems."""
+    """What a worker process keeps between problems."""
 
     planner: Planner
     robots: list[Robot]
-    request: dict[str, Any]
+    request: PlanRequest
     warm: set[Robot]
 
 
 _state: _State | None = None
 
 
-def _prepare(loaded: Loaded, robots: list[Robot], request: dict[str, Any]) -> None:
+def _prepare(loaded: PlannerArguments, robots: list[Robot], request: PlanRequest) -> None:
     global _state
     _state = _State(load_planner(*loaded), robots, request, set())
 
@@ -137,4 +133,4 @@ def _plan(robot: int, asked: tuple) -> PlanResult:
         _state.planner.warm_up(problem)
         _state.warm.add(problem.robot)
     _state.planner.load_wanted(problem.robot)
-    return replace(_state.planner.plan(problem, **_state.request), problem=None)  # not sent back
+    return replace(_state.planner.plan(problem, **vars(_state.request)), problem=None)  # the caller has it

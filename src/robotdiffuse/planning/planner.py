@@ -1,4 +1,4 @@
-"""What all planners share: a planner writes `solve`, and `plan` surrounds it."""
+"""The base class of planners: a planner implements `solve`, and `plan` handles the rest of a call."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
@@ -6,43 +6,37 @@ from dataclasses import replace
 from typing import ClassVar, Generic, TypeVar
 
 from robotdiffuse.collision.motions import finer
-from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.core.types import CONVERGED, FIRST
-from robotdiffuse.planning.context import PlanningContext, Request, check_asked
-from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
-from robotdiffuse.problems.problem import JointGoal, Problem
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS, planners_that_support
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
+from robotdiffuse.planning.pipeline import pipeline_for
+from robotdiffuse.planning.start_goal import StartGoal
+from robotdiffuse.problems.problem import JointGoal, Problem, check_problem
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Mesh, PointCloud, Shape, Sphere
 
-Own = TypeVar("Own", bound=Settings)
-WARM_UP, SLIGHT = 1.0, 0.02
-"""Limits of the calls of `warm_up`: easy ones, and the beginning of a search [s]."""
-CONSTRAINTS, CLEARANCE = "path constraints", "a clearance that is asked for"
-"""What not every planner can keep."""
-ABLE = {
-    CONSTRAINTS: "robotdiffuse, aorrtc, rrt_connect, diffusion",
-    CLEARANCE: "robotdiffuse, aorrtc, rrt_connect",
-}
-"""The planners that can, for messages."""
-RADIUS = 0.08
-"""Of the balls of `warm_up` [m]."""
+PlannerSettings = TypeVar("PlannerSettings", bound=Settings)
+EASY_TIME_LIMIT, SHORT_TIME_LIMIT = 1.0, 0.02
+"""Time limits of the calls of `warm_up`: of the easy ones, and of the one that only begins a search [s]."""
+WARM_UP_RADIUS = 0.08
+"""Radius of the balls of `warm_up` [m]."""
 
 
-class Planner(ABC, Generic[Own]):
+class Planner(ABC, Generic[PlannerSettings]):
     """A planner: its name, the class of its settings, and `solve`."""
 
     name: ClassVar[str]
-    settings_class: type[Own]
-    keeps: ClassVar[frozenset[str]] = frozenset()
-    """Which of CONSTRAINTS and CLEARANCE it can keep; the others it refuses. All else that a problem and a
-    call may ask for, `plan` sees to for every planner."""
+    settings_class: type[PlannerSettings]
+    supports: ClassVar[frozenset[str]] = frozenset()
+    """PATH_CONSTRAINTS, CLEARANCE, both or none; requests for what it does not support are refused. `plan`
+    handles everything else that a problem or a request may contain, for every planner."""
 
-    def __init__(self, settings: Own | None = None) -> None:
+    def __init__(self, settings: PlannerSettings | None = None) -> None:
         self.settings = self.settings_class() if settings is None else settings
 
     def plan(
@@ -61,115 +55,98 @@ class Planner(ABC, Generic[Own]):
         The same seed gives the same path, as long as time does not run out. A result with status SOLVED holds
         a path and a trajectory that passed `verify`; any other status comes with a reason.
 
-        until: "first" ends with the first verified motion, "converged" when more time stops paying,
-            "time_limit" when time runs out; planners that cannot improve a path always end with their first.
+        time_limit: wall time for the call, without loading weights and compiling kernels [s].
+        seed: seed of all random numbers, at least 0.
+        until: "first" returns the first verified motion, "converged" searches on until more time hardly
+            shortens the path, "time_limit" until time runs out; planners that cannot improve a path return
+            their first.
         clearance: distance to obstacles that aorrtc, rrt_connect and robotdiffuse keep wherever start, goal
-            and passages allow it [m]; where they do not, less, and a note says so. None: what the problem
-            says, or 1 cm. The other planners have settings of their own, or keep what their motions have;
-            they refuse one that is asked for.
-        velocity_scaling, acceleration_scaling: shares of the robot's limits that the timed motion uses, from
+            and passages allow it [m]; where they do not, the distance is smaller, and a note says so. None:
+            the problem's, or 1 cm. The other planners have their own settings and refuse a clearance.
+        velocity_scaling, acceleration_scaling: parts of the robot's limits that the timed motion uses, from
             0.001 to 1.
-        jerk: most jerk of any joint of the timed motion [rad/s³], at least 0.01. None: no limit, the fastest
-            motion.
+        jerk: largest jerk of any joint of the timed motion [rad/s³], at least 0.01. None: no limit, the
+            fastest motion.
 
-        Where the problem has waypoints, the motion stops at each or passes within its blend:
-        `planning/pipeline/waypoints.py`. Where obstacles move, it waits, goes slower or draws back on its path:
-        `planning/pipeline/moving_obstacles.py`. Where the problem has a start velocity, it begins moving:
-        `planning/pipeline/start_velocity.py`. Where cameras saw the scene, `problem.unknown` says what the rest is taken
-        for: `planning/pipeline/unknown_space.py`. Path constraints are for aorrtc, rrt_connect
-        and robotdiffuse, `planners/constrained`, and for diffusion.
+        Problems may also have, for every planner:
 
-        Raises InputError for arguments that are none of these, for what the planner cannot keep, and where
-        `prepare` does.
+        - waypoints: the motion stops at each or passes within its blend (`planning/pipeline/waypoints.py`);
+        - moving obstacles: the motion waits, slows down or retreats on its path
+          (`planning/pipeline/moving_obstacles.py`);
+        - a start velocity: the arm is moving when the motion begins (`planning/pipeline/start_velocity.py`);
+        - camera views: `problem.unknown` says how unknown space is treated
+          (`planning/pipeline/unknown_space.py`).
+
+        Path constraints are supported by aorrtc, rrt_connect, robotdiffuse (`planning/search/constrained.py`)
+        and diffusion.
+
+        Raises InputError for arguments out of bounds, for a clearance or constraints that the planner does
+        not support, and where `prepare` does.
         """
-        check_asked(problem, time_limit, seed)
-        request = Request(until, clearance, velocity_scaling, acceleration_scaling, jerk)
-        self._check_keeps(problem, request)
+        check_problem(problem)
+        request = PlanRequest(
+            time_limit, seed, until, clearance, velocity_scaling, acceleration_scaling, jerk
+        )
+        self._check_support(problem, request)
         self.prepare(problem.robot)
-        return replace(self._plan(problem, time_limit, seed, request), problem=problem)
+        return replace(pipeline_for(problem)(self, problem, request), problem=problem)
 
-    def _plan(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
-        if problem.moving:
-            from robotdiffuse.planning.pipeline.moving_obstacles import plan_among_moving
-
-            return plan_among_moving(self, problem, time_limit, seed, request)
-        if problem.waypoints:
-            from robotdiffuse.planning.pipeline.waypoints import plan_by_waypoints
-
-            return plan_by_waypoints(self, problem, time_limit, seed, request)
-        if problem.start_velocity is not None:
-            from robotdiffuse.planning.pipeline.start_velocity import plan_in_motion
-
-            return plan_in_motion(self, problem, time_limit, seed, request)
-        if problem.views:
-            from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
-
-            return plan_with_unknown_space(self, problem, time_limit, seed, request)
-        return self.attempt(problem, time_limit, seed, request)
-
-    def _check_keeps(self, problem: Problem, request: Request) -> None:
-        """InputError for what is asked for and the planner cannot keep."""
+    def _check_support(self, problem: Problem, request: PlanRequest) -> None:
+        """Raises InputError for a request that the planner does not support."""
         clearance = problem.clearance if request.clearance is None else request.clearance
-        for what, asked in ((CONSTRAINTS, bool(problem.constraints)), (CLEARANCE, bool(clearance))):
-            if asked and what not in self.keeps:
-                raise InputError(f"planner {self.name} cannot keep {what}; these can: {ABLE[what]}")
-
-    def attempt(self, problem: Problem, time_limit: float, seed: int, request: Request) -> PlanResult:
-        """`plan` in the problem's scene as it is."""
-        context = PlanningContext(self.name, problem, time_limit, seed, request)
-        with context.deadline():
-            try:
-                start_goal = usable_start_goal(context)
-                return start_goal if isinstance(start_goal, PlanResult) else self.solve(context, start_goal)
-            except OutOfTimeError as error:
-                return context.out_of_time(error)
+        for what, wanted in ((PATH_CONSTRAINTS, bool(problem.constraints)), (CLEARANCE, bool(clearance))):
+            if wanted and what not in self.supports:
+                able = ", ".join(planners_that_support(what))
+                raise InputError(f"planner {self.name} does not support {what}; these do: {able}")
 
     def warm_up(self, problem: Problem, until: str = FIRST) -> list[PlanResult]:
-        """Load the compiled code that calls on such a problem need, or compile it on a new machine, which
-        takes about a minute; else the first call's time limit would have to do. `until` is what these calls
-        will ask for: for those that go on after their first path, what only some of them need is loaded too,
-        which takes a process seconds once: Coal, and the network of the hybrid.
+        """Compile or load the kernels now, so that the first call does not spend its time limit on it.
 
-        The results are of calls with nothing in the way, and with balls where the straight line is, and of
-        a moment's with one small obstacle of each of the problem's kinds: its own scene is prepared within
-        the time of its own call.
+        On a new machine this takes about a minute. `until` is that of the calls to come: unless it is
+        "first", what only long calls need is loaded too, which takes seconds once in a process: Coal, and the
+        network of the hybrid planner.
+
+        Returns the results of the calls that it makes: without obstacles, with balls on the straight line,
+        and a very short one with one small obstacle of each kind in the problem's scene. The problem's own
+        scene is compiled within the time of its own call.
         """
         robot, start, goal = problem.robot, problem.start, problem.goal
-        first = goal.positions[:1] if isinstance(goal, JointGoal) else []
-        ways = [start + share * (end - start) for end in first for share in (0.5, 0.35)]
-        balls = [Sphere(link_pose(robot, q, robot.tip)[:3, 3], RADIUS) for q in ways]
+        goals = goal.positions[:1] if isinstance(goal, JointGoal) else []
+        on_line = [start + share * (end - start) for end in goals for share in (0.5, 0.35)]
+        balls = [Sphere(link_pose(robot, q, robot.tip)[:3, 3], WARM_UP_RADIUS) for q in on_line]
         kinds = replace(problem, waypoints=(), blend=(), moving=(), start_velocity=None)
         if not problem.views:
             kinds = replace(kinds, scene=one_of_each(problem.scene))
         easy = [Problem(robot, Scene(shapes), start, goal) for shapes in ([], *([ball] for ball in balls))]
-        calls = [*((easier, WARM_UP) for easier in easy), (kinds, SLIGHT)]
+        calls = [*((easier, EASY_TIME_LIMIT) for easier in easy), (kinds, SHORT_TIME_LIMIT)]
         if until != FIRST:
-            self._load_rarer(robot)
+            self._load_rarely_needed(robot)
         return [self.plan(task, seconds, until=until) for task, seconds in calls]
 
     def prepare(self, robot: Robot) -> None:
-        """What is done before the clock starts: a learned planner loads its weights for the robot, and raises
-        InputError where there are none."""
+        """Do what does not count as planning time: learned planners load their weights for the robot, and
+        raise InputError if there are none."""
 
     def load_wanted(self, robot: Robot) -> None:
-        """What calls would have used and had no time to load, and Coal: for programs that make many calls, to
-        make between them."""
-        from robotdiffuse.collision.exact_meshes import make_ready  # which imports Coal
+        """Load what earlier calls had no time to load, and Coal. Programs that make many calls call this
+        between them."""
+        from robotdiffuse.collision.exact_meshes import make_ready  # imports Coal
 
         make_ready(robot)
 
-    def _load_rarer(self, robot: Robot) -> None:
-        """What only some calls need."""
+    def _load_rarely_needed(self, robot: Robot) -> None:
+        """Load what only some calls need."""
         self.load_wanted(robot)
 
     @abstractmethod
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
-        """Search from the ends until `call.finish` accepts a path, or there is none: `call.unsolved`."""
+        """Search from the start to a goal until `context.finish` accepts a path; `context.unsolved`
+        without."""
 
 
-def ever_finer(context: PlanningContext, settings: Own) -> Iterator[tuple[Own, int]]:
-    """The settings and number of each attempt, until time runs out. From one to the next the resolution is
-    halved: for planners whose path the validator refused."""
+def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[tuple[PlannerSettings, int]]:
+    """Yields settings and attempt number until time runs out, each time at half the resolution: for searches
+    whose path the validator refused."""
     attempt = 0
     while attempt == 0 or context.remaining > 0:
         yield settings, attempt
@@ -178,13 +155,14 @@ def ever_finer(context: PlanningContext, settings: Own) -> Iterator[tuple[Own, i
 
 
 def compiles_first(robot: Robot) -> str:
-    """What to say while a first call keeps people waiting: code for trees of joints is compiled apart."""
+    """A message for people who wait for a first call. Kernels for robots with several arms are compiled
+    separately."""
     who = "a new machine" if robot.branching is None else "the first robot of several arms"
     return f"{who} compiles first, for about a minute"
 
 
 def one_of_each(scene: Scene) -> Scene:
-    """The first shape of each kind; of meshes and clouds a single triangle or point."""
+    """A scene with the first shape of each kind; of meshes one triangle, of point clouds one point."""
     shapes: dict[str, Shape] = {}
     for shape in scene.shapes:
         if isinstance(shape, Mesh):

@@ -1,4 +1,4 @@
-"""Where a motion begins and may end: goals of a pose, ends that touch, and why there can be no plan."""
+"""Start and goal states: usable configurations for a search, or the reason why there are none."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -21,22 +21,24 @@ from robotdiffuse.scenes.scene import Scene
 if TYPE_CHECKING:
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
-ROUNDS, LOOKING = 100, 0.5
-"""How often others are tried, by the exact meshes, as long as none is free; the share of the time left."""
+MAX_IK_ROUNDS, IK_TIME_FRACTION = 100, 0.5
+"""Most rounds of inverse kinematics for a pose whose configurations all collide, and the part of the time
+left that they may take."""
 END_MARGIN = 0.0005
-"""What an end that is closer than the wanted clearance keeps less than it has [m]."""
+"""Near a start or goal with less than the requested clearance, paths keep its clearance less this margin
+[m]."""
 RETREAT_STEP = 0.01
-"""Step of the way out of contact of the covering spheres [rad]."""
+"""Step length out of contact of the covering spheres [rad]."""
 RETREAT_STEPS = 100
-BEYOND_ENDS = np.pi / 2
-"""How far a continuous joint may turn beyond start and goals in a search [rad]."""
+MAX_OVERTURN = np.pi / 2
+"""How far a continuous joint may turn beyond the start and the goals in a search [rad]."""
 
 
 class StartGoal:
-    """Start and goals that the spheres call free, with the ends near contact that they stand for.
+    """The start and the goals of a search, and configurations nearby where the covering spheres are free.
 
-    A continuous joint begins within half a turn here; `complete` adds the whole turns that it really has. A
-    goal stands for its images, see `images`.
+    The start of a continuous joint is within half a turn here; `complete` adds its whole turns back. Each
+    goal is replaced by its images, see `images`.
     """
 
     def __init__(
@@ -52,7 +54,7 @@ class StartGoal:
         self.start = start - self._turns
         ways = [image for goal in goals for image in images(robot, self.start, goal)]
         every = [self.start, *ways]
-        free = checker.free(np.stack(every))  # all at once: most are
+        free = checker.free(np.stack(every))  # in one batch: most are free
         self.start_lead, *leads = (
             q.copy() if at_once and constraints is None else retreat(checker, q, constraints)
             for q, at_once in zip(every, free, strict=True)
@@ -61,40 +63,42 @@ class StartGoal:
         self.goal_leads = [lead for lead in leads if lead is not None]
 
     def rows(self) -> tuple[Float[ndarray, "dof"], Float[ndarray, "k dof"]]:
-        """Where a search begins and where it may end, in float32."""
+        """The start and the goals of a search, in float32."""
         assert self.start_lead is not None
         return self.start_lead.astype(np.float32), np.array(self.goal_leads, np.float32)
 
     def kept_clearance(self, wanted: float) -> float:
-        """The distance that a path can keep to obstacles: as wanted, or half of what the ends have [m]."""
+        """The clearance that a path can keep: the wanted one, or half that of the start or a goal if less
+        [m]."""
         start, goals = self.rows()
         leads = np.concatenate([start[None], goals])
         return min(wanted, 0.5 * float(self.checker.link_clearances(leads).min(initial=wanted)))
 
     def space(self, resolution: float, clearance: float) -> Space:
-        """What searches between the ends check motions in, `clearance` [m] away from obstacles.
+        """The space in which searches check motions, at a resolution [m] and a clearance [m].
 
-        Around an end that is closer itself, it is what that end has, and more with the distance from it
-        (`collision.kernels.motions.padding_near`).
+        Near a start or goal with less clearance, the clearance is reduced to its own, and grows with the
+        distance from it (`collision.kernels.motions.padding_near`).
         """
         start, goals = self.rows()
-        start_goal = np.concatenate([start[None], goals])
+        states = np.concatenate([start[None], goals])
         if clearance <= 0:
-            return self._within(search_space(self.checker, resolution), start_goal)
-        has = self.checker.link_clearances(start_goal).min(axis=1, initial=1.0)
+            return self._within(search_space(self.checker, resolution), states)
+        has = self.checker.link_clearances(states).min(axis=1, initial=1.0)
         close = has < clearance + END_MARGIN
-        near = np.column_stack([start_goal[close], np.maximum(has[close] - END_MARGIN, 0.0)])
-        return self._within(search_space(self.checker, resolution, clearance, near), start_goal)
+        near = np.column_stack([states[close], np.maximum(has[close] - END_MARGIN, 0.0)])
+        return self._within(search_space(self.checker, resolution, clearance, near), states)
 
-    def _within(self, space: Space, start_goal: Float[ndarray, "k dof"]) -> Space:
-        """The space with continuous joints kept within BEYOND_ENDS of what the ends take up."""
+    def _within(self, space: Space, states: Float[ndarray, "k dof"]) -> Space:
+        """The space with continuous joints limited to MAX_OVERTURN beyond the range of start and goals."""
         turning = self._robot.continuous
-        lower = np.where(turning, np.maximum(space.lower, start_goal.min(axis=0) - BEYOND_ENDS), space.lower)
-        upper = np.where(turning, np.minimum(space.upper, start_goal.max(axis=0) + BEYOND_ENDS), space.upper)
+        lower = np.where(turning, np.maximum(space.lower, states.min(axis=0) - MAX_OVERTURN), space.lower)
+        upper = np.where(turning, np.minimum(space.upper, states.max(axis=0) + MAX_OVERTURN), space.upper)
         return space._replace(lower=lower.astype(np.float32), upper=upper.astype(np.float32))
 
     def complete(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
-        """The path with its exact ends in float64 in place of, or before and after, those of the search."""
+        """The path of a search in float64, with the exact start and goal in place of its ends, or added to
+        them."""
         assert self.start_lead is not None
         path = path.astype(np.float64)
         errors = [np.abs(path[-1] - lead).max() for lead in self.goal_leads]
@@ -110,9 +114,9 @@ class StartGoal:
 def images(
     robot: Robot, start: Float[ndarray, "dof"], goal: Float[ndarray, "dof"]
 ) -> list[Float[ndarray, "dof"]]:
-    """The values that stand for a goal in joint space, where continuous joints do not wrap.
+    """The goal with whole turns added to continuous joints: a search does not wrap them.
 
-    First those nearest to the start, then those with one of the continuous joints the other way round: an
+    First the image nearest to the start, then those with one continuous joint turned the other way: an
     obstacle may block the short way.
     """
     nearest = goal - robot.turns(goal - start)
@@ -125,10 +129,10 @@ def images(
 
 
 def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
-    """The ends that a search of this call can begin and end at, or the result that says why it cannot.
+    """The start and the goals for a search of this call, or the result that says why there are none.
 
-    For poses, up to `poses.GOAL_COUNT` configurations by inverse kinematics. Configurations that the covering
-    spheres call free come alone; where there are none, those that the exact meshes call free.
+    For poses, up to `pose_goals.GOAL_COUNT` configurations by inverse kinematics. Goals whose covering
+    spheres are free are preferred; if there are none, those whose exact meshes are free are used.
     """
     checker = CollisionChecker(context.problem.robot, context.problem.scene)
     goals = _usable_goals(context, checker)
@@ -148,11 +152,11 @@ def usable_start_goal(context: PlanningContext) -> StartGoal | PlanResult:
 def retreat(
     checker: CollisionChecker, q: Float[ndarray, "dof"], constraints: "PathConstraints | None" = None
 ) -> Float[ndarray, "dof"] | None:
-    """A configuration nearby that the covering spheres call free, down the gradient of the collision cost.
+    """A configuration nearby whose covering spheres are free, found down the gradient of the collision cost.
 
-    For a start or goal that the exact meshes call free while the spheres, which stick out, do not. None if no
-    free configuration was found within 1 rad, or it does not keep the constraints. The validator decides on the
-    motion there.
+    For a start or goal whose exact meshes are free while the spheres around them are not. None if no free
+    configuration was found within 1 rad, or it does not keep the constraints. The motion to it is left to the
+    validator.
     """
     robot, at = checker.robot, q.copy()
     for _ in range(RETREAT_STEPS):
@@ -167,11 +171,12 @@ def retreat(
 
 
 def closeness(checker: CollisionChecker, q: Float[ndarray, "dof"]) -> str:
-    """Where the covering spheres touch deepest, in words, for a configuration that the meshes call free."""
+    """A message that says where the covering spheres penetrate deepest, for a configuration whose meshes are
+    free."""
     clearances = np.concatenate([checker.link_clearances(q[None])[0], checker.pair_clearances(q[None])[0]])
     worst = int(clearances.argmin())
     link, other = [*((link, None) for link in checker.links), *checker.pairs][worst]
-    from robotdiffuse.collision.exact_meshes import ExactCollision  # and Coal, which most calls do not need
+    from robotdiffuse.collision.exact_meshes import ExactCollision  # imports Coal, rarely needed
 
     exact = ExactCollision(checker.robot, checker.scene)
     check = [frozenset(check) for check in exact.checks].index(frozenset((link, other)))
@@ -209,14 +214,15 @@ def _usable_goals(
 
 
 def _too_heavy(context: PlanningContext, q: Float[ndarray, "dof"]) -> str | None:
-    """Which joint cannot hold the problem's payload there."""
+    """A message that names the joint that cannot hold the problem's payload there; None if all can."""
     return None if context.validator.dynamics is None else context.validator.dynamics.too_much(q)
 
 
 def _goals(
     context: PlanningContext, goal: Goal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
-    """Configurations of a goal that are free, of any of several goals; or why there are none."""
+    """The free configurations of a goal, or of any of several goals; or the result that says why there are
+    none."""
     if isinstance(goal, AnyGoal):
         each = [_goals(context, one, checker) for one in goal.goals]
         found = [goals for goals in each if not isinstance(goals, PlanResult)]
@@ -257,21 +263,21 @@ def _pose_goals(
     context: PlanningContext, goal: PoseGoal | PosesGoal, checker: CollisionChecker
 ) -> Float[ndarray, "k dof"] | PlanResult:
     from robotdiffuse.planning.pose_goals import (
-        reaching,  # and inverse kinematics, which most calls do not need
+        pose_configurations,  # imports inverse kinematics, rarely needed
     )
 
     problem, robot, scene = context.problem, context.problem.robot, context.problem.scene
     constraints, rng = context.validator.constraints, context.rng
-    found = reaching(problem, goal, constraints, rng, checker.free)
+    found = pose_configurations(problem, goal, constraints, rng, checker.free)
     if len(found):
-        return _by_turns(context, found)
-    until, collisions = context.elapsed + LOOKING * context.remaining, list[str | None]()
-    for _ in range(ROUNDS):
-        reached = reaching(problem, goal, constraints, rng)
+        return _with_turns(context, found)
+    until, collisions = context.elapsed + IK_TIME_FRACTION * context.remaining, list[str | None]()
+    for _ in range(MAX_IK_ROUNDS):
+        reached = pose_configurations(problem, goal, constraints, rng)
         found = [_explained(robot, scene, q) for q in reached]
         kept = [q for q, collision in zip(reached, found, strict=True) if collision is None]
         if kept:
-            return _by_turns(context, kept)
+            return _with_turns(context, kept)
         collisions += found
         if not goal.tolerant or context.elapsed > until:
             break
@@ -279,14 +285,14 @@ def _pose_goals(
     named = {pose.frame: f"({xyz}) m" for pose, xyz in zip(poses_of(goal), places, strict=True)}
     of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in named.items())
     if not collisions and constraints is not None:
-        any_of_it = reaching(replace(problem, constraints=()), goal, None, rng)
+        any_of_it = pose_configurations(replace(problem, constraints=()), goal, None, rng)
         wrong = constraints.worst(any_of_it[0]) if len(any_of_it) else None
         if wrong is not None:
             what = f"no configuration was found for {of_poses} that keeps the"
             return context.fail(Status.INVALID_GOAL, f"{what} constraints, e.g. {wrong.message}")
     if not collisions:
         several = poses_of(goal) if len(named) > 1 else ()
-        alone = [pose.frame for pose in several if not len(reaching(problem, pose, None, rng))]
+        alone = [pose.frame for pose in several if not len(pose_configurations(problem, pose, None, rng))]
         brought = " and ".join(f"{frame} to the pose at {named[frame]}" for frame in alone or named)
         return context.fail(
             Status.UNREACHABLE_GOAL, f"no configuration within the joint limits brings {brought}"
@@ -297,14 +303,15 @@ def _pose_goals(
     )
 
 
-def _by_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:
-    """Goals of a pose, which does not say how often a joint turns."""
+def _with_turns(context: PlanningContext, goals: Iterable[ndarray]) -> Float[ndarray, "k dof"]:
+    """The goals and their copies with whole turns: a pose does not say how often a continuous joint has
+    turned."""
     robot, start = context.problem.robot, context.problem.start
     return np.concatenate([robot.same_stance(q, start) for q in goals])
 
 
 def _explained(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:
-    """See `explain_collision`, which imports Coal."""
+    """The message of `explain_collision`, imported here because it imports Coal."""
     from robotdiffuse.collision.exact_meshes import explain_collision
 
     return explain_collision(robot, scene, q)

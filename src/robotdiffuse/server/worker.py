@@ -21,7 +21,7 @@ from robotdiffuse.core.input_files import parse_json
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import UNTIL
 from robotdiffuse.planning import DEFAULT_PLANNER, PLANNERS, load_planner
-from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.files import problem_from_record
 from robotdiffuse.problems.problem import Problem
@@ -165,19 +165,15 @@ def answer_plan(state: _State, body: bytes) -> Answer:
     planner = _planner(asked.get("planner", DEFAULT_PLANNER))
     planner.prepare(problem.robot)
     planner.load_wanted(problem.robot)
-    PlanningContext(planner.name, problem, request=_request(given), time_limit=time_limit, seed=seed)
+    PlanRequest(**given)
     _warm_up_once(planner, problem, asked["problem"]["robot"])
     state.shared.due = time.monotonic() + time_limit + GRACE_TIME
     result: PlanResult = planner.plan(problem, **given)
     return _answer(result.record(), result.status.value)
 
 
-ARGUMENTS = ("planner", "time_limit", "seed", *(field.name for field in fields(Request)))
+ARGUMENTS = ("planner", *(field.name for field in fields(PlanRequest)))
 """Fields of a plan request besides its problem."""
-
-
-def _request(given: dict[str, Any]) -> Request:
-    return Request(**{name: value for name, value in given.items() if name not in ("time_limit", "seed")})
 
 
 def _check_kind(name: str, value: object) -> None:

@@ -70,7 +70,7 @@ def bumps(waypoints: int) -> Float[ndarray, "inner inner"]:
 
 
 class Gaussian(MotionModel):
-    """The exact denoiser of straight lines with such bumps."""
+    """The exact denoiser of straight lines with Gaussian bumps."""
 
     def denoise(
         self,
@@ -94,7 +94,7 @@ def gaussian() -> Gaussian:
 
 
 def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
-    """Lines with bumps, a third of them called trivial, around one ball."""
+    """Lines with bumps around one ball; a third of them are marked trivial."""
     rng = np.random.default_rng(1)
     t = np.linspace(0, 1, waypoints)[:, None]
     middle, half = (PANDA.lower + PANDA.upper) / 2, (PANDA.upper - PANDA.lower) / 2
@@ -105,7 +105,7 @@ def data_of(count: int, waypoints: int = WAYPOINTS) -> TrajectoryData:
 
 
 def stay(q: ndarray, _left: int) -> ndarray:
-    """No guide."""
+    """A guide that changes nothing."""
     return q
 
 
@@ -122,7 +122,7 @@ def test_the_loss_falls() -> None:
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-    # an untrained network says that there is no noise: the variance of it is 1
+    # an untrained network predicts no noise, whose variance is 1
     assert losses[0] == pytest.approx(1.0, abs=0.1)
     assert np.mean(losses[-5:]) < 0.6
     assert 0 <= planning_success(network, PANDA, data_of(6), 4, 2, rng) <= 1
@@ -138,7 +138,7 @@ def test_share_of_trivial_motions() -> None:
 
 
 def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> None:
-    """100 steps without guide; 300 samples of several joints know the variance to a few percent."""
+    """100 steps without a guide; 300 samples of several joints give the variance to a few percent."""
     starts, goals = (np.repeat(end[None], 300, 0) for end in (LEFT, RIGHT))
     levels = gaussian.schedule.sampling_levels(100)[:-1]
     q = sample(gaussian, starts, goals, levels, np.random.default_rng(0), stay)
@@ -146,7 +146,7 @@ def test_samples_have_the_mean_and_variance_of_the_data(gaussian: Gaussian) -> N
     x = gaussian.normalizer.to_unit(q.astype(np.float64))
     t = np.linspace(0, 1, WAYPOINTS)[:, None]
     bump = x - ((1 - t) * x[:, :1] + t * x[:, -1:])
-    # joints whose bumps the limits cut off tell nothing about the sampler
+    # joints whose bumps are clipped at the limits say nothing about the sampler
     whole = np.abs(x).max((0, 1)) < 0.99
     assert whole.sum() >= 2
     bump = bump[:, 1:-1, whole]
@@ -169,7 +169,7 @@ def test_samples_hold_their_ends_exactly() -> None:
     assert np.all(q >= PANDA.lower - 1e-5) and np.all(q <= PANDA.upper + 1e-5)
 
 
-def test_the_guide_is_told_the_steps_to_come(gaussian: Gaussian) -> None:
+def test_the_guide_gets_the_number_of_steps_to_come(gaussian: Gaussian) -> None:
     told: list[int] = []
 
     def guide(q: ndarray, left: int) -> ndarray:
@@ -280,7 +280,7 @@ def test_guidance_lowers_the_collision_cost() -> None:
     assert np.all(after < before) and np.array_equal(moved[:, [0, -1]], q[:, [0, -1]])
 
 
-def test_each_guide_moves_its_share_its_own_way() -> None:
+def test_each_guide_moves_only_its_rows() -> None:
     edmp = EDMP(EDMPSettings(samples=30))
     shares = edmp.settings.shares()
     assert np.array_equal(np.concatenate([np.arange(30)[share] for share in shares]), np.arange(30))

@@ -1,4 +1,4 @@
-"""A* and D* Lite on a lattice: the least cost of the graph, also after changes, within memory and time."""
+"""A* and D* Lite on a lattice: least-cost paths, also after changes, within memory and time limits."""
 
 import time
 from dataclasses import replace
@@ -24,7 +24,7 @@ from robotdiffuse.planning.baselines.lattice.planner import (
     DStarLiteSettings,
     LatticeSettings,
     Outcome,
-    _moves,
+    lattice_moves,
 )
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -58,7 +58,7 @@ def arm_problem(seed: int) -> tuple[CollisionChecker, np.ndarray, np.ndarray, np
 def least_cost(
     checker: CollisionChecker, start: np.ndarray, goals: np.ndarray, settings: LatticeSettings
 ) -> float:
-    """By Dijkstra's algorithm over the whole graph, written down."""
+    """The least cost by Dijkstra's algorithm over the whole graph."""
     lower, upper, origin = ARM.lower, ARM.upper, start.astype(float)
     low = np.ceil((lower - origin) / SPACING).astype(int)
     high = np.floor((upper - origin) / SPACING).astype(int)
@@ -99,7 +99,7 @@ def least_cost(
 
 
 def cost_of(search: AStarSearch | DStarLiteSearch) -> float:
-    """The cost, after a look at the path."""
+    """The cost that the search found, after checking its path."""
     outcome = search.run()
     assert outcome in (Outcome.FOUND, Outcome.EXHAUSTED)
     path = search.path()
@@ -139,7 +139,7 @@ def test_inflation_bounds_the_cost(seed):
 @pytest.mark.parametrize("joints", [1, 2])
 @pytest.mark.parametrize("seed", range(8))
 def test_repairs_cost_what_a_new_search_costs(seed, joints):
-    """Obstacles move, come and go, and the arm goes on along its path."""
+    """Obstacles move, appear and disappear, while the arm moves along its path."""
     checker, start, goals, rng = arm_problem(seed)
     settings = DStarLiteSettings(spacing=0.3, joints_per_move=joints, resolution=0.02)
     search, at = DStarLiteSearch(checker, start, goals, settings), None
@@ -159,7 +159,7 @@ def test_repairs_cost_what_a_new_search_costs(seed, joints):
             at = path[1]
         search.update(checker, at)
         fresh = DStarLiteSearch(checker, start, goals, settings)
-        # the same lattice to the last bit, searched from the node where the arm stands
+        # exactly the same lattice, searched from the node where the arm stands
         fresh.update(checker, at)
         assert cost_of(search) == cost_of(fresh)
         if checker.free(np.array([start if at is None else at]))[0]:
@@ -221,7 +221,7 @@ def test_trivial(planner, goal):
     ("planner", "settings"),
     [(AStar, AStarSettings(spacing=0.1, max_nodes=300)), (DStarLite, DStarLiteSettings(max_nodes=300))],
 )
-def test_full_memory_is_told(planner, settings):
+def test_full_memory_is_reported(planner, settings):
     result = planner(settings).plan(Problem(PANDA, WALL, LEFT, JointGoal(RIGHT[None])), time_limit=5.0)
     assert result.status is Status.NO_PATH
     assert "memory is full" in result.reason and "coarser" in result.reason
@@ -284,7 +284,7 @@ def test_bad_settings(wrong, what):
         AStarSettings(**wrong)
 
 
-def test_bad_settings_of_d_star_lite_bear_its_name():
+def test_messages_on_settings_name_d_star_lite():
     with pytest.raises(InputError, match=r"d_star_lite\.spacing"):
         DStarLiteSettings(spacing=-1.0)
 
@@ -306,8 +306,8 @@ def test_updates_refuse_another_robot_and_places_off_the_lattice():
 
 @pytest.mark.parametrize("settings", [AStarSettings(), DStarLiteSettings()])
 def test_two_arms_do_not_outrun_the_time_limit(settings: AStarSettings | DStarLiteSettings) -> None:
-    """With 14 joints a slice of 200 expansions met 78,400 edges, and the clock was looked at a second late;
-    before that, the moves of two joints at once were picked from all 3^14, for half a minute."""
+    """Regression: with 14 joints 200 expansions checked 78,400 edges between two readings of the clock, which
+    took a second; before that, moves of two joints were selected from all 3^14, for half a minute."""
     baxter = load_robot("baxter")
     rng, checker = np.random.default_rng(0), CollisionChecker(baxter, Scene())
     q = rng.uniform(baxter.lower, baxter.upper, (2000, 14)).astype(np.float32)
@@ -327,13 +327,13 @@ def test_two_arms_do_not_outrun_the_time_limit(settings: AStarSettings | DStarLi
 
 def test_moves_of_several_joints_are_all_once_few_joints_first() -> None:
     for dof, joints in ((1, 1), (3, 2), (4, 4), (3, 7)):
-        half = _moves(dof, joints)
+        half = lattice_moves(dof, joints)
         every = {m for m in product((-1, 0, 1), repeat=dof) if 0 < sum(map(abs, m)) <= joints}
         assert len(half) == len(every) / 2 and {*map(tuple, half), *map(tuple, -half)} == every
         assert (np.diff(np.abs(half).sum(axis=1)) >= 0).all()
 
 
-def test_more_edges_of_a_node_than_can_be_looked_at_are_refused() -> None:
+def test_too_many_edges_per_node_are_refused() -> None:
     baxter = load_robot("baxter")
     ends = np.zeros((2, 14), np.float32)
     with pytest.raises(InputError, match=r"joints_per_move is 14; on baxter .* 4782968 edges.* at most 5"):

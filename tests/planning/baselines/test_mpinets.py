@@ -43,7 +43,7 @@ def network() -> MPiNetsNetwork:
 
 
 class Straight(MPiNetsNetwork):
-    """Goes straight to the goal, at most 0.1 rad a joint and step."""
+    """A policy that goes straight to the goal, by at most 0.1 rad per joint and step."""
 
     def forward(self, clouds: torch.Tensor, q: torch.Tensor, goal: torch.Tensor) -> torch.Tensor:
         return q + (goal - q).clamp(-0.1, 0.1)
@@ -97,7 +97,7 @@ def test_pooled_layers_and_their_gradients_are_those_of_pytorch(dtype: torch.dty
     direction = torch.randn_like(found)
     wanted = [x, *layers.parameters()]
     gradients = torch.autograd.grad(found, wanted, direction)
-    # bf16 has 8 bits, and equal greatest values, which share a gradient in PyTorch, are rare but in it
+    # bf16 has 8 bits: equal maxima, which share a gradient in PyTorch, are common only there
     tolerance = 1e-5 if dtype == torch.float32 else 0.1
     assert torch.allclose(found, expected, atol=tolerance)
     if dtype == torch.float32:
@@ -203,9 +203,9 @@ def test_trained_weights_are_read_and_the_same_seed_gives_the_same_path(
     planner = MPiNets(MPiNetsSettings(weights=str(tmp_path), near=0.299))
     q = torch.tensor(LEFT[None], dtype=torch.float32)
     cloud = clouds_of(network, 1)
-    # weights are kept with half the bits
+    # weights are stored in half precision
     assert torch.allclose(network(cloud, q, q), planner.network(PANDA)(cloud, q, q), atol=1e-3)
-    # the policy, which knows nothing, makes some steps before it happens to be near enough
+    # the untrained policy makes some steps before it is near enough by chance
     goal = LEFT + np.array([0.0, 0.0, 0.3, 0.0, 0.0, 0.0, 0.0])
     problem = Problem(PANDA, Scene([Sphere([0.0, 0.0, 1.5], 0.1)]), LEFT, goal)
     paths = [planner.plan(problem, 20.0, seed).path for seed in (5, 5)]

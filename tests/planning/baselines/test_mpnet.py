@@ -1,4 +1,4 @@
-"""MPNet: its auto-encoder, what it learns from, bidirectional planning, contraction and replanning."""
+"""MPNet: its auto-encoder, its training data, bidirectional planning, contraction and replanning."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from robotdiffuse.learning.networks.mpnet import (
 from robotdiffuse.learning.robot_identity import RobotIdentity
 from robotdiffuse.learning.training.batches import TrajectoryData
 from robotdiffuse.planning.baselines.mpnet import MPNet, MPNetPlannerSettings, NeuralPlanning, scene_code
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -63,7 +63,7 @@ def motions(waypoints: int = 48) -> TrajectoryData:
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> str:
-    """A folder with a small network that has seen some training."""
+    """A folder with a small network after some training."""
     net, data, rng = network(), motions(), np.random.default_rng(0)
     net.fit_statistics(data)
     optimizer = torch.optim.Adam(net.parameters(), 3e-3)
@@ -77,11 +77,11 @@ def weights(tmp_path_factory) -> str:
 
 
 def planning(weights: str, problem: Problem, **changes: object) -> NeuralPlanning:
-    """A round of the planner, before it begins."""
+    """A round of the planner before it starts."""
     settings = replace(MPNetPlannerSettings(weights), **changes)
     checker = CollisionChecker(problem.robot, problem.scene)
     start_goal = StartGoal(checker, problem.start, np.array([RIGHT]))
-    context, rng = PlanningContext("mpnet", problem, 60.0, 0), np.random.default_rng(1)
+    context, rng = PlanningContext("mpnet", problem, PlanRequest(60.0)), np.random.default_rng(1)
     return NeuralPlanning(context, start_goal, network(), settings, rng)
 
 
@@ -277,7 +277,7 @@ def test_the_same_seed_gives_the_same_path(weights: str) -> None:
 
 
 def test_giving_up_says_what_was_wrong(weights: str) -> None:
-    """A wall all around: there is no way, and the last attempt says why."""
+    """With walls all around there is no path, and the result says what was wrong with the last attempt."""
     walls = [Box([side * 0.65, 0.0, 0.5], [1.0, 0.02, 3.0]) for side in (1, -1)]
     problem = wall_problem(Scene([*walls, Box([0.0, 0.0, 1.35], [3.0, 0.02, 1.3])]))
     result = MPNet(MPNetPlannerSettings(weights)).plan(problem, 0.3)

@@ -46,13 +46,13 @@ def problem(*goals: np.ndarray, scene: Scene = WALL) -> Problem:
 
 
 def plan(planner: type[planners.OmplPlanner], problem: Problem, seed: int = 1) -> PlanResult:
-    """Anytime planners take all the time that they are given."""
+    """Plan with a short time limit for anytime planners, which use all of it."""
     return planner().plan(problem, time_limit=1.5 if planner.anytime else 120.0, seed=seed)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled() -> None:
-    """What compiling and loading the kernels takes is no planner's time."""
+    """Compile and load the kernels before the planners are timed."""
     planners.OmplRRTConnect().plan(problem(RIGHT), time_limit=120.0)
 
 
@@ -103,7 +103,7 @@ def test_one_of_several_goals(planner):
 
 @pytest.mark.timeout(300)
 def test_prm_with_many_goals_ends():
-    """Its two threads waited for each other, for the roadmap and for Python's lock."""
+    """Regression: its two threads deadlocked on the roadmap's and Python's locks."""
     rng = np.random.default_rng(0)
     many = problem(*(RIGHT + 0.1 * rng.standard_normal((20, 7))))
     for seed in range(5):
@@ -120,7 +120,7 @@ def test_a_pose_is_reached(planner):
 
 
 def corridor() -> Problem:
-    """A planar arm whose goal lies between two walls, too long to be left or entered."""
+    """A planar arm with its goal between two walls, so long that the arm can neither leave nor enter."""
     walls = [Box([0.8, side * 0.12, 0.0], [1.2, 0.08, 0.2]) for side in (-1, 1)]
     return Problem(box_arm(), Scene(walls), np.array([2.0, 0.0, 0.0]), JointGoal(np.zeros((1, 3))))
 
@@ -197,15 +197,15 @@ def test_an_error_below_ompl_comes_out(planner, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr(planners, "motions_free", broken)
         patched.setattr(planners.lane_collision, "free_many", broken)
-        # what surrounds the search asks the kernel as well
-        patched.setattr("robotdiffuse.planning.planner.usable_start_goal", FreeEnds)
+        # start and goal are checked by the kernel too
+        patched.setattr("robotdiffuse.planning.attempt.usable_start_goal", UncheckedStartGoal)
         with pytest.raises(RuntimeError, match="broken kernel"):
             planner().plan(problem(RIGHT), time_limit=120.0)
     assert plan(planner, problem(RIGHT)).solved
 
 
-class FreeEnds(planners.StartGoal):
-    """Ends that nobody checks."""
+class UncheckedStartGoal(planners.StartGoal):
+    """A start and a goal without collision checks."""
 
     def __init__(self, *_):
         self.checker = CollisionChecker(PANDA, WALL)

@@ -1,4 +1,4 @@
-"""What the network proposes, to be looked at."""
+"""Batches of the hybrid planner for drawing."""
 
 import numpy as np
 import pytest

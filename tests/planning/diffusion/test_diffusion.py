@@ -1,4 +1,4 @@
-"""The paper's method alone: the network's samples as they are, the shortest valid one, batch after batch."""
+"""The paper's method alone: unchanged samples of the network, the shortest valid one, batch after batch."""
 
 from dataclasses import replace
 

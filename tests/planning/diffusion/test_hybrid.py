@@ -23,7 +23,7 @@ from robotdiffuse.planning.diffusion.hybrid import (
     _Batches,
     unlearned_starts,
 )
-from robotdiffuse.planning.search.anytime import SLICE, AnytimeSearch
+from robotdiffuse.planning.search.anytime import CLOCK_INTERVAL, AnytimeSearch
 from robotdiffuse.planning.search.aorrtc import AORRTCSettings
 from robotdiffuse.problems.families.rop import ROP
 from robotdiffuse.problems.problem import JointGoal, PoseGoal, Problem
@@ -48,12 +48,12 @@ def planner():
 
 @pytest.fixture
 def no_search(monkeypatch):
-    """Search counts its iterations and finds nothing, so that the network's batches are the only help."""
+    """The search counts its iterations and finds nothing, so that only the network's batches find paths."""
 
     def idle(self):
-        self.work, self._tried = self.work + SLICE, self._tried + SLICE
+        self.work, self._tried = self.work + CLOCK_INTERVAL, self._tried + CLOCK_INTERVAL
 
-    monkeypatch.setattr(AnytimeSearch, "_slice", idle)
+    monkeypatch.setattr(AnytimeSearch, "_iterate", idle)
 
 
 def test_the_network_solves_and_the_validator_agrees(planner, no_search):
@@ -87,13 +87,13 @@ def test_any_sampler_plans(sampler, no_search):
     assert result.stage == "network" and result.path is not None and verify(PROBLEM, result.path).valid
 
 
-def test_weights_that_can_do_without_the_code_are_not_told_it(planner, no_search, monkeypatch):
-    """The code of the scene made none of the hybrid's paths shorter, and took 2 ms."""
+def test_weights_that_need_no_scene_encoding_get_none(planner, no_search, monkeypatch):
+    """The encoding of the scene made none of the hybrid's paths shorter, and took 2 ms."""
     monkeypatch.setattr("robotdiffuse.planning.diffusion.hybrid.encode", None)
     assert planner.plan(PROBLEM, time_limit=10.0).stage == "network"
 
 
-def test_weights_that_cannot_do_without_the_code_are_told_it(planner):
+def test_weights_that_need_a_scene_encoding_get_it(planner):
     model = small_model().for_inference()
     assert not model.settings.null_condition
     checker = CollisionChecker(box_arm(), Scene([BALL]))
@@ -107,7 +107,7 @@ def test_a_free_straight_line_is_the_answer(planner):
 
 
 def test_a_point_cloud_in_place_of_shapes(planner, no_search):
-    """What a camera sees: the same ball as points."""
+    """The same ball as points, as a camera sees it."""
     points = sample_surface(PROBLEM.scene, 4000, np.random.default_rng(0))
     problem = Problem(PANDA, Scene([PointCloud(points, 0.01)]), LEFT, JointGoal(RIGHT[None]))
     result = planner.plan(problem, time_limit=10.0)
@@ -136,8 +136,9 @@ def test_search_answers_where_the_network_gives_nothing(planner, monkeypatch):
     assert verify(PROBLEM, result.path).valid
 
 
-def test_the_first_path_comes_before_the_network_is_asked(monkeypatch):
-    """So time that runs out while it samples costs no plan; and what is returned is no longer."""
+def test_the_first_path_comes_before_the_network_runs(monkeypatch):
+    """So a time limit that ends during sampling costs no plan; and the returned path is no longer than the
+    first."""
     began = []
 
     def late(self, *arguments, draw=RobotDiffuse.draw):
@@ -156,7 +157,8 @@ def test_the_first_path_comes_before_the_network_is_asked(monkeypatch):
 
 
 def test_a_call_loads_the_network_in_its_own_time_or_not_at_all(monkeypatch):
-    """The second call of a process was late once by what loading took: it came before the clock."""
+    """Regression: the second call of a process was late by the loading time, which was before the clock
+    started."""
     loaded, model = [], RobotDiffuse.model
     monkeypatch.setattr(RobotDiffuse, "model", lambda self, robot: loaded.append(robot) or model(self, robot))
     planner = RobotDiffuse(RobotDiffuseSettings(network_share=0.9))  # which is due soon after the path
@@ -176,7 +178,7 @@ def test_a_call_loads_the_network_in_its_own_time_or_not_at_all(monkeypatch):
     assert loaded
 
 
-def test_batches_have_their_share_of_the_work(monkeypatch):
+def test_batches_get_their_part_of_the_work(monkeypatch):
     drawn = []
     draw = RobotDiffuse.draw
     monkeypatch.setattr(RobotDiffuse, "draw", lambda *arguments: drawn.append(1) or draw(*arguments))
@@ -190,7 +192,8 @@ def test_batches_have_their_share_of_the_work(monkeypatch):
 
 
 def test_a_candidate_that_the_validator_refuses_is_not_returned(planner, monkeypatch):
-    """The compiled check is not the validator: candidates through the ball are called free here, and refused."""
+    """The compiled check is not the validator: here it calls candidates through the ball free, and they are
+    refused."""
 
     def through(self, _model, _checker, _code, start, goals, _rng):
         line = start + np.linspace(0, 1, 48)[:, None] * (goals[0] - start)
@@ -210,12 +213,12 @@ def test_a_robot_without_weights_is_planned_by_search_and_noise(planner):
 
 
 STRANGER = Problem(replace(PANDA, name="stranger"), Scene([BALL]), LEFT, JointGoal(RIGHT[None]))
-"""There are no weights for its robot."""
+"""A problem for a robot without weights."""
 
 
 @pytest.fixture
 def noise_at(monkeypatch):
-    """How many iterations the search had done at each batch of smooth noise, and whether it had a path."""
+    """The iterations of search before each batch of smooth noise, and whether there was a path."""
     drawn = []
 
     def draw(self):
@@ -228,8 +231,8 @@ def noise_at(monkeypatch):
 
 
 def test_no_smooth_noise_before_search_has_a_path(planner, no_search, noise_at):
-    """On hard problems of arms without weights three fifths of the time went to batches of noise, and the
-    default solved fewer than its own search."""
+    """Regression: on hard problems of arms without weights, batches of noise took three fifths of the time,
+    and the default planner solved fewer problems than its own search."""
     assert planner.plan(STRANGER, time_limit=0.5).status is Status.TIMEOUT
     assert not noise_at
 
@@ -242,16 +245,16 @@ def test_smooth_noise_keeps_to_its_share_of_the_work(noise_at):
 
 
 def test_smooth_noise_shortens_and_the_validator_agrees(monkeypatch):
-    """Search finds one long way round and then nothing."""
+    """The search finds one long detour and then nothing."""
 
     def detour(self):
-        self.work, self._tried = self.work + SLICE, self._tried + SLICE
+        self.work, self._tried = self.work + CLOCK_INTERVAL, self._tried + CLOCK_INTERVAL
         if self.best is None:
             up = np.array([0.0, -1.0, 0.0, -1.9, 0.0, 2.2, 0.785])
             path = np.array([LEFT, up, RIGHT], np.float32)
             self._take(path, float(path_length(path)), "aorrtc")
 
-    monkeypatch.setattr(AnytimeSearch, "_slice", detour)
+    monkeypatch.setattr(AnytimeSearch, "_iterate", detour)
     settings = RobotDiffuseSettings(search=AORRTCSettings(patience=5 * BATCH_WORK))
     result = RobotDiffuse(settings).plan(STRANGER, time_limit=10.0)
     assert result.stage == "smooth_noise" and result.path is not None and verify(STRANGER, result.path).valid
@@ -263,8 +266,8 @@ def test_invalid_start(planner):
     assert result.status is Status.INVALID_START and "crate" in result.reason
 
 
-def test_the_code_tells_scenes_apart():
-    """z of two clouds of one scene is nearer than z of clouds of two scenes."""
+def test_encodings_distinguish_scenes():
+    """Encodings z of two clouds of one scene are nearer to each other than those of two scenes."""
     model = load_model("panda")
     assert model is not None
     rng = np.random.default_rng(0)
@@ -305,7 +308,7 @@ def test_the_paper_s_planner_has_a_guidance_scale():
 
 
 def test_locked_joints_that_the_network_does_not_know_keep_the_weights():
-    """Fingers at another opening; an arm joint that is held leaves the network fewer joints."""
+    """Fingers locked at another opening; with a locked arm joint the network would have fewer joints."""
     for opening in (0.0, 0.065):
         robot = load_robot("panda", locked={"panda_finger_joint1": opening})
         assert weights_for("model", robot) is not None and RobotDiffuse().model(robot) is not None

@@ -1,9 +1,9 @@
-"""Smooth noise: the ends are held, the limits kept, and it is as wide as the Panda's own noise."""
+"""Smooth noise: fixed ends, joint limits, and the covariance of the noise in the Panda's weights."""
 
 import numpy as np
 
 from robotdiffuse.learning.checkpoint import load_model
-from robotdiffuse.planning.diffusion.smooth_noise import SPREAD, WIDEST, smooth_noise
+from robotdiffuse.planning.diffusion.smooth_noise import MAX_HALF_RANGE, SPREAD, smooth_noise
 from robotdiffuse.robots import load_robot
 
 PANDA = load_robot("panda")
@@ -20,9 +20,9 @@ def test_ends_and_limits_are_kept() -> None:
 
 
 def test_its_covariance_is_about_that_of_the_pandas_weights() -> None:
-    """The eigenvalues within a hundredth of their sum, and the standard deviation on average."""
+    """Eigenvalues agree to a hundredth of their sum, and the standard deviation on average."""
     q = smooth_noise(MIDDLE, MIDDLE[None], 4000, 48, PANDA, np.random.default_rng(1)) - MIDDLE
-    half = np.minimum(0.5 * (PANDA.upper - PANDA.lower), WIDEST)
+    half = np.minimum(0.5 * (PANDA.upper - PANDA.lower), MAX_HALF_RANGE)
     rows = np.moveaxis(q / half, 1, 2).reshape(-1, 48)
     assert np.sqrt((rows**2).mean()) == np.float32(SPREAD).round(6) or abs(rows.std() - SPREAD) < 0.005
     model = load_model("panda")

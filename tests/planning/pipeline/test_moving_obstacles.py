@@ -1,4 +1,4 @@
-"""Planning among obstacles that move, motions that begin moving, and the reactive loop."""
+"""Planning among moving obstacles."""
 
 from dataclasses import replace
 
@@ -9,7 +9,6 @@ import robotdiffuse as rd
 from robotdiffuse.certificates.checker import check
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.deadline import OutOfTimeError, deadline
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning import PLANNERS
 from robotdiffuse.planning.pipeline.moving_obstacles_kernel import WAITED, earliest
@@ -19,7 +18,7 @@ from robotdiffuse.validation.validator import verify_trajectory
 PANDA = rd.load_robot("panda")
 START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
 CROSSING = rd.MovingObstacle(rd.Sphere([0.95, 0.0, 0.45], 0.12, name="ball"), velocity=[-0.15, 0, 0])
-"""In the way when the arm would come by at full speed; it then goes on over the base."""
+"""Crosses the path when the arm would pass at full speed, then goes on over the base."""
 PASSING = rd.MovingObstacle(rd.Box([0.55, -0.5, 0.4], [0.1, 0.1, 0.8], name="cart"), velocity=[0, 0.3, 0])
 
 
@@ -58,22 +57,23 @@ def test_any_planner_finds_the_path(name: str) -> None:
     assert known.get(name, name) in PLANNERS
 
 
-def test_start_that_is_hit_at_once() -> None:
+def test_a_start_that_is_hit_at_once_is_invalid() -> None:
     at = rd.MovingObstacle(rd.Sphere([0.3, -0.45, 0.45], 0.2, name="ball"), velocity=[0, 0, 0.1])
     found = rd.load_planner("rrt_connect").plan(problem(at))
     assert found.status is Status.INVALID_START
     assert "touches ball" in found.reason
 
 
-def test_no_way_by_a_wall_that_comes() -> None:
+def test_a_wall_that_comes_cannot_be_passed() -> None:
     wall = rd.MovingObstacle(rd.Box([0, 2.0, 0.5], [4, 0.1, 4], name="wall"), velocity=[0, -2.5, 0])
     found = rd.load_planner("rrt_connect").plan(problem(wall), 0.5)
     assert found.status is Status.TIMEOUT
     assert "moving obstacles" in found.reason
 
 
-def test_earliest_waits_for_what_passes() -> None:
-    """Three configurations in a row, the middle one taken at ticks 1 to 3, both ends of a step checked."""
+def test_the_earliest_schedule_waits_for_a_passing_obstacle() -> None:
+    """Three configurations in a row; the middle one is occupied at ticks 1 to 3; both ends of a step are
+    checked."""
     clear = np.ones((3, 10), bool)
     clear[1, 1:4] = False
     args = np.array([0, 2]), np.array([0]), np.array([1]), np.array([0, 3]), np.array([0, 1, 2])
@@ -90,60 +90,6 @@ def test_the_grid_of_times_ends_with_the_time() -> None:
         earliest(np.ones((3, 10), bool), *args)
 
 
-VELOCITIES = [np.eye(7)[0] * 2.0, np.array([0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6]), -np.eye(7)[0]]
-
-
-@pytest.mark.parametrize("velocity", VELOCITIES)
-def test_motion_begins_moving(velocity: np.ndarray) -> None:
-    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
-    found = rd.load_planner("rrt_connect").plan(task, 5.0)
-    assert found.status is Status.SOLVED, found.reason
-    assert found.trajectory is not None
-    assert np.allclose(found.trajectory.velocities[0], velocity, atol=1e-9)
-    assert (np.abs(found.trajectory.velocities) <= PANDA.velocity * (1 + 1e-6)).all()
-    assert (np.abs(found.trajectory.accelerations) <= PANDA.acceleration * (1 + 1e-3)).all()
-    assert verify_trajectory(task, found.trajectory).valid
-    at_rest = verify_trajectory(replace(task, start_velocity=None), found.trajectory).violation
-    assert at_rest is not None
-    assert at_rest.kind in ("rest", "acceleration")
-
-
-@pytest.mark.parametrize(
-    ("velocity", "message"),
-    [
-        ([0.1] * 6, "start_velocity is .*; it must be 7 finite numbers"),
-        ([np.nan] * 7, "start_velocity is .*; it must be 7 finite numbers"),
-        ([9.0, 0, 0, 0, 0, 0, 0], "start_velocity: panda_joint1 is 9; its velocity limit is 2.17"),
-    ],
-)
-def test_start_velocities_that_are_none(velocity: list[float], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
-
-
-def test_start_velocities_of_nearly_nothing_are_rest() -> None:
-    """1e-300 rad/s divided by its square's root, which is 0."""
-    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-300] * 7).start_velocity is None
-    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-5] * 7).start_velocity is not None
-
-
-def test_start_velocity_into_a_limit() -> None:
-    start = START.copy()
-    start[0] = PANDA.upper[0] - 0.01
-    task = rd.Problem(PANDA, rd.Scene(), start, END, start_velocity=np.eye(7)[0] * 2.0)
-    found = rd.load_planner("rrt_connect").plan(task)
-    assert found.status is Status.INVALID_START
-    assert "panda_joint1 cannot stop" in found.reason
-
-
-def test_start_velocity_beyond_what_scaling_leaves() -> None:
-    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=np.eye(7)[0] * 2.0)
-    with pytest.raises(InputError, match=r"velocity_scaling leaves it 1\.08"):
-        rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
-    with pytest.raises(InputError, match="jerk cannot be limited beside start_velocity"):
-        rd.load_planner("rrt_connect").plan(task, jerk=100.0)
-
-
 UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
 BESIDE: dict[str, dict[str, object]] = {
     "waypoints": {"waypoints": [(START + END) / 2 - [0, 0.3, 0, 0, 0, 0, 0], START]},
@@ -154,7 +100,7 @@ BESIDE: dict[str, dict[str, object]] = {
 
 
 @pytest.mark.parametrize("asked", BESIDE)
-def test_what_else_is_asked_holds_among_moving_obstacles(asked: str) -> None:
+def test_other_requests_hold_among_moving_obstacles(asked: str) -> None:
     if asked == "payload":
         pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
     obstacle = PASSING if asked == "waypoints" else CROSSING
@@ -178,7 +124,8 @@ def test_what_else_is_asked_holds_among_moving_obstacles(asked: str) -> None:
 
 
 def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
-    """The waypoint is on the straight line, where nothing would stop the motion; a ball is there first."""
+    """The waypoint is on the straight line, where the motion would not stop by itself; a ball is there
+    first."""
     middle = (START + END) / 2
     at = link_pose(PANDA, middle, "panda_hand")[:3, 3]
     ball = rd.MovingObstacle(rd.Sphere(at, 0.08, name="ball"), velocity=[0.3, 0, 0.3])
@@ -188,10 +135,3 @@ def test_a_stop_at_a_waypoint_is_not_gone_through() -> None:
     assert verify_trajectory(task, found.trajectory).valid
     alone = rd.load_planner("rrt_connect").plan(replace(task, moving=()), 20.0).trajectory
     assert alone is not None and found.trajectory.duration > alone.duration
-
-
-def test_the_loop_says_what_it_does_not_know() -> None:
-    ball = rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1, name="ball"), max_speed=0.1)
-    for more in BESIDE.values():
-        with pytest.raises(InputError, match=r"problem\.\w+: the replanner knows of none"):
-            rd.Replanner(problem(ball, **more))

@@ -1,4 +1,5 @@
-"""Policies for unknown space: assumptions only add obstacles, carved free at the ends; what results say of it."""
+"""Policies for unknown space: assumptions only add obstacles, with start and goal carved free; what results
+say."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -13,24 +14,24 @@ from robotdiffuse.collision.kernel_arrays import compile_robot
 from robotdiffuse.core.results import load_result
 from robotdiffuse.core.types import FIRST, Status
 from robotdiffuse.perception.assumptions import (
-    CARVED,
-    FINE,
+    CARVING_MARGIN,
     FINE_SHAPE,
+    FINE_VOXEL_SIZE,
     PADDINGS,
     THRESHOLDS,
     Padded,
     Voxels,
-    assumptions,
     voxels_in,
 )
-from robotdiffuse.perception.confidence import RATES, confidence
+from robotdiffuse.perception.confidence import RATES
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import LOW, SHAPE, VOXEL, observe
 from robotdiffuse.perception.ray_caster import looking_at, ray_cast, voxels_within
-from robotdiffuse.perception.swept_voxels_kernel import heaviest_part, summed, surface, sweep
+from robotdiffuse.perception.swept_voxels_kernel import sweep
 from robotdiffuse.planning import load_planner
-from robotdiffuse.planning.context import Request
-from robotdiffuse.planning.pipeline.unknown_space import AS_SEEN, plan_with_unknown_space
+from robotdiffuse.planning.attempt import attempt
+from robotdiffuse.planning.context import PlanRequest
+from robotdiffuse.planning.pipeline.unknown_space import AS_SEEN, assumptions_of, plan_with_unknown_space
 from robotdiffuse.planning.planner import Planner
 from robotdiffuse.problems.problem import PoseGoal, Problem
 from robotdiffuse.robots import load_robot
@@ -43,9 +44,9 @@ PANDA = load_robot("panda")
 START = np.array([-0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 GOAL = np.array([0.9, 0.3, 0.0, -1.8, 0.0, 2.1, 0.8])
 DEEP = Scene([Box([0.55, 0.0, 0.3], [0.5, 0.2, 0.6])])
-"""A box that goes from far ahead to close to the arm; a camera ahead sees its front."""
+"""A deep box in front of the arm; a camera ahead sees only its front."""
 AHEAD = looking_at(np.array([1.7, 0.0, 0.3]), np.array([0.0, 0.0, 0.3]))
-REQUEST = Request()
+REQUEST = PlanRequest(4.0)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def partial(unknown: str, *views: DepthView) -> Problem:
 
 
 def true_voxels() -> Float32[ndarray, "nx ny nz"]:
-    return voxels_within(DEEP, LOW, FINE, FINE_SHAPE).astype(np.float32)
+    return voxels_within(DEEP, LOW, FINE_VOXEL_SIZE, FINE_SHAPE).astype(np.float32)
 
 
 @pytest.mark.parametrize("unknown", ["optimistic", "padded", "occupied"])
@@ -79,11 +80,11 @@ def test_solved_means_free_of_what_was_seen(planner: Planner, unknown: str) -> N
 
 
 def test_predicted_obstacles_are_kept_clear_of(planner: Planner) -> None:
-    """As seen, the way leads through the back of the box; with its voxels predicted, past it."""
+    """As seen, the path leads through the back of the box; with its voxels predicted, past it."""
     truth = Problem(PANDA, DEEP, START, GOAL)
     through = planner.plan(partial("optimistic"), time_limit=2.0)
     assert through.path is not None and not verify(truth, through.path).valid
-    past = plan_with_unknown_space(planner, partial("predicted"), 4.0, 0, REQUEST, true_voxels())
+    past = plan_with_unknown_space(planner, partial("predicted"), REQUEST, true_voxels())
     assert past.assumption == "predicted, p > 0.1" and past.swept_probability == 0
     assert past.path is not None and verify(truth, past.path).valid
     assert past.confidence is not None and through.confidence is not None
@@ -93,14 +94,14 @@ def test_predicted_obstacles_are_kept_clear_of(planner: Planner) -> None:
 def test_of_several_motions_the_one_that_sweeps_least_probability(planner: Planner) -> None:
     everywhere = np.full(FINE_SHAPE, np.float32(0.01))
     problem = partial("predicted")
-    chosen = plan_with_unknown_space(planner, problem, 4.0, 0, REQUEST, everywhere)
-    first = planner.attempt(replace(problem, views=()), 1.0, 0, REQUEST)
+    chosen = plan_with_unknown_space(planner, problem, REQUEST, everywhere)
+    first = attempt(planner, replace(problem, views=()), PlanRequest(1.0))
     unknown = observe(problem.views, PANDA, START).unknown.repeat(2, 0).repeat(2, 1).repeat(2, 2)
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
     swept = np.zeros(FINE_SHAPE, np.bool_)
     assert first.path is not None and chosen.swept_probability is not None
     path = first.path.positions.astype(np.float32)
-    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(FINE), swept)
+    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(FINE_VOXEL_SIZE), swept)
     assert chosen.swept_probability <= 0.01 * (swept & unknown & ~voxels_in(ends)).sum() * (1 + 1e-3)
 
 
@@ -116,7 +117,9 @@ def test_occupied_crosses_nothing_unknown_but_at_the_ends(planner: Planner) -> N
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, near)]).astype(np.float32)
     swept, path = np.zeros(SHAPE, np.bool_), result.path.positions.astype(np.float32)
     sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(VOXEL), swept)
-    unknown = observe(problem.views, PANDA, START).unknown & ~voxels_in(ends, CARVED + VOXEL / 2, VOXEL)
+    unknown = observe(problem.views, PANDA, START).unknown & ~voxels_in(
+        ends, CARVING_MARGIN + VOXEL / 2, VOXEL
+    )
     assert unknown.any() and not (swept & unknown).any()
 
 
@@ -137,70 +140,32 @@ def test_assumptions_are_carved_free_at_the_ends() -> None:
     ends = np.concatenate([placed_spheres(PANDA, q) for q in (START, GOAL)]).astype(np.float32)
     solid = np.ones(FINE_SHAPE, np.bool_)
     volume = observe([taken(DEEP)], PANDA, START)
-    chain = [*assumptions(partial("padded"), volume, None), *assumptions(partial("occupied"), volume, None)]
+    chain = [a for p in ("padded", "occupied") for a in assumptions_of(partial(p), volume, None)]
     assert [assumption.padding for assumption in chain if isinstance(assumption, Padded)] == list(PADDINGS)
-    for assumption in (*chain, Voxels("all", solid, partial("predicted"))):
+    for assumption in (*chain, Voxels("all", solid, PANDA, Scene())):
         cloud = assumption.obstacles(ends)
         away = np.linalg.norm(cloud.points[:, None] - ends[None, :, :3], axis=2) - ends[:, 3]
         assert len(cloud.points) and away.min() > cloud.point_radius
         assert assumption.touched(ends) > 0 or isinstance(assumption, Padded)
-    assert len(Voxels("all", solid, partial("predicted")).obstacles(ends[:1]).points) < 0.15 * solid.size
+    assert len(Voxels("all", solid, PANDA, Scene()).obstacles(ends[:1]).points) < 0.15 * solid.size
 
 
-def test_thresholds_fall_from_assumption_to_rung() -> None:
+def test_later_assumptions_have_fewer_voxels() -> None:
     volume = observe([taken(DEEP)], PANDA, START)
     p = np.random.default_rng(0).random(FINE_SHAPE).astype(np.float32) ** 3
     occupied = [
         assumption.occupied
-        for assumption in assumptions(partial("predicted"), volume, p)
+        for assumption in assumptions_of(partial("predicted"), volume, p)
         if isinstance(assumption, Voxels)
     ]
     assert len(occupied) == len(THRESHOLDS)
     assert all((b <= a).all() and b.sum() < a.sum() for a, b in pairwise(occupied))
 
 
-def test_swept_voxels_are_those_in_the_spheres_along_the_way() -> None:
-    path = np.stack([START, GOAL]).astype(np.float32)
-    swept = np.zeros(SHAPE, np.bool_)
-    sweep(compile_robot(PANDA), path, np.array(LOW, np.float32), np.float32(VOXEL), swept)
-    centres = (np.argwhere(np.ones(SHAPE)) + 0.5) * VOXEL + LOW
-    moving = {link for link in PANDA.spheres if PANDA.link_frame(link) > 0}
-    fixed = sum(len(spheres) for link, spheres in PANDA.spheres.items() if link not in moving)
-    for t in (0.0, 0.5, 1.0):
-        spheres = placed_spheres(PANDA, START + t * (GOAL - START))[fixed:]
-        distances = np.linalg.norm(centres[:, None] - spheres[None, :, :3], axis=2) - spheres[:, 3]
-        within = (distances < -0.002).any(axis=1).reshape(SHAPE)
-        assert within.any() and swept[within].all()
-
-
-def test_confidence_falls_with_the_probability_that_is_swept() -> None:
-    for assumption in ("predicted, p > 0.1", AS_SEEN):
-        stated = [confidence(assumption, risk) for risk in (0.0, 0.1, 1.0, 10.0, 1000.0)]
-        assert all(0 <= b <= a <= 1 for a, b in pairwise(stated))
-    assert all(0 < confidence(assumption) < 1 for assumption in RATES)
-
-
-def test_files_of_results_keep_it(planner: Planner, tmp_path: Path) -> None:
-    result = plan_with_unknown_space(planner, partial("predicted"), 4.0, 0, REQUEST, true_voxels())
+def test_result_files_keep_the_assumption_and_its_confidence(planner: Planner, tmp_path: Path) -> None:
+    result = plan_with_unknown_space(planner, partial("predicted"), REQUEST, true_voxels())
     result.save(tmp_path / "result.json")
     again = load_result(tmp_path / "result.json").result
     for name in ("assumption", "confidence", "swept_probability", "unknown_region"):
         assert getattr(again, name) == getattr(result, name)
     assert again.unknown_region is not None and len(again.unknown_region[0]) == 3
-
-
-def test_the_part_that_weighs_most_is_boxed() -> None:
-    marked, weights = np.zeros((6, 7, 8), np.bool_), np.ones((6, 7, 8), np.float32)
-    marked[0, 0, :3], marked[5, 6, 7], marked[3:5, 3, 3] = True, True, True
-    assert heaviest_part(marked, weights).tolist() == [[0, 0, 0], [1, 1, 3]]
-    weights[5, 6, 7] = 4.0
-    assert heaviest_part(marked, weights).tolist() == [[5, 6, 7], [6, 7, 8]]
-    assert summed(weights, marked) == 9.0
-    assert not heaviest_part(np.zeros_like(marked), weights).any()
-
-
-def test_the_surface_is_what_has_a_face_outside() -> None:
-    marked = np.zeros((5, 5, 5), np.bool_)
-    marked[1:4, 1:4, 1:4] = True
-    assert len(surface(marked)) == 26 and [2, 2, 2] not in surface(marked).tolist()
-    assert len(surface(np.ones((3, 3, 3), np.bool_))) == 0

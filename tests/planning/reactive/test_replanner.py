@@ -1,4 +1,6 @@
-"""The reactive loop: what it hands out always ends at rest before anything can get there."""
+"""The replanner: every motion ends at rest before an obstacle can reach the arm."""
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ FLOOR = rd.Box([0, 0, -0.06], [2, 2, 0.1], name="floor")
 
 
 def balls(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where balls are at first, and their velocities: through the arm's workspace after 1 to 2 s."""
+    """Positions and velocities of balls that cross the arm's workspace after 1 to 2 s."""
     rng = np.random.default_rng(seed)
     through = np.column_stack([rng.uniform(0.4, 0.7, count), rng.uniform(-0.3, 0.3, count), [0.5] * count])
     ways = np.column_stack([rng.choice([-1.0, 1.0], count), rng.normal(size=(count, 2)) * [0.3, 0.2]])
@@ -92,15 +94,15 @@ def test_a_late_step_finds_the_arm_where_the_last_command_left_it() -> None:
     assert np.allclose(late.motion.positions[0], command.motion.positions[-1], atol=1e-9)
 
 
-def test_what_is_not_seen_can_be_further_each_time() -> None:
-    """A ball that is not seen again keeps the arm at rest after a while, wherever it is."""
+def test_unseen_obstacles_grow_with_time() -> None:
+    """A ball that is not seen again may be anywhere after a while, which keeps the arm at rest."""
     replanner = loop(np.array([[0.5, 1.6, 0.5]]))
     replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
     late = replanner.step({}, 10.0)
     assert not late.renewed
 
 
-def test_obstacle_that_stands_in_the_goal_is_waited_for() -> None:
+def test_the_arm_waits_for_an_obstacle_at_the_goal() -> None:
     from robotdiffuse.robots.kinematics import link_pose
 
     place = link_pose(PANDA, END, "panda_hand")[:3, 3]
@@ -126,14 +128,14 @@ def test_obstacle_that_stands_in_the_goal_is_waited_for() -> None:
         ({"sphere": [0.5, 1.0, 0.5]}, 0.1, r"observation\['sphere'\] is 0.6 m from where it was 0.1 s ago"),
     ],
 )
-def test_steps_that_make_no_sense(observation: object, now: float, message: str) -> None:
+def test_invalid_steps_are_refused(observation: object, now: float, message: str) -> None:
     replanner = loop(np.array([[0.5, 1.6, 0.5]]))
     replanner.step({"sphere": [0.5, 1.6, 0.5]}, 0.0)
     with pytest.raises(InputError, match=message):
         replanner.step(observation, now)  # type: ignore[arg-type]
 
 
-def test_loops_that_cannot_begin() -> None:
+def test_replanners_that_cannot_begin() -> None:
     with pytest.raises(InputError, match=r"problem\.moving is empty"):
         rd.Replanner(rd.Problem(PANDA, rd.Scene(), START, END))
     inside = rd.Problem(
@@ -145,3 +147,19 @@ def test_loops_that_cannot_begin() -> None:
     )
     with pytest.raises(InputError, match="the replanner cannot begin: the start is in collision"):
         rd.Replanner(inside)
+
+
+UPRIGHT = rd.AxisCone("panda_hand", [0, 0, 1], [0, 0, -1], 0.2)
+UNSUPPORTED: dict[str, dict[str, Any]] = {
+    "waypoints": {"waypoints": [rd.JointGoal((START + END) / 2)]},
+    "constraints": {"constraints": [UPRIGHT]},
+    "payload": {"payload": rd.Payload(0.5, link="panda_hand")},
+}
+
+
+@pytest.mark.parametrize("what", UNSUPPORTED)
+def test_the_replanner_refuses_what_it_does_not_support(what: str) -> None:
+    ball = rd.MovingObstacle(rd.Sphere([3, 0, 0], 0.1, name="ball"), max_speed=0.1)
+    problem = rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], **UNSUPPORTED[what])
+    with pytest.raises(InputError, match=rf"problem\.{what}: the replanner does not support it"):
+        rd.Replanner(problem)

@@ -1,4 +1,4 @@
-"""AORRTC: paths below the bound, shorter with time; `until`, the clearance and the scaling of a call."""
+"""AORRTC: paths below the bound, shorter with time; until, clearance and scaling of a request."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -64,7 +64,7 @@ def test_paths_are_below_the_bound_and_join_the_ends() -> None:
 
 @pytest.mark.parametrize("limit", [2.0, 0.05])
 def test_trees_that_are_kept_hold_free_edges_and_change_no_path(limit: float) -> None:
-    """Of a search that found a path, and of one that hardly can in its time: walls on both sides, one
+    """With a search that finds a path, and one that hardly can in its time: walls on both sides and one
     above."""
     walls = [Box([x, 0.0, 0.6], [1.4, 0.05, 2.4], name=f"wall{x}") for x in (-0.95, 0.95)]
     scene = WALL if limit > 1 else Scene([*walls, Box([0.0, 0.0, 1.2], [0.6, 0.05, 0.6], name="above")])
@@ -92,10 +92,10 @@ def test_samples_are_in_the_spheroid_of_a_goal() -> None:
     bound = np.float32(1.3 * np.linalg.norm(goals[0] - start))
     far = np.full(7, 10.0, np.float32)
     space = search_space(CollisionChecker(PANDA, WALL), 0.04)._replace(lower=-far, upper=far)
-    shares, state, q = rrt_kernel._shares(start, goals, bound), random_state(3), np.empty(7, np.float32)
+    shares, state, q = rrt_kernel.goal_shares(start, goals, bound), random_state(3), np.empty(7, np.float32)
     near = np.zeros(2)
     for _ in range(2_000):
-        rrt_kernel._sample_within(space, start, goals, shares, bound, q, state)
+        rrt_kernel.sample_within(space, start, goals, shares, bound, q, state)
         through = np.linalg.norm(q - start) + np.linalg.norm(q - goals, axis=1)
         assert through.min() <= bound + 1e-4
         near += through <= bound
@@ -103,7 +103,7 @@ def test_samples_are_in_the_spheroid_of_a_goal() -> None:
 
 
 @pytest.mark.parametrize("planner", [AORRTC(), RRTConnect()], ids=["aorrtc", "rrt_connect"])
-def test_longer_is_no_longer(planner: AORRTC | RRTConnect) -> None:
+def test_more_time_gives_no_longer_paths(planner: AORRTC | RRTConnect) -> None:
     planner.plan(AROUND, 1e-3)  # compiles
     first, short, limit = (
         planner.plan(AROUND, 1.0, seed=3, until=until) for until in ("first", "converged", "time_limit")
@@ -131,21 +131,21 @@ def test_a_free_straight_line_is_the_answer() -> None:
     assert len(result.path.positions) == 2
 
 
-def test_the_clearance_is_kept_or_it_is_said_that_it_is_not() -> None:
+def test_the_clearance_is_kept_or_a_note_says_otherwise() -> None:
     for asked in (0.0, 0.02, 0.05):
         result = AORRTC().plan(AROUND, 5.0, clearance=asked)
         assert result.scene_clearance is not None
         least = CollisionChecker(PANDA, WALL)
         assert result.trajectory is not None
-        legs = pairwise(result.trajectory.positions)  # rounded corners keep it too
-        dense = np.concatenate([np.linspace(a, b, 5) for a, b in legs])
+        segments = pairwise(result.trajectory.positions)  # rounded corners keep it too
+        dense = np.concatenate([np.linspace(a, b, 5) for a, b in segments])
         assert least.link_clearances(dense).min() >= asked - 0.002 and not result.notes
-    # between the plates the arm does not keep 20 cm
+    # between the plates the arm cannot keep 20 cm
     narrow = AORRTC().plan(AROUND, 5.0, clearance=0.3)
     assert narrow.solved and any("not 30 cm" in note for note in narrow.notes)
 
 
-def test_the_problem_says_the_clearance_unless_the_call_does() -> None:
+def test_the_clearance_of_a_call_overrides_that_of_the_problem() -> None:
     wide = Problem(PANDA, WALL, LEFT, RIGHT, clearance=0.05)
     kept, less = AORRTC().plan(wide, 5.0), AORRTC().plan(wide, 5.0, clearance=0.0)
     assert kept.path_length is not None and less.path_length is not None
@@ -172,8 +172,8 @@ def test_a_limit_of_jerk_is_kept_by_a_certified_motion() -> None:
     assert free.duration < gentle.duration < 2 * free.duration
 
 
-def test_no_gain_asked_for_is_no_end() -> None:
-    """With `gain` 0 the search stopped at once where there was no path at half the work."""
+def test_gain_zero_does_not_end_the_search() -> None:
+    """Regression: with `gain` 0 the search stopped at once if there was no path at half the work."""
     result = AORRTC(AORRTCSettings(gain=0.0, patience=0)).plan(AROUND, 0.5)
     assert result.solved and len(result.progress) > 1
 
@@ -201,11 +201,12 @@ def test_a_short_limit_is_a_time_out() -> None:
     assert result.status is Status.TIMEOUT and result.path is None
 
 
-def test_one_slow_validation_does_not_take_later_calls_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A first call that loads code validated for a second; calls of a tenth of that then ended at once."""
-    monkeypatch.setitem(context._finishing, "panda", 1.0)
+def test_one_slow_validation_does_not_use_up_later_calls(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: a first call, which loaded kernels, validated for a second; shorter calls then ended at
+    once."""
+    monkeypatch.setitem(context._validation_seconds, "panda", 1.0)
     assert AORRTC().plan(AROUND, 0.3, until="time_limit").solved
-    assert context._finishing["panda"] < 1.0
+    assert context._validation_seconds["panda"] < 1.0
 
 
 def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
@@ -220,8 +221,8 @@ def test_simplification_keeps_ends_and_freedom_and_does_not_lengthen() -> None:
             assert motions_free(space, short).all()
 
 
-def test_a_long_way_round_is_left_again() -> None:
-    """Bounded rounds found nothing below a first path that went round a shelf, where restarts did."""
+def test_a_long_detour_is_replaced() -> None:
+    """Regression: bounded rounds found nothing shorter than a first path around a shelf; restarts did."""
     problem = replace(held_out_problem("shelf", 3), clearance=0.0)
     result = AORRTC(AORRTCSettings(patience=40_000)).plan(problem, time_limit=60.0)
     assert result.path is not None and result.path.length < 8.0

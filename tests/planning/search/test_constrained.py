@@ -1,5 +1,5 @@
-"""Planning under path constraints: what is found keeps them at every millimetre, by kinematics that share no
-code with search and validator; what cannot be is told."""
+"""Planning under path constraints: motions keep them at every millimetre, by kinematics that share no code
+with search and validator; starts and goals that cannot are reported."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -39,7 +39,7 @@ def problem(constraints: list[Constraint], scene: rd.Scene | None = None) -> Pro
 
 
 def excess(constraint: Constraint, q: np.ndarray) -> float:
-    """How far the worst of configurations [n, dof] is beyond a constraint [m] or [rad], by hand."""
+    """The largest violation of a constraint by configurations [n, dof], [m] or [rad], computed by hand."""
     T = link_poses(PANDA, q, constraint.frame)
     p = T[:, :3, 3]
     if isinstance(constraint, rd.AxisCone):
@@ -56,7 +56,7 @@ def excess(constraint: Constraint, q: np.ndarray) -> float:
     way = last[:3, 3] - first[:3, 3]
     share = np.clip((p - first[:3, 3]) @ way / (way @ way), 0, 1)
     off = np.linalg.norm(p - first[:3, 3] - share[:, None] * way, axis=1) - constraint.tolerance
-    # start and goal have the same orientation here but for a turn of the base joint, about the vertical
+    # start and goal differ in orientation only by a turn of the base joint, about the vertical
     ups = (rotation_from_rpy(0.0, 0.0, 1.2 * one) @ first[:3, :3] for one in share.tolist())
     assert constraint.angle is not None
     turned = max(rotation_angle(up.T @ R) for up, R in zip(ups, T[:, :3, :3], strict=True))
@@ -104,7 +104,7 @@ def test_validator_names_constraint_amount_and_place() -> None:
     assert verify(problem([UPRIGHT]), straight).valid, "turning the base joint keeps the hand upright"
 
 
-def test_start_and_goal_that_do_not_keep_constraints_are_told_by_how_much() -> None:
+def test_violations_at_start_and_goal_are_reported() -> None:
     tilted = START + np.array([0, 0, 0, 0, 0, 0.5, 0])
     told = load_planner("aorrtc").plan(replace(problem([UPRIGHT]), start=tilted))
     assert told.status is Status.INVALID_START
@@ -116,8 +116,9 @@ def test_start_and_goal_that_do_not_keep_constraints_are_told_by_how_much() -> N
     assert told.status is Status.INVALID_GOAL and "28.65 degrees" in told.reason
 
 
-def test_goal_pose_with_room_is_turned_until_it_keeps_the_constraint() -> None:
-    """A pose tilted by half a radian with any tilt allowed: few draws are upright, projection makes some."""
+def test_a_goal_pose_with_tolerance_is_turned_until_it_keeps_the_constraint() -> None:
+    """A pose tilted by half a radian with any tilt allowed: few draws are upright, but projection makes some
+    so."""
     T = transform(AT + np.array([0.0, 0.4, 0.1])) @ transform(
         np.zeros(3), rotation_from_rpy(np.pi - 0.5, 0.0, 0.0)
     )

@@ -1,4 +1,4 @@
-"""Near neighbours: the same as by brute force, whatever the points, and far fewer looks."""
+"""Nearest neighbours are those of brute force, for any points."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def tree_of(points: np.ndarray):
 @given(st.integers(1, 400), st.integers(1, 7), st.integers(1, 40), st.integers(0, 2**31))
 def test_the_same_as_brute_force(n: int, dof: int, k: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    # rounded: many equal coordinates, which a split must not tear apart
+    # rounded: many equal coordinates, which a split must not separate
     points = rng.normal(size=(n, dof)).round(int(rng.integers(1, 6))).astype(np.float32)
     points = np.unique(points, axis=0)
     rng.shuffle(points)

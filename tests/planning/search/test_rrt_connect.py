@@ -112,7 +112,7 @@ def test_search_can_be_continued():
 
 
 def test_retreat_from_contact_of_the_spheres():
-    """A start that the meshes call free, and the covering spheres, which stick out, do not."""
+    """A start whose meshes are free while the covering spheres around them are not."""
     ahead = link_pose(PANDA, READY, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
     for radius in np.arange(0.1, 0.05, -0.0002):
         scene = Scene([Sphere(ahead, radius)])
@@ -127,7 +127,8 @@ def test_retreat_from_contact_of_the_spheres():
 
 @pytest.mark.parametrize("end", ["start", "goal"])
 def test_ends_too_close_to_contact_name_link_obstacle_and_depth(end, monkeypatch):
-    """Free by the meshes, not by the spheres, and no way out: once a timeout at once that named nothing."""
+    """Regression: a state free by the meshes but not by the spheres, without a way out, was an immediate
+    timeout."""
     ahead = link_pose(PANDA, READY, "panda_hand")[:3, 3] - [0.0, 0.0, 0.2]
     radii = np.arange(0.1, 0.05, -0.0002)
     scenes = (Scene([Sphere(ahead, radius, name="ball")]) for radius in radii)
@@ -163,7 +164,7 @@ def test_out_of_reach():
 
 
 def test_no_way_through_times_out():
-    """A wall between start and goal, with a gap for the base alone: the search ends with the time."""
+    """A wall between start and goal, with a gap only for the base: the search ends with the time limit."""
     checker = CollisionChecker(PANDA, SEALED)
     assert checker.free(np.stack([LEFT, RIGHT])).all()
     result = RRTConnect().plan(Problem(PANDA, SEALED, LEFT, JointGoal(RIGHT[None])), time_limit=0.3)

@@ -41,14 +41,15 @@ TOUCHING = replace(ENDLESS, safety_distance=0.0)
 
 
 def two_joints():
-    """The planar arm with its last joint locked: configurations are a plane, and a grid knows the optimum."""
+    """The planar arm with its last joint locked: the configuration space is a plane, and a grid gives the
+    optimum."""
     pairs = (("l1", "l2"), ("l1", "l3"), ("l2", "l3"))
     arm = box_arm().with_locked({box_arm().joint_names[2]: 0.0})
     return replace(arm, allowed_collisions=frozenset(map(frozenset, pairs)))
 
 
 def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray, cells: int) -> float:
-    """Shortest way over a grid whose steps go in 64 directions, so that it is at most 0.4 % too long."""
+    """Length of the shortest path over a grid with steps in 64 directions, at most 0.4 % too long."""
     axis = np.linspace(-2.8, 2.8, cells)
     h = axis[1] - axis[0]
     free = checker.free(np.array(list(product(axis, axis)))).reshape(cells, cells)
@@ -59,7 +60,7 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
         here = np.s_[max(0, -i) : cells - max(0, i), max(0, -j) : cells - max(0, j)]
         there = np.s_[max(0, i) : cells - max(0, -i), max(0, j) : cells - max(0, -j)]
         open_ = free[here] & free[there]
-        # what a long step passes over must be free as well
+        # nodes that a long step passes over must be free too
         for t in np.arange(1, max(abs(i), abs(j))) / max(abs(i), abs(j)):
             a, b = round(t * i), round(t * j)
             middle = np.s_[max(0, -i) + a : cells - max(0, i) + a, max(0, -j) + b : cells - max(0, j) + b]
@@ -76,7 +77,7 @@ def grid_optimum(checker: CollisionChecker, start: np.ndarray, goal: np.ndarray,
 
 @pytest.fixture(scope="module")
 def planar():
-    """A planar problem with a detour, its checker, ends and optimum."""
+    """A planar problem with a detour: its checker, start, goals and optimum."""
     robot = two_joints()
     scene = Scene([Sphere([0.75, 0.0, 0.0], 0.2), Sphere([-0.3, 0.7, 0.0], 0.15)])
     checker = CollisionChecker(robot, scene)

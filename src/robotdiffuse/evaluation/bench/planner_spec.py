@@ -7,8 +7,12 @@ from typing import Any
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Settings
 from robotdiffuse.planning import PLANNERS, load_planner, planner_settings
-from robotdiffuse.planning.context import Request
+from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.planner import Planner
+
+
+CALL_ARGUMENTS = [field.name for field in fields(PlanRequest) if field.name not in ("time_limit", "seed")]
+"""Arguments of a planner's calls that a contestant may set; the bench sets the others."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +24,7 @@ class PlannerSpec:
     weights: str | None = None
     """A folder; None: those that come with the package."""
     settings: tuple[str, ...] = ()
-    """NAME=VALUE of the planner's settings and of its calls' arguments (`Request`)."""
+    """NAME=VALUE of the planner's settings and of its calls' arguments (`PlanRequest`)."""
 
     @classmethod
     def parse(cls, text: str) -> "PlannerSpec":
@@ -53,7 +57,8 @@ class PlannerSpec:
 
     def request(self) -> dict[str, Any]:
         """Arguments of its calls: until, clearance, ..."""
-        return vars(Request().changed(text for text in self.settings if _of_call(text)))
+        request = PlanRequest().changed(text for text in self.settings if _of_call(text))
+        return {name: getattr(request, name) for name in CALL_ARGUMENTS}
 
     def load(self) -> Planner:
         """Load the planner. Raises InputError as `load_planner` does, and for a planner that another process
@@ -74,4 +79,4 @@ class PlannerSpec:
 
 
 def _of_call(text: str) -> bool:
-    return text.partition("=")[0] in {field.name for field in fields(Request)}
+    return text.partition("=")[0] in CALL_ARGUMENTS

@@ -1,8 +1,7 @@
 """EDMP: ensemble-of-costs-guided diffusion (Saha et al., ICRA 2024), one prior and many guides in parallel.
 
-No single cost and no single choice of its numbers fits all scenes. So a batch is split among an ensemble of
-guides; each guides its share, and the best of all samples is the plan. The prior is unconditional
-(see `guided_prior`).
+No single cost, and no single choice of its parameters, fits all scenes. So a batch is divided among an
+ensemble of guides, and the best of all samples is the plan. The prior is unconditional (see `guided_prior`).
 
 Settings and the paper's values:
 
@@ -13,11 +12,11 @@ Settings and the paper's values:
 | denoising steps | 30 of the 255 levels, for a CPU | 255 |
 | gradient steps per denoising step | 1 | 1 |
 
-Differences: distances of covering spheres stand in for the volumes of boxes: the hinge of their signed
-distance at single waypoints for the intersection volume of links and obstacles, and the same at several
-places between waypoints as well for the swept volume. Obstacles are expanded by a margin that falls with the
-noise, as there. Links must keep a distance to each other too, which is not there. The numbers of the guides
-are ours, for theirs are in other units. Batches are repeated with new noise while there is time.
+Differences: distances of covering spheres replace volumes of boxes. The hinge of their signed distance at the
+waypoints replaces the intersection volume of links and obstacles; the same at several places between
+waypoints replaces the swept volume. Obstacles are expanded by a margin that falls with the noise, as in the
+paper. Links must keep a distance to each other too, unlike in the paper. The parameters of the guides are
+ours, as theirs have other units. Batches are repeated with new noise while there is time.
 """
 
 from collections.abc import Callable
@@ -49,16 +48,16 @@ class GuideSettings(Settings, name="edmp.guides"):
     """One guide of the ensemble."""
 
     between: Natural
-    """Places between two waypoints that the cost looks at: 0 is the intersection's cost, more that of the
-    swept motion."""
+    """Places between two waypoints at which the cost is evaluated: 0 for the intersection cost, more for the
+    swept one."""
     far_margin: NotNegative
-    """By which obstacles are expanded at the first guided step [m]."""
+    """Margin by which obstacles are expanded at the first guided step [m]."""
     near_margin: NotNegative
-    """The same at the last step [m]; it falls evenly from one to the other."""
+    """Margin at the last step [m]; it falls linearly from one to the other."""
     weight: NotNegative
-    """Of the cost [rad²/m]: a waypoint that is too close moves by about this times 0.5 m/rad."""
+    """Weight of the cost [rad²/m]: a waypoint that is too close moves by about this times 0.5 m/rad."""
     guided_share: Share
-    """Share of the denoising steps that are guided, the last ones."""
+    """Part of the denoising steps that are guided, the last ones."""
 
     def margin(self, left: int, steps: int) -> float | None:
         """The margin where `left` of `steps` denoising steps are still to come [m]; None: not guided yet."""
@@ -80,7 +79,7 @@ ENSEMBLE = tuple(
 @dataclass(frozen=True)
 class EDMPSettings(PriorSettings, name="edmp"):
     samples: Count = 24
-    """Trajectories per batch, shared out evenly among the guides."""
+    """Trajectories per batch, divided evenly among the guides."""
     sampling_steps: Annotated[int, Bound(least=2.0)] = 30
     """Denoising steps, closer where there is little noise."""
     push: Positive = 0.15
@@ -95,7 +94,7 @@ class EDMPSettings(PriorSettings, name="edmp"):
             )
 
     def shares(self) -> list[slice]:
-        """The rows of a batch that each guide has."""
+        """The rows of a batch for each guide."""
         cuts = np.linspace(0, self.samples, len(self.guides) + 1).round().astype(int).tolist()
         return [slice(a, b) for a, b in pairwise(cuts)]
 
@@ -126,7 +125,7 @@ class EDMP(GuidedPrior[EDMPSettings]):
     def guided(
         self, checker: CollisionChecker, q: Float[ndarray, "samples waypoints dof"], left: int
     ) -> Float[ndarray, "samples waypoints dof"]:
-        """The batch after a gradient step of every guide on its share; the ends of trajectories stay."""
+        """The batch after a gradient step of every guide on its rows; the ends of trajectories stay fixed."""
         settings, moved = self.settings, q.copy()
         for share, guide in zip(settings.shares(), settings.guides, strict=True):
             margin = guide.margin(left, settings.sampling_steps)
@@ -139,10 +138,11 @@ class EDMP(GuidedPrior[EDMPSettings]):
 
 
 def quadratic_levels(schedule: NoiseSchedule, steps: int) -> Int[ndarray, "steps"]:
-    """A part of the levels, falling from T, closer where there is little noise (Song et al. 2021, D.2).
+    """`steps` of the levels, falling from T, closer together where there is little noise (Song et al. 2021,
+    D.2).
 
-    For fewer steps than levels: evenly spaced ones end where there is much noise left, of which an error of
-    the network stays in the samples. Raises InputError unless there are that many levels.
+    Evenly spaced levels would end at a high noise level, and leave the network's error there in the samples.
+    Raises InputError unless there are that many levels.
     """
     schedule.sampling_levels(steps)
     wanted = schedule.steps * (np.arange(1, steps + 1) / steps) ** 2

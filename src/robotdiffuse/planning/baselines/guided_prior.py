@@ -1,14 +1,14 @@
-"""What MPD and EDMP share: batches of guided samples of the trajectory prior, until one passes the validator.
+"""The base of MPD and EDMP: batches of guided samples of a trajectory prior, until one passes validation.
 
 - *MPD*: J. Carvalho, A. Le, M. Baierl, D. Koert, J. Peters, "Motion Planning Diffusion: Learning and Planning
   of Robot Motions with Diffusion Models", IROS 2023.
 - *EDMP*: K. Saha et al., "EDMP: Ensemble-of-costs-guided Diffusion for Motion Planning", ICRA 2024.
 
-Both train the temporal U-Net of Diffuser (M. Janner et al., ICML 2022), which sees noisy trajectories and the
-noise level but no scene, to predict the noise; both hold start and goal at their values in every noisy
-trajectory (in-painting), and both bring in the scene by gradients of costs on the mean of every denoising
-step. So one trained network serves both, the diffusion model in the configuration `trajectory_prior`; each
-samples by levels, noise and guides of its own.
+Both train the temporal U-Net of Diffuser (M. Janner et al., ICML 2022) to predict the noise. Its network
+inputs are noisy trajectories and the noise level, but no scene. Both hold start and goal at their values in
+every noisy trajectory (in-painting), and both consider the scene through gradients of costs on the mean of
+every denoising step. So both use one trained network, the diffusion model in the configuration
+`trajectory_prior`; levels, noise and guides of the sampling differ.
 
 Differences from the papers, with their values:
 
@@ -17,10 +17,10 @@ Differences from the papers, with their values:
 - T = 255 levels of the cosine schedule, as EDMP; MPD trains with 25 levels of an exponential schedule. Its
   sampler takes the 25 of these levels that are nearest to it in signal-to-noise ratio.
 - Width 32 at resolutions 1, 2, 4 (0.7 million numbers); MPD 32 at 1, 2, 4, 8 (about 4 million). It trains at
-  1,200 samples/s on a core of a CPU. Layer norms over channels and condition by scale and shift, as our U-Net
-  has, in place of group norms and an added time embedding.
-- Trained on trajectories of all scenes mixed, as EDMP; MPD trains a prior per environment. A tenth of a batch
-  are motions whose straight line is free, and half of it is reversed, as for our own model.
+  1,200 samples/s on a core of a CPU. Our U-Net has layer norms over channels, and scale
+  and shift by the condition, in place of group norms and an added time embedding.
+- Trained on trajectories of all scenes mixed, as EDMP; MPD trains a prior per environment. A tenth of each
+  batch are motions with a free straight line, and half of it is reversed, as for our own model.
 """
 
 from abc import abstractmethod
@@ -44,18 +44,18 @@ from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
 from robotdiffuse.planning.start_goal import StartGoal
 
-RESOLUTION = 0.02
+SAMPLE_RESOLUTION = 0.02
 """No point of the arm moves further than this between two checks of a sample [m]."""
 Guide = Callable[[ndarray, int], ndarray]
-"""The mean of a denoising step [count, waypoints, dof] [rad], and how many steps are still to come (0 at
-the last one and in the steps without noise after it), to the mean after steps down the guide's costs."""
+"""Maps the mean of a denoising step [count, waypoints, dof] [rad], and the number of steps to come (0 at the
+last one and in the steps without noise after it), to the mean after gradient steps on the guide's costs."""
 
 
 class Attempt(NamedTuple):
     """A sample that collides."""
 
     segments: int
-    """How many of the motions from waypoint to waypoint are not free."""
+    """Number of segments in collision."""
     length: float
     """[rad]"""
     path: Float[ndarray, "waypoints dof"]
@@ -68,19 +68,19 @@ class PriorSettings(LearnedSettings):
     sampling_steps: Annotated[int, Bound(least=2.0)] = 25
     """Denoising steps."""
     self_margin: NotNegative = 0.01
-    """Distance between links below which their cost arises [m]."""
+    """Links nearer to each other than this have a cost [m]."""
     push: Positive = 0.1
     """Longest move of a waypoint in one gradient step [rad]."""
 
 
-Own = TypeVar("Own", bound=PriorSettings)
+GuidedPriorSettings = TypeVar("GuidedPriorSettings", bound=PriorSettings)
 
 
-class GuidedPrior(LearnedPlanner[Own]):
+class GuidedPrior(LearnedPlanner[GuidedPriorSettings]):
     """A planner that samples batches from the prior under guidance.
 
-    The free samples of a batch go to the validator, the shortest first; where none passes, the next batch is
-    drawn from new noise, until time runs out. There is no search, and no sample is shortened or repaired.
+    The free samples of a batch are validated, the shortest first. If none passes, the next batch is drawn
+    from new noise, until time runs out. Nothing is searched, shortened or repaired.
     """
 
     network_name = "trajectory_prior"
@@ -95,13 +95,13 @@ class GuidedPrior(LearnedPlanner[Own]):
         rng: np.random.Generator,
         stop: Callable[[], bool] = lambda: False,
     ) -> Float[ndarray, "count waypoints dof"] | None:
-        """A batch of guided samples, float32; None if `stop` says so before they are done."""
+        """A batch of guided samples, float32; None if `stop` returns True before they are complete."""
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
         prior, samples = self.network(context.problem.robot), self.settings.samples
         start, goals = shared_out(*start_goal.rows(), samples)
-        space = search_space(start_goal.checker, RESOLUTION)
+        space = search_space(start_goal.checker, SAMPLE_RESOLUTION)
         closest: Attempt | None = None
         batches = 0
         while context.remaining > 0:
@@ -121,14 +121,14 @@ class GuidedPrior(LearnedPlanner[Own]):
                 if result is not None:
                     return result
         if closest is not None:
-            # so that the result says what is wrong with it; the exact meshes may even call it free
+            # so that the result says what is wrong with it; by the exact meshes it may even be free
             result = context.finish(start_goal.complete(closest.path), self.name)
             if result is not None:
                 return result
         return context.unsolved(
             f"none of {batches * samples} samples of the network is free of collision"
             if batches
-            else f"time ran out before the first {samples} samples were done; it takes a longer limit"
+            else f"time ran out before the first {samples} samples were complete; use a longer time limit"
         )
 
 
@@ -150,8 +150,8 @@ def sample(
     """A trajectory from each start to its goal, float32, within the limits but for the ends themselves.
 
     levels, noise_scale: see `ancestral`.
-    quiet_steps: more steps at the last level, to which no noise is added (MPD: 5).
-    stop: asked before every step; None is returned if it says so.
+    quiet_steps: additional steps at the last level, without noise (MPD: 5).
+    stop: called before every step; None is returned if it returns True.
     """
     reference = prior.reference(starts, goals)
     condition = prior.condition(np.zeros((len(starts), 0), np.float32), starts, goals)
@@ -181,7 +181,7 @@ def sample(
 
 
 def falling(rising: Int[ndarray, "steps"], most: int) -> Int[ndarray, "steps"]:
-    """Rising levels, those that are the same moved apart, up to `most`; the other way round."""
+    """Rising levels in reverse order, with equal ones moved apart, up to `most`."""
     at = np.arange(len(rising))
     apart = np.maximum.accumulate(rising - at) + at
     return np.minimum(apart, most - at[::-1])[::-1].copy()
@@ -194,7 +194,7 @@ def _attempt(space: Space, path: Float[ndarray, "waypoints dof"]) -> Attempt:
 def shared_out(
     start: Float[ndarray, "dof"], goals: Float[ndarray, "k dof"], samples: int
 ) -> tuple[Float[ndarray, "samples dof"], Float[ndarray, "samples dof"]]:
-    """Start and goal of each sample: the nearest goals take turns."""
+    """The start and the goal of each sample: the nearest goals in turn."""
     nearest = nearest_goals(start, goals, samples)
     return np.repeat(start[None], samples, 0), nearest[np.arange(samples) % len(nearest)]
 
@@ -209,9 +209,9 @@ def collision_gradient(
     """Collision cost of trajectories [m] and its gradient by their waypoints [m/rad], of the ends too.
 
     The cost of a configuration is the root of the sum of h² over the covering spheres and pairs of links,
-    with the hinges h of their signed distances (see `learning.guidance`): how far the arm is within margins.
-    That of a trajectory is its sum over the waypoints and over `between` places in each step from waypoint to
-    waypoint, the places of a step counting together as one more waypoint.
+    with the hinges h of their signed distances (see `learning.guidance`): how far the arm is within the
+    margins. The cost of a trajectory is the sum over the waypoints, and over `between` places in each
+    segment, which together count as one more waypoint.
     """
     count, waypoints, dof = q.shape
     shares = np.arange(1, between + 1, dtype=np.float32) / (between + 1)

@@ -1,7 +1,7 @@
 """MPD: Motion Planning Diffusion (Carvalho et al., IROS 2023), a diffusion prior guided by cost gradients.
 
-The prior is unconditional (see `guided_prior`); planning draws from the posterior given
-the costs: in the last part of the denoising steps the mean of each step goes some gradient steps down
+The prior is unconditional (see `guided_prior`); planning draws from the posterior given the costs: in the
+last part of the denoising steps, the mean of each step is moved by some gradient steps on the cost
 
     collision (scene and links) + joint limits + Gaussian process prior of constant velocity,
 
@@ -14,15 +14,15 @@ Settings and the paper's or its code's values:
 | trajectories per batch | 16 | 100 (50 in the code), on a GPU |
 | denoising steps | 25 | 25 |
 | steps without noise after them | 5 | 5 |
-| share of them that is guided, the last | 0.25 | 0.25 |
+| part of them that is guided, the last | 0.25 | 0.25 |
 | gradient steps per denoising step | 5 | 5 |
 | factor of the noise of a step | 0.5 | 0.5 |
 | places checked per waypoint by the collision cost | 2 | 1.5 |
 | weights of the costs | below | for other units and distances |
 
-Other differences: signed distances of covering spheres by our compiled kernel in place of their grid; the
-Gaussian process is that of the positions, its velocities integrated out, and its step is implicit, so that a
-long step is stable; batches are repeated with new noise while there is time.
+Other differences: signed distances of covering spheres by our compiled kernel replace their grid. The
+Gaussian process is that of the positions, with the velocities integrated out; its step is implicit, so that
+long steps are stable. Batches are repeated with new noise while there is time.
 """
 
 from collections.abc import Callable
@@ -48,31 +48,33 @@ from robotdiffuse.planning.baselines.guided_prior import (
 )
 
 EXPONENTIAL_BETAS = (1e-4, 1.0)
-"""Variance that the first and last step of MPD's exponential schedule add."""
+"""Variances that the first and the last step of MPD's exponential schedule add."""
 
 
 @dataclass(frozen=True)
 class MPDSettings(PriorSettings, name="mpd"):
-    """Denoising steps are at levels as far apart as those of MPD's exponential schedule."""
+    """Settings of MPD. The noise levels are spaced as in MPD's exponential schedule."""
 
     quiet_steps: Natural = 5
-    """Steps without noise after the others."""
+    """Number of final steps without noise."""
     guided_share: Share = 0.25
-    """Share of the denoising steps that are guided, the last ones; the quiet steps always are."""
+    """Part of the denoising steps that are guided, the last ones; the quiet steps always are."""
     guide_steps: Count = 5
     """Gradient steps at each guided denoising step."""
     noise_scale: NotNegative = 0.5
-    """Factor of the standard deviation that a denoising step adds."""
+    """Factor on the standard deviation of the noise of a denoising step."""
     margin: NotNegative = 0.04
-    """Distance to obstacles below which the collision cost arises [m]."""
+    """Spheres nearer to obstacles than this have a collision cost [m]."""
     limit_margin: NotNegative = 0.02
-    """The same of joint values to their limits [rad]."""
+    """Joints nearer to their limits than this are moved away from them [rad]."""
     collision_weight: NotNegative = 0.1
-    """Of the collision cost [rad²/m]: a waypoint that is too close moves by about this times 0.5 m/rad."""
+    """Weight of the collision cost [rad²/m]: a waypoint that is too close moves by about this times 0.5
+    m/rad."""
     prior_weight: NotNegative = 2.0
-    """Of the Gaussian process' cost, with waypoints one unit of time apart and a power spectrum of 1 rad²."""
+    """Weight of the Gaussian process cost, with waypoints one unit of time apart and a power spectrum of 1
+    rad²."""
     between: Natural = 1
-    """Places between two waypoints that the collision cost looks at."""
+    """Places between two waypoints at which the collision cost is evaluated."""
 
 
 class MPD(GuidedPrior[MPDSettings]):
@@ -105,7 +107,7 @@ class MPD(GuidedPrior[MPDSettings]):
     def guided(
         self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]
     ) -> Float[ndarray, "count waypoints dof"]:
-        """Trajectories after the gradient steps of one denoising step; their ends stay."""
+        """Trajectories after the gradient steps of one denoising step; their ends stay fixed."""
         settings, robot = self.settings, checker.robot
         gaussian = gaussian_process(q.shape[1])
         for _ in range(settings.guide_steps):
@@ -165,7 +167,7 @@ class GaussianProcess:
     ) -> Float[ndarray, "count waypoints dof"]:
         """One implicit gradient step down weight q P q / 2 on all waypoints but the ends.
 
-        It solves x = q - weight P x, the minimum of |x - q|² / 2 + weight x P x / 2 its ends held.
+        It solves x = q - weight P x, the minimum of |x - q|² / 2 + weight x P x / 2 with fixed ends.
         """
         inner, ends = _implicit(q.shape[1], weight)
         moved = q.copy()
@@ -174,7 +176,8 @@ class GaussianProcess:
 
 
 def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
-    """Of the states of one joint, (position, velocity) of each waypoint in turn: block tri-diagonal."""
+    """The precision of the states of one joint, (position, velocity) of each waypoint in turn: block
+    tri-diagonal."""
     transition = np.array([[1.0, 1.0], [0.0, 1.0]])
     inverse = np.linalg.inv(np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]))
     precision = np.zeros((2 * waypoints, 2 * waypoints))
@@ -186,7 +189,7 @@ def state_precision(waypoints: int) -> Float[ndarray, "states states"]:
 
 @cache
 def gaussian_process(waypoints: int) -> GaussianProcess:
-    """The prior over so many waypoints."""
+    """The prior over this number of waypoints."""
     every = state_precision(waypoints)
     position, velocity = slice(0, None, 2), slice(1, None, 2)
     mixed = every[position, velocity]
@@ -199,7 +202,7 @@ def gaussian_process(waypoints: int) -> GaussianProcess:
 def _implicit(
     waypoints: int, weight: float
 ) -> tuple[Float[ndarray, "inner inner"], Float[ndarray, "inner 2"]]:
-    """What `GaussianProcess.step` multiplies inner waypoints and ends with."""
+    """The matrices that `GaussianProcess.step` multiplies the inner waypoints and the ends with."""
     precision = gaussian_process(waypoints).precision
     inverse = np.linalg.inv(np.eye(waypoints - 2) + weight * precision[1:-1, 1:-1])
     return inverse, -weight * inverse @ precision[1:-1][:, [0, -1]]

@@ -1,18 +1,19 @@
-"""MPiNets: motions that a policy makes step by step (A. Fishman et al., "Motion Policy Networks", CoRL 2022).
+"""MPiNets: roll-outs of a policy, step by step (A. Fishman et al., "Motion Policy Networks", CoRL 2022).
 
-The policy (`learning.networks.mpinets`) sees points of the scene, of the arm and of the goal, and is rolled
-out from the start, at most 150 steps, the paper's number. The first roll-out is the paper's planner: one
-cloud, no noise, nothing repeated. While there is time, others follow with new clouds and noise.
+The network inputs of the policy (`learning.networks.mpinets`) are points of the scene, of the arm and of the
+goal. It is rolled out from the start for at most 150 steps, the paper's number. The first roll-out is the
+paper's planner: one cloud, no noise, no repetition. While there is time, others follow with new clouds and
+noise.
 
 Differences from the paper, besides those of the network:
 
-- The paper ends a roll-out within 1 cm and 15 degrees of the target pose. A goal here is a configuration to
-  be met to 1e-4 rad: near it, a straight edge leads there if the compiled check calls it free; else the
-  policy goes on. For a pose the goals are configurations by inverse kinematics.
-- The paper has one roll-out. The repetitions, which cost its success nothing, use the time that all planners
-  have. They are spread over the goals, the nearest first, and end where the arm collides.
-- Nothing is repaired or shortened. A motion that the validator refuses is not a result; where nothing better was
-  found, the first one is handed to it, so that the result says what was wrong.
+- The paper ends a roll-out within 1 cm and 15 degrees of the target pose. A goal here is a configuration, to
+  be reached to 1e-4 rad: near it, a straight edge leads there if it is free; else the policy goes on. For a
+  pose the goals are configurations by inverse kinematics.
+- The paper has one roll-out. The repetitions cannot lower its success and use the time that all planners get.
+  They are spread over the goals, the nearest first, and end where the arm collides.
+- Nothing is repaired or shortened. A motion that the validator refuses is not a result. If nothing better was
+  found, the best one is validated once more, so that the result says what was wrong.
 """
 
 from dataclasses import dataclass
@@ -34,8 +35,9 @@ from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.scenes.surface_points import sample_surface
 
-STILL = 1e-4
-"""The policy stands still where no joint moves further in a step [rad]; it would for ever."""
+STANDSTILL = 1e-4
+"""A roll-out ends when no joint moves further than this in a step [rad]: the policy would stand still
+forever."""
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,10 @@ class MPiNetsSettings(LearnedSettings, name="mpinets"):
     near: NotNegative = 0.3
     """Largest distance of a joint at which a straight edge to the goal is tried [rad]."""
     batch: Count = 8
-    """Roll-outs at once, after the first, which is alone."""
+    """Roll-outs at once; the first one runs alone."""
     noise: NotNegative = 0.015
-    """Standard deviation of the noise on where the policy sees the arm, as in training [rad]; none in the
-    first roll-out."""
+    """Standard deviation of the noise on the arm's configuration in the network inputs, as in training [rad];
+    none in the first roll-out."""
     resolution: Positive = 0.02
     """No point of the arm moves further than this between two checks [m]."""
 
@@ -74,7 +76,8 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
                 if best is None or motion.arrived > best.arrived:
                     best = motion
             tried += count
-        # the validator looks at the meshes, which the covering spheres stick out of: it may be good after all
+        # the validator checks the meshes, which are smaller than the covering spheres: it may be valid after
+        # all
         result = context.finish(best.path(start_goal), "policy")
         if result is not None:
             return result
@@ -90,9 +93,9 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
         count: int,
         rng: np.random.Generator,
     ) -> "list[_Motion]":
-        """So many roll-outs, or what there is of them when one is free all the way or time runs out.
+        """`count` roll-outs, complete unless one is free all the way or time runs out.
 
-        `tried` were tried before; the very first goes on even if it collides.
+        tried: number of roll-outs before; the very first one goes on even if it collides.
         """
         settings, first = self.settings, tried == 0
         space = search_space(start_goal.checker, settings.resolution)
@@ -117,12 +120,12 @@ class MPiNets(LearnedPlanner[MPiNetsSettings]):
             roll_outs.advance(None if first else noise)
             for i in np.flatnonzero(roll_outs.running).tolist():
                 motions[i].go(space, roll_outs.waypoints[-1][i])
-            roll_outs.stop(np.abs(roll_outs.waypoints[-1] - roll_outs.waypoints[-2]).max(1) < STILL)
+            roll_outs.stop(np.abs(roll_outs.waypoints[-1] - roll_outs.waypoints[-2]).max(1) < STANDSTILL)
         return motions
 
 
 class _Motion:
-    """What a roll-out has made so far."""
+    """The motion of a roll-out so far."""
 
     def __init__(self, start: Float32[ndarray, "dof"], goal: Float32[ndarray, "dof"]) -> None:
         self.waypoints, self.goal = [start], goal
@@ -130,7 +133,7 @@ class _Motion:
 
     @property
     def free(self) -> bool:
-        """Whether it reaches the goal free of collision by the compiled check."""
+        """Whether it reaches the goal without a collision by the compiled check."""
         return self.arrived and not self.collided
 
     def go(self, space: Space, q: Float32[ndarray, "dof"]) -> None:
@@ -138,13 +141,13 @@ class _Motion:
         self.waypoints.append(q)
 
     def try_to_arrive(self, space: Space) -> None:
-        """Go straight to the goal if that is free."""
+        """Add the straight edge to the goal if it is free."""
         if motions_free(space, np.stack([self.waypoints[-1], self.goal]))[0]:
             self.waypoints.append(self.goal)
             self.arrived = True
 
     def path(self, start_goal: StartGoal) -> Float[ndarray, "n dof"]:
-        """Its waypoints, with the exact ends of the problem as far as it has reached them."""
+        """Its waypoints, with the exact start, and the exact goal if it was reached."""
         if self.arrived:
             return start_goal.complete(np.stack(self.waypoints))
         return np.concatenate(
@@ -155,7 +158,7 @@ class _Motion:
 def scene_clouds(
     network: MPiNetsNetwork, checker: CollisionChecker, count: int, rng: np.random.Generator
 ) -> Float32[Tensor, "count points 3"]:
-    """Random clouds of the scene as the network wants them [m]; zeros where nothing is in reach."""
+    """Random clouds of the scene in the size of the network's inputs [m]; zeros if nothing is in reach."""
     points, region = network.settings.scene_points, network.settings.region
     clouds = np.zeros((count, points, 3), np.float32)
     for cloud in clouds:

@@ -1,22 +1,22 @@
-"""MPNet: a network proposes states from both ends in turn, until they see each other; then what collides is
-proposed anew.
+"""MPNet: a network proposes states from the start and the goal in turn until a free straight line connects
+them; then it proposes new states for those that collide.
 
 A. Qureshi, Y. Miao, A. Simeonov and M. Yip, "Motion Planning Networks: Bridging the Gap Between
 Learning-based and Classical Motion Planners", T-RO 2020. The networks are in `learning.networks.mpnet`. The
 parts, by the paper's names:
 
-- *Bidirectional neural planning* (`MPNet._between`): both ends step towards each other, unchecked (the
-  states are "beacons"), until the straight line between them is free.
-- *Lazy states contraction*: states that a free straight line can skip are left out.
-- *Replanning*: states in collision are left out, and neural planning goes between each two states that do not
-  see each other, up to `replanning` times. The network's dropout makes every time another.
-- *Hybrid replanning*, if `hybrid` is on: what is still broken is left to a classical planner, RRT-Connect
-  here (paper: RRT*). It is off by default, the paper's MPNetPath:NR, so that the network is what is measured.
+- *Bidirectional neural planning* (`NeuralPlanning.between`): both ends step towards each other, unchecked
+  (the states are "beacons"), until the straight line between them is free.
+- *Lazy states contraction*: states that a free straight line can skip are removed.
+- *Replanning*: states in collision are removed, and neural planning runs between neighbouring states without
+  a free straight line, up to `replanning` times. The network's dropout makes each time different.
+- *Hybrid replanning*, if `hybrid` is on: a classical planner repairs what still collides, RRT-Connect here
+  (paper: RRT*). It is off by default, as in the paper's MPNetPath:NR, so that benchmarks measure the network.
 
 Differences from the paper: `attempts` paths are planned at once, in one batch of the network, until one of
 them is free, and new ones are begun as long as there is time (the paper plans one). Where the network finds
-nothing between two states, the next replanning tries again, where the paper's attempt ends. Of several goals
-the attempts take each an equal share.
+nothing between two states, the next replanning tries again; the paper's attempt ends there. Several goals are
+divided evenly among the attempts.
 """
 
 from dataclasses import dataclass, replace
@@ -43,7 +43,7 @@ from robotdiffuse.scenes.surface_points import sample_surface
 from robotdiffuse.trajectories.simplification import shortcut
 
 SEARCH_ITERATIONS = 500
-"""Iterations of RRT-Connect between two looks at the clock, in hybrid replanning."""
+"""Iterations of RRT-Connect between two readings of the clock, in hybrid replanning."""
 SEARCH_CAPACITY = 20_000
 
 
@@ -54,14 +54,14 @@ class MPNetPlannerSettings(LearnedSettings, name="mpnet"):
     steps: Count = 24
     """Most steps of bidirectional neural planning between two states; a step is 0.7 rad."""
     replanning: Natural = 10
-    """N_r, how often what collides is planned anew before the attempts are given up."""
+    """N_r, how often colliding parts are replanned before the attempts are given up."""
     hybrid: bool = False
-    """Whether RRT-Connect joins what the network has left broken."""
+    """Whether RRT-Connect repairs what the network leaves in collision."""
     hybrid_range: Positive = 1.0
     """Longest extension of a tree of RRT-Connect [rad, joint-space L2]."""
     resolution: Positive = 0.03
-    """No point of the arm moves further than this between two checks of a motion [m]; the validator's certificate
-    covers the rest, and after a path that it refuses it is half of that."""
+    """No point of the arm moves further than this between two checks of a motion [m]; the validator's
+    certificate covers the rest. It is halved after a path that the validator refuses."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
 
@@ -135,12 +135,12 @@ class NeuralPlanning:
         self.goals = goals[(np.arange(settings.attempts) + rng.integers(len(goals))) % len(goals)]
         self.z = scene_code(network, start_goal.checker, rng)
         self.replanned = 0
-        """How often what collides was planned anew."""
+        """How often colliding parts were replanned."""
         self.searched = False
-        """Whether RRT-Connect was asked."""
+        """Whether RRT-Connect was used."""
 
     def best(self) -> Attempt:
-        """The shortest path that is free, or the one with the fewest segments in collision."""
+        """The shortest free path, or the path with the fewest segments in collision."""
         paths = [self.contracted(path) for path in self.between(self.starts, self.goals, True)]
         free = [self.segments_free(path) for path in paths]
         while not any(f.all() for f in free):
@@ -158,17 +158,17 @@ class NeuralPlanning:
 
     def reason(self, rounds: int) -> str:
         how = " and RRT-Connect" if self.searched else ""
-        return (
-            f"solved by {MPNet.name}: round {rounds}, after {self.replanned} times of neural replanning{how}"
-        )
+        return f"solved by {MPNet.name}: round {rounds}, after {self.replanned} neural replannings{how}"
 
     def between(
         self, starts: Float[ndarray, "n dof"], goals: Float[ndarray, "n dof"], one_will_do: bool = False
     ) -> list[Float[ndarray, "_ dof"]]:
         """Bidirectional neural planning of many motions at once.
 
-        one_will_do: ends as soon as one of them is free. Those whose ends have not come to see each other
-        have a segment in collision, and so may others, whose states lie in obstacles.
+        one_will_do: stop as soon as one of them is free.
+
+        Motions whose ends were not connected have a segment in collision; so may others, whose states
+        collide.
         """
         forth, back = [[q] for q in starts], [[q] for q in goals]
         near, far, apart = forth, back, list(range(len(starts)))
@@ -186,8 +186,8 @@ class NeuralPlanning:
         return [_joined(*rows) for rows in zip(forth, back, strict=True)]
 
     def replan(self, paths: list[Float[ndarray, "_ dof"]]) -> list[Float[ndarray, "_ dof"]]:
-        """The paths without their states in collision, with new states between those that do not see each
-        other."""
+        """The paths without their states in collision, with new states where the straight line is not
+        free."""
         kept = [self.without_collisions(path) for path in paths]
         broken = [
             (a, int(i)) for a, path in enumerate(kept) for i in np.flatnonzero(~self.segments_free(path))
@@ -205,8 +205,8 @@ class NeuralPlanning:
         ]
 
     def search(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
-        """The path with RRT-Connect between the states, those in collision left out, that do not see each
-        other; as far as time allows."""
+        """The path without its states in collision, with paths of RRT-Connect where the straight line is not
+        free; as far as time allows."""
         self.searched = True
         path = self.without_collisions(path)
         pieces = [path[:1]]
@@ -225,13 +225,13 @@ class NeuralPlanning:
         return np.stack([a, b])
 
     def without_collisions(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
-        """The path without the states, but for its ends, that are in collision."""
-        # a motion from a state to itself is that state
+        """The path without its inner states in collision."""
+        # a motion from a state to itself checks that state
         free = np.array([self.segments_free(np.stack([q, q]))[0] for q in path[1:-1]], bool)
         return np.concatenate([path[:1], path[1:-1][free], path[-1:]])
 
     def contracted(self, path: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
-        """Lazy states contraction: without the states that free straight lines can skip."""
+        """The path after lazy states contraction: without states that free straight lines can skip."""
         return shortcut(self.space, path, 0, self.state)
 
     def segments_free(self, path: Float[ndarray, "n dof"]) -> Bool[ndarray, "segments"]:
@@ -240,7 +240,7 @@ class NeuralPlanning:
     def next_states(
         self, q: Float[ndarray, "n dof"], goal: Float[ndarray, "n dof"]
     ) -> Float[ndarray, "n dof"]:
-        """Pnet's, with its dropout."""
+        """The states that Pnet proposes, with dropout."""
         with torch.inference_mode():
             z = self.z.expand(len(q), -1)
             return self.network.next_states(
@@ -255,7 +255,7 @@ def _joined(forth: list[ndarray], back: list[ndarray]) -> Float[ndarray, "n dof"
 def scene_code(
     network: MPNetNetwork, checker: CollisionChecker, rng: np.random.Generator
 ) -> Float[Tensor, "1 code"]:
-    """z of a random cloud of the scene's obstacles; of zeros where there are none."""
+    """The encoding z of a random cloud of the scene's obstacles; of zeros without obstacles."""
     cloud = np.zeros((1, network.settings.points, 3), np.float32)
     points = sample_surface(checker.scene, network.settings.points, rng, network.region)
     cloud[0, : len(points)] = points

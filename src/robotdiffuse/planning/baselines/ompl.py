@@ -3,20 +3,21 @@
 I. Sucan, M. Moll and L. Kavraki, "The Open Motion Planning Library", IEEE Robotics and Automation Magazine
 2012. Every setting is OMPL's own default, read off the planner, unless `OmplSettings` says otherwise.
 
-*Collision.* States are points of a RealVectorStateSpace with the joint limits as bounds. OMPL asks Python for
-every state and every motion; those answer with the compiled kernel that `rrt_connect` searches with.
+*Collision.* States are points of a RealVectorStateSpace with the joint limits as bounds. OMPL asks Python
+about every state and every motion; the answers come from the compiled kernel that `rrt_connect` uses.
 
-*First-solution planners* (RRT, RRT-Connect, PRM) end with their first path, which OMPL's PathSimplifier then
-shortens as in its SimpleSetup and in MoveIt. *Anytime planners* (RRT*, Informed RRT*, BIT*, AORRTC) minimize
+*First-solution planners* (RRT, RRT-Connect, PRM) end with their first path; OMPL's PathSimplifier shortens
+it, as in its SimpleSetup and in MoveIt. *Anytime planners* (RRT*, Informed RRT*, BIT*, AORRTC) minimize
 joint-space length until time runs out, or until the path is as short as the straight line. Whenever a path is
-IMPROVEMENT shorter than the last, the validator looks at it, so that a late path that it refuses costs no plan.
+IMPROVEMENT shorter than the last one, it is validated, so that a late path that is refused does not cost the
+plan.
 
-*Seeds.* OMPL has one source of seeds for the whole process, which is set anew for each search, so that a seed
-gives a path again as long as time does not run out (anytime planners mostly end when it does). The exception
-is PRM: a second thread looks for the path while the roadmap grows, so its path varies from run to run.
+*Seeds.* OMPL has one source of seeds for the whole process. It is set for each search, so the same seed gives
+the same path as long as time does not run out (anytime planners mostly end when it does). The exception is
+PRM: a second thread searches for the path while the roadmap grows, so its path varies from run to run.
 
-*Threads.* OMPL's bindings keep Python's global lock while they search, and searches of several threads would
-mix their seeds: use processes.
+*Threads.* OMPL's bindings hold Python's global lock while they search, and searches in several threads would
+mix their seeds. Use processes.
 """
 
 from collections.abc import Iterator
@@ -50,38 +51,39 @@ except ImportError:
     ) from None
 
 IMPROVEMENT = 0.01
-"""An anytime planner stops to hand over a path when it is shorter by this share than the last."""
+"""An anytime planner stops to have a path validated when it is shorter than the last by this part."""
 OPTIMAL = 1e-4
-"""A path that is longer than the straight line by at most this share is as short as can be."""
+"""A path that exceeds the straight line by at most this part is optimal."""
 
 
-SAME = 1e-6
-"""Start and goal this close [rad] are one."""
+SAME_STATE_DISTANCE = 1e-6
+"""A start and a goal closer than this are the same [rad]."""
 
 
 @dataclass(frozen=True)
 class OmplSettings(Settings, name="ompl"):
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of a motion [m]; the validator's certificate
-    covers the rest, and after a path that it refuses the search begins anew at half the distance."""
+    """No point of the arm moves further than this between two checks of a motion [m]; the validator's
+    certificate covers the rest. After a path that the validator refuses, the search starts again at half the
+    distance."""
     clearance: NotNegative = 0.002
-    """Distance to obstacles that paths keep where start and goal allow it [m], as for rrt_connect."""
+    """Distance to obstacles that paths keep where start and goal allow it [m], as with rrt_connect."""
     range: Positive | None = None
-    """Longest extension of a tree [rad, joint-space L2]; None: OMPL's own, 0.2 of the space's diameter. PRM
-    and BIT* have none."""
+    """Longest extension of a tree [rad, joint-space L2]; None: OMPL's default, 0.2 of the space's diameter.
+    PRM and BIT* have no such setting."""
     simplify: bool = True
     """Whether OMPL's PathSimplifier shortens the path of a first-solution planner."""
 
 
 class OmplPlanner(Planner[OmplSettings]):
-    """What the planners of OMPL share; a planner is its class in ompl.geometric and a line in PLANNERS."""
+    """Base class of OMPL's planners; each is a class of ompl.geometric and a line in PLANNERS."""
 
     settings_class = OmplSettings
     algorithm: ClassVar[type[ob.Planner]]
     anytime: ClassVar[bool]
-    """Whether it goes on after its first path."""
+    """Whether it improves its first path."""
     backwards: ClassVar[bool] = False
-    """Whether OMPL is asked for a path from the goals to the start."""
+    """Whether OMPL searches from the goals to the start."""
 
     def __init__(self, settings: OmplSettings | None = None) -> None:
         """Raises InputError for a range where the planner has none."""
@@ -109,11 +111,11 @@ class OmplPlanner(Planner[OmplSettings]):
         return context.unsolved()
 
     def _best(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
-        """The shortest path that the validator let pass until time runs out or none can be shorter."""
+        """The shortest valid path when time runs out or a path is optimal."""
         problem, settings, attempt = context.problem, self.settings, 0
         start, goals = start_goal.rows()
         nearest = float(np.linalg.norm(goals - start, axis=1).min())
-        enough = (1 + OPTIMAL) * max(nearest, SAME)
+        enough = (1 + OPTIMAL) * max(nearest, SAME_STATE_DISTANCE)
         best, shortest, searched = None, np.inf, np.inf
         search = _Search(context, start_goal, self, settings, attempt)
         while search.run(shorter_than=max((1 - IMPROVEMENT) * searched, enough)):
@@ -188,7 +190,8 @@ class OmplAORRTC(OmplPlanner):
 
 
 class _Watch:
-    """Ends a search by OMPL, and keeps what Python raised below it: no exception passes through C++."""
+    """Ends a search of OMPL, and keeps exceptions that Python code raised in it: none may pass through
+    C++."""
 
     def __init__(self, context: PlanningContext) -> None:
         self.context = context
@@ -199,13 +202,13 @@ class _Watch:
 
     @contextmanager
     def until_time_is_over(self) -> Iterator[ob.PlannerTerminationCondition]:
-        """Raises after it what was caught within it."""
-        # not a condition in Python: PRM's second thread would wait forever for the lock that the first holds
+        """A context manager that re-raises at its end an exception that was kept."""
+        # not a Python callback: PRM's second thread would wait forever for the lock that the first one holds
         yield from self._while(ob.timedPlannerTerminationCondition(max(self.context.remaining, 0.0)))
 
     @contextmanager
     def until_shorter(self, planner: Any, than: float) -> Iterator[ob.PlannerTerminationCondition]:
-        """The same, but also until the planner has a path shorter than this [rad]."""
+        """A condition that also ends the search once the planner has a path shorter than this [rad]."""
         self._planner, self._shorter_than = planner, than
         yield from self._while(ob.PlannerTerminationCondition(self._is_over))
 
@@ -215,7 +218,7 @@ class _Watch:
             self._condition.terminate()
 
     def raise_caught(self) -> None:
-        """Raise it, and forget it: its traceback knows the validators."""
+        """Raise the kept exception and drop it, as its traceback refers to the validity checkers."""
         error, self._error = self._error, None
         try:
             if error is not None:
@@ -228,7 +231,8 @@ class _Watch:
         try:
             yield condition
         finally:
-            # AORRTC keeps the condition, which knows the planner: a cycle that no garbage collector sees
+            # AORRTC keeps the condition, which refers to the planner: a cycle invisible to the garbage
+            # collector
             self._condition = self._planner = None
         self.raise_caught()
 
@@ -241,7 +245,7 @@ class _Watch:
 
 
 class _States(ob.StateValidityChecker):
-    """Single states."""
+    """Validity of single states."""
 
     def __init__(self, information: ob.SpaceInformation, space: Space, watch: _Watch) -> None:
         super().__init__(information)
@@ -259,7 +263,7 @@ class _States(ob.StateValidityChecker):
 
 
 class _Motions(ob.MotionValidator):
-    """Straight motions: the end is checked and the way, not the start, which OMPL knows to be free."""
+    """Validity of straight motions; the start is not checked, as OMPL knows it to be free."""
 
     def __init__(self, information: ob.SpaceInformation, space: Space, watch: _Watch) -> None:
         super().__init__(information)
@@ -278,7 +282,7 @@ class _Motions(ob.MotionValidator):
 
 
 class _Search:
-    """One search by OMPL; it can be continued. Paths are not yet validated."""
+    """One search of OMPL, which can be continued. Its paths are not validated yet."""
 
     def __init__(
         self,
@@ -288,14 +292,14 @@ class _Search:
         settings: OmplSettings,
         attempt: int,
     ) -> None:
-        # OMPL hands a seed from this source to each generator that it makes from here on; 0 is none
-        ou.RNG.setSeed(int(np.random.SeedSequence([context.seed, attempt]).generate_state(1)[0]) or 1)
+        # OMPL seeds every generator that it creates from here on from this source; 0 is not a seed
+        ou.RNG.setSeed(int(np.random.SeedSequence([context.request.seed, attempt]).generate_state(1)[0]) or 1)
         self._call, self._robot = context, context.problem.robot
         self._watch = _Watch(context)
         space = search_space(
             start_goal.checker, settings.resolution, start_goal.kept_clearance(settings.clearance)
         )
-        # Python keeps what C++ refers to, until the search is over
+        # keeps objects that C++ refers to alive until the search is over
         self._states = _state_space(self._robot)
         self._information = ob.SpaceInformation(self._states)
         self._validity = _States(self._information, space, self._watch)
@@ -314,16 +318,16 @@ class _Search:
             self._definition.addStartState(self._state(q))
         self._definition.setGoal(self._goals)
         if planner.anytime:
-            # others would take an objective as a reason to go on after their first path
+            # first-solution planners would go on after their first path if they had an objective
             self._definition.setOptimizationObjective(ob.PathLengthOptimizationObjective(self._information))
         self._anytime = planner.anytime
-        # bestCost, setRange and the constructor are of no class that algorithms share
+        # bestCost, setRange and the constructor are not part of a common base class
         algorithm: Any = planner.algorithm
         self._planner: Any = algorithm(self._information)
         if settings.range is not None:
             self._planner.setRange(settings.range)
         self._planner.setProblemDefinition(self._definition)
-        # BIT* asks for the validity of start and goals here
+        # BIT* checks the validity of start and goals here
         self._planner.setup()
         self._watch.raise_caught()
         self._status = ""
@@ -335,7 +339,7 @@ class _Search:
 
     @property
     def gave_up(self) -> str:
-        """Why there is no path, if OMPL ended before time did; else ""."""
+        """The reason why there is no path if OMPL ended before the time limit; else ""."""
         return f"OMPL ended without a path: {self._status}" if self._call.remaining > 0 else ""
 
     def run(self, shorter_than: float = np.inf) -> bool:
@@ -353,7 +357,7 @@ class _Search:
         return self._definition.hasExactSolution()
 
     def simplify(self) -> None:
-        """Shorten the path as OMPL does, within the time that is left."""
+        """Shorten the path by OMPL's PathSimplifier, within the time left."""
         with self._watch.until_time_is_over() as condition:
             og.PathSimplifier(self._information, self._goals).simplify(self._solution(), condition)
 
@@ -371,7 +375,7 @@ class _Search:
     def _state(self, q: Float[ndarray, "dof"]) -> ob.RealVectorStateType:
         state = self._information.allocState()
         assert isinstance(state, ob.RealVectorStateType)
-        # float32 may lie beyond a limit by rounding, which OMPL would refuse
+        # rounding to float32 may exceed a limit, which OMPL would refuse
         for joint, value in enumerate(np.clip(q.astype(np.float64), self._robot.lower, self._robot.upper)):
             state[joint] = float(value)
         return state
@@ -388,7 +392,8 @@ def _state_space(robot: Robot) -> ob.RealVectorStateSpace:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """OMPL prints to the console, among others that setting a seed again is of no use."""
+    """A context manager that silences OMPL's console output, such as that setting a seed again has no
+    effect."""
     level = ou.getLogLevel()
     ou.setLogLevel(ou.LogLevel.LOG_NONE)
     try:

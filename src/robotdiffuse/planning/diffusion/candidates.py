@@ -1,4 +1,4 @@
-"""What the hybrid's batches propose for a problem, before anything is searched or chosen: to be looked at."""
+"""The batches of the hybrid planner for a problem before any search or choice, for drawing."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -9,39 +9,39 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.diffusion.hybrid import WAYPOINTS, RobotDiffuse
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.learned import nearest_goals
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.problem import Problem
 
-TIME = 1.0
-"""Limit for finding configurations of the goal [s]."""
-BETWEEN = 4
-"""Clearances are measured so many times from one waypoint to the next."""
+TIME_LIMIT = 1.0
+"""For finding configurations of the goal [s]."""
+PLACES_PER_SEGMENT = 4
+"""Places at which clearances are measured, from one waypoint to the next."""
 
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """A batch."""
+    """A batch of trajectories and their clearances."""
 
     source: str
     """"network", or "smooth_noise" for an arm without weights."""
     positions: Float[ndarray, "count waypoints dof"]
     clearances: Float[ndarray, "count"]
-    """Least signed distance of the covering spheres to the obstacles along each, sampled [m], at most 1 m;
-    negative where they touch, which the meshes within need not."""
+    """Smallest signed distance of the covering spheres to the obstacles along each trajectory, sampled [m],
+    at most 1 m; negative where spheres touch, though the meshes within may not."""
 
 
 def draw_candidates(problem: Problem, seed: int = 0) -> Candidates:
-    """A batch as `robotdiffuse` draws it at its turn.
+    """Draw a batch as the planner `robotdiffuse` does.
 
-    Raises InputError where start or goal leave nothing to draw.
+    Raises InputError if the start or the goal cannot be used.
     """
     planner = _planner()
     model = planner.model(problem.robot)
-    context = PlanningContext(planner.name, problem, TIME, seed)
+    context = PlanningContext(planner.name, problem, PlanRequest(TIME_LIMIT, seed))
     start_goal = usable_start_goal(context)
     if isinstance(start_goal, PlanResult):
         raise InputError(f"nothing can be drawn: {start_goal.reason}")
@@ -54,7 +54,7 @@ def draw_candidates(problem: Problem, seed: int = 0) -> Candidates:
         code = planner.code(model, start_goal.checker, context.rng)
         q = planner.draw(model, start_goal.checker, code, start, goals, context.rng)
     count, waypoints, dof = q.shape
-    at = np.linspace(0, waypoints - 1, BETWEEN * (waypoints - 1) + 1)
+    at = np.linspace(0, waypoints - 1, PLACES_PER_SEGMENT * (waypoints - 1) + 1)
     low = np.minimum(at.astype(int), waypoints - 2)
     share = (at - low)[:, None]
     dense = (1 - share) * q[:, low] + share * q[:, low + 1]

@@ -1,16 +1,16 @@
-"""The paper's method and nothing else: encoder, sampling, guidance.
+"""The paper's method alone: encoder, sampling, guidance.
 
 The scene's point cloud is encoded; trajectories from start to goal are sampled by the diffusion model, under
-collision guidance; every sample goes to the validator as it is, and the shortest valid one is the answer. Where
-none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line, no
-search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance solve.
-Around it, `planning.diffusion.hybrid` puts what makes a motion dependable.
+collision guidance; every sample goes to the validator as it is, and the shortest valid one is the answer.
+Where none is valid, the next batch is drawn from new noise, until time runs out. There is no straight line,
+no search, no refinement, and nothing is shortened: what this planner solves, the network and its guidance
+solve. The hybrid planner (`planning.diffusion.hybrid`) surrounds it with a search.
 
-Path constraints are a further cost of guidance, and each waypoint of a sample is projected onto them before
-the validator, who proves them between the waypoints too, is asked. The network has never seen any.
+Path constraints are one more cost of guidance, and each waypoint of a sample is projected onto them before
+validation, which proves them between the waypoints too. The network was trained without constraints.
 
-Unless the settings say otherwise, the weights are used with the sampler and the steps that they name, and
-without guidance this is the network alone: `guidance_steps` 0.
+The weights name the sampler and the number of steps, unless the settings do. With `guidance_steps` 0 the
+network runs without guidance.
 """
 
 from collections.abc import Sequence
@@ -30,10 +30,10 @@ from robotdiffuse.learning.costs import CostStep, path_constraint_cost
 from robotdiffuse.learning.guidance import CollisionGuidance, GuidanceSettings
 from robotdiffuse.learning.sampling import SamplingSettings
 from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.planning import PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.learned import LearnedPlanner, LearnedSettings, nearest_goals
-from robotdiffuse.planning.planner import CONSTRAINTS
-from robotdiffuse.planning.search.constrained import SHARE, corner_kept
+from robotdiffuse.planning.search.constrained import TOLERANCE_FRACTION, corner_kept
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 from robotdiffuse.robots.robot import Robot
@@ -57,15 +57,14 @@ class GuidedSamplingSettings(SamplingSettings, LearnedSettings):
 @dataclass(frozen=True)
 class DiffusionSettings(GuidedSamplingSettings, name="diffusion"):
     optimize_time: NotNegative = 0.0
-    """Time in which further batches are drawn after the first that has a valid sample [s]; the shortest of
-    all is the answer."""
+    """Time for more batches after the first one with a valid sample [s]; the shortest of all is returned."""
 
 
-Own = TypeVar("Own", bound=GuidedSamplingSettings)
+SamplerSettings = TypeVar("SamplerSettings", bound=GuidedSamplingSettings)
 
 
-class ModelSampler(LearnedPlanner[Own]):
-    """What planners around the diffusion model share: to load it, and to draw batches by the settings."""
+class ModelSampler(LearnedPlanner[SamplerSettings]):
+    """Base of the planners that use the diffusion model: loads it, and draws batches by the settings."""
 
     network_name = "model"
 
@@ -93,10 +92,10 @@ class ModelSampler(LearnedPlanner[Own]):
         clearances: "ClearanceFn | None" = None,
         problem_costs: Sequence[CostStep] = (),
     ) -> Float[ndarray, "count waypoints dof"]:
-        """A batch of samples under guidance, shared out among the nearest goals.
+        """A batch of samples under guidance, divided among the nearest goals.
 
-        code: from `encode`; None: the whole condition is hidden, of weights that can do without it.
-        clearances: the model's inputs about the obstacles; None: those of the checker's scene.
+        code: the scene, as by `encode`; None: the condition is hidden, for weights that allow it.
+        clearances: the model's clearance inputs; None: the true ones of the checker's scene.
         problem_costs: as for `CollisionGuidance`.
         """
         from robotdiffuse.learning.clearance_features import link_clearances
@@ -128,20 +127,20 @@ class ModelSampler(LearnedPlanner[Own]):
 def encode(
     model: "MotionModel", checker: CollisionChecker, points: int, rng: np.random.Generator
 ) -> Float[ndarray, "code"]:
-    """z of a scene: its point cloud through the frozen encoder; of so many points, unless the encoder takes
-    clouds of one size."""
-    assert model.encoder is not None  # a prior is no network of these planners
-    settings = model.encoder.settings
-    count = points if model.encoder.any_size else settings.cloud
-    return model.encode(sample_surface(checker.scene, count, rng, settings.region), rng)
+    """The encoding z of a scene: its point cloud of `points` points through the frozen encoder, unless the
+    encoder has a fixed size."""
+    assert model.encoder is not None  # unconditional priors are not used by these planners
+    of_encoder = model.encoder.settings
+    count = points if model.encoder.any_size else of_encoder.cloud
+    return model.encode(sample_surface(checker.scene, count, rng, of_encoder.region), rng)
 
 
 def _projected(
     constraints: PathConstraints, path: Float[ndarray, "waypoints dof"]
 ) -> Float[ndarray, "waypoints dof"]:
-    """The path with all waypoints between its ends on what the constraints leave; as it is, for the validator to
-    refuse, where one of them leads nowhere."""
-    between = constraints.projected(path[1:-1], SHARE)
+    """The path with its inner waypoints projected onto the constraints; the path itself, for the validator to
+    refuse, if the projection of one fails."""
+    between = constraints.projected(path[1:-1], TOLERANCE_FRACTION)
     return np.concatenate([path[:1], between, path[-1:]]) if len(between) == len(path) - 2 else path
 
 
@@ -150,7 +149,7 @@ class Diffusion(ModelSampler[DiffusionSettings]):
 
     name = "diffusion"
     settings_class = DiffusionSettings
-    keeps = frozenset({CONSTRAINTS})
+    supports = frozenset({PATH_CONSTRAINTS})
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -158,8 +157,8 @@ class Diffusion(ModelSampler[DiffusionSettings]):
         start, goals = start_goal.rows()
         code = encode(model, start_goal.checker, self.settings.points, rng)
         names, constraints = context.problem.robot.joint_names, context.validator.constraints
-        costs = [] if constraints is None else [path_constraint_cost(constraints, SHARE)]
-        every, valid, until = list[Path](), list[Path](), context.time_limit
+        costs = [] if constraints is None else [path_constraint_cost(constraints, TOLERANCE_FRACTION)]
+        every, valid, until = list[Path](), list[Path](), context.request.time_limit
         while not every or context.elapsed < until:
             batch = self.draw(model, start_goal.checker, code, start, goals, rng, problem_costs=costs)
             if constraints is not None:
@@ -169,10 +168,11 @@ class Diffusion(ModelSampler[DiffusionSettings]):
             for path in passed:
                 context.improved(path.length)
             if passed and not valid:
-                until = min(context.elapsed + self.settings.optimize_time, context.time_limit)
+                until = min(context.elapsed + self.settings.optimize_time, context.request.time_limit)
             every, valid = every + paths, valid + passed
         reason = f"{len(valid)} of {len(every)} samples of the network are valid"
-        # where none is, the validator is asked about one once more, so that the result says what is wrong with it
+        # where none is, the validator is asked about one once more, so that the result says what is wrong
+        # with it
         for path in sorted(valid or every[-1:], key=lambda path: path.length):
             how = f"solved by network: {reason}"
             result = context.finish(path.positions, "network", how, keeps=partial(corner_kept, constraints))

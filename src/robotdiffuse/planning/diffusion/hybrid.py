@@ -1,17 +1,18 @@
-"""RobotDiffuse, a hybrid: the paper's diffusion model and AORRTC in one anytime loop.
+"""RobotDiffuse, the hybrid planner: the paper's diffusion model and AORRTC in one anytime loop.
 
-The straight line if it is free. Else a search for a first path, within milliseconds, then ever shorter ones;
-and, for a share of the work, batches of trajectories sampled by the diffusion model under collision guidance,
-or, where none of them is free, the same after more gradient steps (refinement). The model's inputs are
-clearances and, by default, no code of the scene (see the setting `guidance_scale`). What the batches propose
-is simplified by the same code as what search finds, and the shortest path of either bounds the next search.
-Everything goes through the validator, and the result names the stage that its path comes from.
+The straight line is returned if it is free. Otherwise a search finds a first path within milliseconds, then
+shorter ones. A part of the work goes to batches of trajectories that the diffusion model samples under
+collision guidance; where none of a batch is free, it is refined by more gradient steps. The model's network
+inputs are the clearances of the links and, by default, no encoding of the scene (see the setting
+`guidance_scale`). Paths of the batches are simplified like those of the search, and the shortest path of
+either bounds the next round of search. The validator checks every path, and the result names the stage that
+found it.
 
-For an arm without weights the batches are smooth noise after as many such steps (see smooth_noise.py). They
-are drawn only once search has a path: before that they solve less than search does in their time, see
-benchmarks/results/hard_arms.txt.
+For an arm without weights the batches are smooth noise, refined by the same steps (see smooth_noise.py). They
+are drawn only once the search has a path: before that they solve fewer problems in the same time than search
+does, see benchmarks/results/hard_arms.txt.
 
-Under path constraints it is search alone: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
+Under path constraints only the search runs: with batches for a quarter of 0.3 to 1 s, paths were a thousandth
 shorter (the mean of 20 upright cups and of 20 lines; median: the same).
 """
 
@@ -33,13 +34,13 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, Natural
 from robotdiffuse.learning.guidance import CollisionGuidance
 from robotdiffuse.learning.weights_registry import weights_for
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.diffusion.diffusion import GuidedSamplingSettings, ModelSampler, encode
 from robotdiffuse.planning.diffusion.smooth_noise import smooth_noise
 from robotdiffuse.planning.learned import nearest_goals
-from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS
 from robotdiffuse.planning.search.anytime import AnytimeSearch, anytime
-from robotdiffuse.planning.search.aorrtc import AORRTC, STEP, AORRTCSettings
+from robotdiffuse.planning.search.aorrtc import AORRTC, IMPROVEMENT_STEP, AORRTCSettings
 from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
 
@@ -47,32 +48,33 @@ if TYPE_CHECKING:
     from robotdiffuse.learning.motion_model import MotionModel
 
 BATCH_WORK = 12_000
-"""Iterations of search that take about as long as a batch of 16 samples in two steps, or its refinement."""
+"""Iterations of search that take about as long as a batch of 16 samples in two steps, or as its
+refinement."""
 WAYPOINTS = 48
-"""Of smooth noise: as many as the networks have."""
+"""Waypoints of smooth noise: as many as the networks have."""
 BATCH_SECONDS = 0.1
-"""What a batch or its refinement takes, until it is known [s]: the first of a process is slow."""
-LONGER = 2.0
-"""A batch may take so many times what those before it took: scenes differ."""
+"""Expected time of a batch or its refinement before any was measured [s]: the first of a process is slow."""
+BATCH_TIME_FACTOR = 2.0
+"""A batch is begun if this many times the expected time is left: scenes differ."""
 LOAD_SECONDS = 3.0
-"""A call that has so much time left loads PyTorch and the network, if it would use it [s]."""
+"""A call loads PyTorch and the network if it needs them and has this much time left [s]."""
 
 
 @dataclass(frozen=True)
 class RobotDiffuseSettings(GuidedSamplingSettings, name="robotdiffuse"):
     sampling_steps: Count | None = 2
-    """Calls of the denoiser per batch. With guidance, more bring no more solved problems, see
+    """Calls of the denoiser per batch. With guidance, more calls solve no more problems, see
     benchmarks/results/guidance.txt."""
     guidance_scale: float = 0.0
     """Scale of classifier-free guidance. At 0 the condition is hidden, and the scene's code is not computed:
     with it paths are as long, see benchmarks/results/network_inputs.txt. Weights that cannot do without their
     condition are then sampled with 1."""
     refinement_steps: Natural = 40
-    """Most gradient steps on the sampled trajectories that still collide."""
-    shortened: Count = 6
-    """Most candidates of a batch that are simplified."""
+    """Gradient steps on batches that still collide."""
+    max_simplified: Count = 6
+    """Largest number of free trajectories of a batch that are simplified, the shortest ones."""
     network_share: Annotated[float, Bound(least=0.0, below=1.0)] = 0.25
-    """Share of the work that goes to batches, of the network or of smooth noise; a batch counts as BATCH_WORK
+    """Part of the work that goes to batches, of the network or of smooth noise; a batch counts as BATCH_WORK
     iterations of search."""
     search: AORRTCSettings = field(default_factory=AORRTCSettings)
 
@@ -82,21 +84,21 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
     name = "robotdiffuse"
     settings_class = RobotDiffuseSettings
-    keeps = frozenset({CONSTRAINTS, CLEARANCE})
+    supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
 
     def __init__(self, settings: RobotDiffuseSettings | None = None) -> None:
         """Raises InputError if the folder that the settings name holds no weights."""
         super().__init__(settings)
         self.wanted: set[FilePath] = set()
-        """Weights that a call would have used, had there been time to load them."""
-        self.at_hand: set[FilePath] = set()
-        """Those that are loaded."""
+        """Folders of weights that a call needed and had no time to load."""
+        self.loaded: set[FilePath] = set()
+        """Folders of weights that are loaded."""
         self.seconds = {"batch": BATCH_SECONDS, "refinement": BATCH_SECONDS}
-        """What they took of late [s]: the last one, or more if those before did."""
+        """Expected times [s]: that of the last one, or more if those before it took longer."""
 
     def prepare(self, robot: Robot) -> None:
-        """See `planning.planner.Planner`: given weights. Those of the package are loaded in a call's own
-        time, if it has LOAD_SECONDS left for that, else by `warm_up` and `load_wanted`."""
+        """Load the weights that the settings name. Those of the package are loaded within a call, if it has
+        LOAD_SECONDS left, or else by `warm_up` and `load_wanted`."""
         if self.settings.weights is not None:
             self._load(robot)
 
@@ -106,12 +108,12 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         if self.weights(robot) in self.wanted:
             self._load(robot)
 
-    def _load_rarer(self, robot: Robot) -> None:
-        super()._load_rarer(robot)
+    def _load_rarely_needed(self, robot: Robot) -> None:
+        super()._load_rarely_needed(robot)
         self._load(robot)
 
     def weights(self, robot: Robot) -> FilePath | None:
-        """The folder of those that are used for a robot; None if there are none."""
+        """The folder of the weights for a robot; None if there are none."""
         given = self.settings.weights
         return weights_for(self.network_name, robot) if given is None else FilePath(given)
 
@@ -119,7 +121,7 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
         weights = self.weights(robot)
         if weights is not None:
             self.model(robot)
-            self.at_hand.add(weights)
+            self.loaded.add(weights)
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -129,10 +131,10 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
 
             return plan_constrained(context, start_goal, settings.search)
         search = AnytimeSearch(context, start_goal, settings.search, AORRTC.name)
-        weights, help_out = self.weights(robot), None
+        weights, fallback = self.weights(robot), None
         if weights is not None:
             batches = _NetworkBatches(self, context, start_goal, search, weights)
-            help_out = batches.offer
+            fallback = batches.offer
         else:
             batches = _Batches(self, context, start_goal, search)
             note = f"there are no weights for {robot.name}; planned by search and smooth noise"
@@ -142,38 +144,37 @@ class RobotDiffuse(ModelSampler[RobotDiffuseSettings]):
             if batches.due:
                 batches.offer()
             else:
-                search.improve(context.search_until, STEP)
+                search.improve(context.search_until, IMPROVEMENT_STEP)
 
         return anytime(
             context,
-            start_goal,
             search,
-            lambda: search.pays(settings.search.gain, settings.search.patience),
+            lambda: search.improves(settings.search.gain, settings.search.patience),
             improve,
-            help_out,
+            fallback,
         )
 
     def code(
         self, model: "MotionModel", checker: CollisionChecker, rng: np.random.Generator
     ) -> Float[ndarray, "code"] | None:
-        """z of the scene; None if the network's condition is hidden."""
+        """The encoding z of the scene; None if the network's condition is hidden."""
         hidden = self.guidance_scale(model) == 0.0
         return None if hidden else encode(model, checker, self.settings.points, rng)
 
     def guidance_scale(self, model: "MotionModel") -> float:
-        """The setting; 1 in place of 0 for weights that cannot do without their condition."""
+        """The setting; 1 in place of 0 for weights that need their condition."""
         scale = self.settings.guidance_scale
         return 1.0 if scale == 0.0 and not model.settings.null_condition else scale
 
     def refine(
         self, checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"]
     ) -> Float[ndarray, "count waypoints dof"]:
-        """More gradient steps on trajectories, whether sampled or not; float32."""
+        """Trajectories after `refinement_steps` gradient steps on the guidance costs; float32."""
         return CollisionGuidance(checker, self.settings.guidance)(q, self.settings.refinement_steps)[0]
 
 
 class _Batches:
-    """Batches of smooth noise in the anytime loop of a call, once it has a path."""
+    """Batches of smooth noise in the anytime loop of a call, drawn once it has a path."""
 
     def __init__(
         self, planner: RobotDiffuse, context: PlanningContext, start_goal: StartGoal, search: AnytimeSearch
@@ -183,12 +184,12 @@ class _Batches:
 
     @property
     def due(self) -> bool:
-        """Whether the batches have had less than their share of the work, and there is time for one."""
+        """Whether the batches had less than their part of the work, and there is time for another one."""
         batches, share = self._spent + BATCH_WORK, self.planner.settings.network_share
         return batches <= share * (self.search.work + batches) and self._can()
 
     def offer(self) -> None:
-        """Draw a batch and offer the shortest free ones to the search."""
+        """Draw a batch and offer its shortest free trajectories to the search, if there is time."""
         if self._can():
             self._draw()
 
@@ -197,11 +198,11 @@ class _Batches:
         return self._time_for("batch")
 
     def _time_for(self, part: str) -> bool:
-        return self.context.remaining > LONGER * self.planner.seconds[part]
+        return self.context.remaining > BATCH_TIME_FACTOR * self.planner.seconds[part]
 
     @contextmanager
     def _timed(self, part: str) -> Iterator[None]:
-        """A batch or its refinement, which counts as work and whose time the next ones will know."""
+        """Count a batch or its refinement as work, and update its expected time."""
         began = self.context.elapsed
         yield
         took, self._spent = self.context.elapsed - began, self._spent + BATCH_WORK
@@ -217,8 +218,8 @@ class _Batches:
         self._take(q, "smooth_noise")
 
     def _take(self, q: Float[ndarray, "count waypoints dof"], stage: str) -> bool:
-        """Offer the shortest ones that are free in the space of the search; whether there were any."""
-        space, most = self.search.space, self.planner.settings.shortened
+        """Offer the shortest free trajectories to the search; returns whether there were any."""
+        space, most = self.search.space, self.planner.settings.max_simplified
         ordered = sorted(np.ascontiguousarray(q, np.float32), key=path_length)
         paths = list(islice((path for path in ordered if motions_free(space, path).all()), most))
         for path in paths:
@@ -228,7 +229,7 @@ class _Batches:
 
 
 class _NetworkBatches(_Batches):
-    """Batches of the network in its place, refined where none is free."""
+    """Batches of the network, refined where none is free."""
 
     def __init__(
         self,
@@ -242,15 +243,15 @@ class _NetworkBatches(_Batches):
         self._weights = weights
 
     def _can(self) -> bool:
-        """Whether there is time for a batch, and for loading the network, which takes seconds once."""
+        """Whether there is time for a batch, and for loading the network unless it is loaded."""
         self.planner.wanted.add(self._weights)
-        at_hand = self._weights in self.planner.at_hand or self.context.remaining > LOAD_SECONDS
-        return at_hand and super()._can()
+        loaded = self._weights in self.planner.loaded or self.context.remaining > LOAD_SECONDS
+        return loaded and super()._can()
 
     @cached_property
     def _model(self) -> "MotionModel":
         model = self.planner.model(self.context.problem.robot)
-        assert model is not None  # there are weights, or these were no batches of a network
+        assert model is not None  # _NetworkBatches are made only where there are weights
         return model
 
     @cached_property
@@ -260,7 +261,7 @@ class _NetworkBatches(_Batches):
     def _draw(self) -> None:
         planner, checker, context = self.planner, self.start_goal.checker, self.context
         model = self._model
-        planner.at_hand.add(self._weights)
+        planner.loaded.add(self._weights)
         start, goals = self.start_goal.rows()
         with self._timed("batch"):
             sampled = planner.draw(model, checker, self._code, start, goals, context.rng)
@@ -278,7 +279,8 @@ def unlearned_starts(
     robot: Robot,
     rng: np.random.Generator,
 ) -> Float[ndarray, "count waypoints dof"]:
-    """The straight line, and the line with random bumps: the control for what refinement owes to learning."""
+    """The straight line, and lines with random bumps: the control that shows what refinement owes to
+    learning."""
     t = np.linspace(0.0, 1.0, waypoints)[:, None]
     q = np.repeat((start + t * (goal - start))[None], count, axis=0)
     for harmonic in (1, 2):

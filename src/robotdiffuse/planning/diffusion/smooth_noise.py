@@ -1,9 +1,10 @@
-"""Smooth noise: what the diffusion model begins with, for arms that have no weights.
+"""Smooth noise: random trajectories like those that the diffusion model starts from, for arms without
+weights.
 
 The noise of the model that comes with the Panda has the covariance of its training trajectories about the
 straight lines between their ends. Its eigenvectors are nearly sines of k half waves, its eigenvalues fall as
-k^-3.5, and its standard deviation is an eighth of half the range of a joint. So it has a closed form for any
-arm. Under the guidance of many steps it stands in for the network's draws, without any network.
+k^-3.5, and its standard deviation is an eighth of half the range of a joint. So the noise has
+a closed form for any arm. Refined by many guidance steps, it replaces the samples of a network.
 """
 
 import numpy as np
@@ -13,13 +14,14 @@ from numpy import ndarray
 from robotdiffuse.robots.robot import Robot
 
 SPREAD = 0.127
-"""Standard deviation over the waypoints, of half the range of a joint: the mean over the Panda's joints."""
-WIDEST = np.pi
-"""Half the range of a joint counts as no more than this [rad]: continuous joints have none."""
+"""Standard deviation over the waypoints, as a fraction of half a joint's range: the mean over the Panda's
+joints."""
+MAX_HALF_RANGE = np.pi
+"""Half a joint's range counts as no more than this [rad]: continuous joints have no limits."""
 WAVES = 8
-"""Sines; what more would add is less than a hundredth."""
-FALL = 3.5
-"""Their variances fall as k to this power."""
+"""Number of sines; more would add less than a hundredth."""
+VARIANCE_EXPONENT = 3.5
+"""The variance of the sine of k half waves falls as k to this power."""
 
 
 def smooth_noise(
@@ -30,14 +32,16 @@ def smooth_noise(
     robot: Robot,
     rng: np.random.Generator,
 ) -> Float[ndarray, "count waypoints dof"]:
-    """Straight lines from the start to goals, which take turns, and smooth noise; within the limits, but for
-    the ends themselves; float32."""
+    """Straight lines from the start to the goals in turn, plus smooth noise; float32.
+
+    All waypoints but the ends are clipped to the joint limits.
+    """
     t = np.linspace(0.0, 1.0, waypoints)
     waves = np.arange(1, WAVES + 1)
-    deviations = waves ** (-FALL / 2)
+    deviations = waves ** (-VARIANCE_EXPONENT / 2)
     deviations *= SPREAD * np.sqrt(2) / np.linalg.norm(deviations)  # a sine's mean square is a half
     basis = np.sin(np.pi * t[:, None] * waves) * deviations
-    half = np.minimum(0.5 * (robot.upper - robot.lower), WIDEST)
+    half = np.minimum(0.5 * (robot.upper - robot.lower), MAX_HALF_RANGE)
     lines = start + t[:, None] * (goals[np.arange(count) % len(goals), None] - start)
     q = lines + half * (basis @ rng.normal(size=(count, WAVES, len(start))))
     q = np.clip(q, robot.lower, robot.upper).astype(np.float32)

@@ -1,21 +1,20 @@
-"""Motions among obstacles that move: a path that any planner finds among those that stand still, and a timing
-that waits, goes slower or draws back so that the others pass.
+"""Motions among obstacles that move: any planner's path among what stands still, timed so that the moving
+obstacles pass.
 
-Along the path are places where the arm may rest; motions from rest to rest between any two of them, forwards
-and backwards, at full speed or slower, are timed within the limits as always. Which of them, after which
-waits, reach the end first is found by going through a grid of times once: a place is reached at a time if the
-arm rested there before, or a motion that nothing is in the way of ends there (safe intervals, M. Phillips and
-M. Likhachev, "SIPP: Safe interval path planning for dynamic environments", ICRA 2011, on a grid). The grid
-only proposes: the motion as a whole is validated in time. Without success other paths are tried: other seeds,
-and ways round where the obstacles are at some time.
+Along the path there are places where the arm may stop. Motions between any two of them, forwards and
+backwards, at full speed or slower, are timed within the limits as always. A grid of times is gone through
+once to find which motions, after which waits, reach the end first: a place is reached at a time if the arm
+waited there before, or if a collision-free motion ends there (safe intervals, M. Phillips and M. Likhachev,
+"SIPP: Safe interval path planning for dynamic environments", ICRA 2011, on a grid). The grid only proposes:
+the validator checks the motion as a whole in time. If that fails, other paths are tried: other seeds, and
+paths around the obstacles where they are at some time.
 
-A path by waypoints is timed as one: no motion between rests goes through a waypoint, so that the arm stops at
-each, in their order, waits there if it must, and may draw back to one before it.
+The motion stops at each waypoint of a path through waypoints, in their order. It waits there if it must, and
+may go back to an earlier waypoint.
 """
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy import ndarray
@@ -25,9 +24,10 @@ from robotdiffuse.collision.moving_obstacles import MovingCollision, links_of
 from robotdiffuse.core.deadline import OutOfTimeError, check_timing
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Trajectory
-from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.attempt import Solver, attempt
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.pipeline.moving_obstacles_kernel import earliest
-from robotdiffuse.planning.pipeline.waypoints import plan_by_waypoints
+from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
 from robotdiffuse.planning.search.constrained import corner_kept
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
@@ -36,28 +36,24 @@ from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verifier
 
-if TYPE_CHECKING:
-    from robotdiffuse.planning.planner import Planner
-
-STEP = 0.02
-"""Of the grid of times [s]."""
+GRID_STEP = 0.02
+"""Step of the grid of times [s]."""
 CELL_SECONDS = 1e-8
-"""What a time and a configuration of the grid take at least [s]."""
-TRAVEL = 0.02
-"""No point of the arm moves further between two configurations of the grid [m]."""
-PATIENCE, LONGER = 5.0, 3.0
-"""The grid ends so long after the path could have been gone without obstacles [s], so many times over."""
-SHARE = 0.5
-"""Of the time that is left, for each path."""
+"""Least computing time per cell of the grid (a configuration at a time) [s]."""
+GRID_TRAVEL = 0.02
+"""No point of the arm moves further than this between two configurations of the grid [m]."""
+EXTRA_TIME, DURATION_FACTOR = 5.0, 3.0
+"""The grid ends at this factor of the duration without moving obstacles, plus this time [s]."""
+PATH_TIME_FRACTION = 0.5
+"""Part of the time left that planning each path gets."""
 
 
-def plan_among_moving(
-    planner: "Planner", problem: Problem, time_limit: float, seed: int, request: Request
-) -> PlanResult:
+def plan_among_moving_obstacles(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
     """A motion among the problem's moving obstacles, certified in time until it ends."""
-    context = PlanningContext(planner.name, problem, time_limit, seed, request)
+    context = PlanningContext(solver.name, problem, request)
     robot = problem.robot
     still = replace(problem, moving=())
+    plan_path = plan_through_waypoints if problem.waypoints else attempt
     contact = context.validator.settings.contact
     collision = MovingCollision(robot, problem.moving, contact, 0.0)
     first = collision.sweep(np.zeros(1), problem.start[None]).contact
@@ -65,17 +61,17 @@ def plan_among_moving(
         return context.fail(
             Status.INVALID_START, f"the start is in collision: {first.link} touches {first.obstacle}"
         )
-    rng, attempt, tried = np.random.default_rng(seed), 0, 0
+    rng, attempts, tried = np.random.default_rng(request.seed), 0, 0
     horizon, reason = 0.0, ""
-    while attempt == 0 or context.remaining > 0:
+    while attempts == 0 or context.remaining > 0:
         scene = problem.scene
-        if attempt % 2:  # ways round the obstacles as they stand at some time
+        if attempts % 2:  # paths around the obstacles where they are at some time
             time = float(rng.uniform(0.0, horizon))
             scene = Scene([*scene.shapes, *(one.at(time) for one in problem.moving if one.known)])
-        limit = max(SHARE * (time_limit - context.elapsed), 1e-3)
-        asked = replace(still, scene=scene), limit, seed + attempt // 2, request
-        found = plan_by_waypoints(planner, *asked) if problem.waypoints else planner.attempt(*asked)
-        attempt += 1
+        limit = max(PATH_TIME_FRACTION * (request.time_limit - context.elapsed), 1e-3)
+        of_path = replace(request, time_limit=limit, seed=request.seed + attempts // 2)
+        found = plan_path(solver, replace(still, scene=scene), of_path)
+        attempts += 1
         if found.path is None or found.trajectory is None:
             if scene is problem.scene:
                 return found
@@ -96,7 +92,7 @@ def plan_among_moving(
             reason = f"; last: {report.violation.message}"
     return context.fail(
         Status.TIMEOUT,
-        f"no timing of {tried} paths with waits and retreats gets by the moving obstacles{reason}",
+        f"no timing of {tried} paths, with waits and retreats, passes the moving obstacles{reason}",
     )
 
 
@@ -110,7 +106,7 @@ def _solved(
         found,
         reason=f"{found.reason}, timed among moving obstacles",
         planning_time=context.elapsed,
-        seed=context.seed,
+        seed=context.request.seed,
         trajectory=timed,
         scene_clearance=scene,
         self_clearance=itself,
@@ -120,7 +116,7 @@ def _solved(
 
 
 def _stops(problem: Problem, path: Path) -> list[int]:
-    """The rows of a path at its waypoints, the first of each after those before it."""
+    """The rows of a path at its waypoints: for each the first one after the waypoint before."""
     rows, stops = range(len(path.positions)), [0]
     for goal in problem.waypoints:
         there = (i for i in rows[stops[-1] :] if goal_error(problem.robot, goal, path.positions[i]) is None)
@@ -135,7 +131,7 @@ def _timed(
     path: Path,
     clearance: float,
 ) -> Trajectory | None:
-    """The earliest motion along the path that the grid knows, None if there is none."""
+    """The earliest collision-free motion along the path on the grid of times; None if there is none."""
     robot, validator = problem.robot, verifier(replace(problem, moving=()))
     if path.length < APART:
         return time_parameterize(robot, path, lambda _: True, validator.collision_free, context.timing)
@@ -145,21 +141,21 @@ def _timed(
         lambda t: validator.trajectory(t).valid,
         validator.collision_free,
         context.timing,
-        STEP,
+        GRID_STEP,
         partial(corner_kept, validator.constraints),
         context.beside,
         _stops(problem, path),
     )
     links = links_of(robot)[1]
-    s, configurations = rests.spaced(links.levers.max(axis=0), TRAVEL)
+    s, configurations = rests.spaced(links.levers.max(axis=0), GRID_TRAVEL)
     longest = sum(motion.ticks for motion in rests.motions if motion.target == motion.source + 1) // len(
         PACES
     )
-    count = int(LONGER * longest + PATIENCE / STEP)
+    count = int(DURATION_FACTOR * longest + EXTRA_TIME / GRID_STEP)
     check_timing(f"a grid of {count} times", CELL_SECONDS * count * len(configurations))
-    times = STEP * np.arange(count)
+    times = GRID_STEP * np.arange(count)
     speed = max(one.greatest_speed for one in problem.moving)
-    asked = clearance + (TRAVEL + speed * STEP) / 2
+    asked = clearance + (GRID_TRAVEL + speed * GRID_STEP) / 2
     clear = free_over(links, collision.tracks, configurations, times, asked)
     cells = list[ndarray]()
     for motion in rests.motions:

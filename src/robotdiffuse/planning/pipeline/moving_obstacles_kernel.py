@@ -1,4 +1,4 @@
-"""The compiled search for the earliest arrival among obstacles that move; see `moving.py`."""
+"""The compiled search for the earliest arrival among moving obstacles; see `moving_obstacles.py`."""
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -7,9 +7,9 @@ from numpy import ndarray
 
 from robotdiffuse.core.deadline import check_timing
 
-NEVER, WAITED = -2, -1
-CELLS_AT_ONCE = 10_000_000
-"""Cells of motions that are gone through between two looks at the clock."""
+UNREACHED, WAITED = -2, -1
+CELLS_PER_CLOCK_CHECK = 10_000_000
+"""Cells of motions that are visited between two readings of the clock."""
 
 
 def earliest(
@@ -20,16 +20,19 @@ def earliest(
     first: Int[ndarray, "n"],
     cells: Int[ndarray, "k"],
 ) -> tuple[list[int], bool]:
-    """How the last place is reached first, beginning at rest at the first place at tick 0: the motions in
-    order, -1 for each tick that the arm waits; and whether there is a way.
+    """The earliest schedule from rest at the first place, at tick 0, to the last place.
 
-    clear says which configurations are free when; cell[places] are those of the places; motion m goes from
-    source[m] to target[m] by cells[first[m] : first[m + 1]], one for each tick. Raises OutOfTimeError where a
-    deadline leaves no time for it.
+    clear: which configurations are free at which tick.
+    cell: the configuration of each place.
+    source, target: the places that each motion connects.
+    first, cells: motion m passes the configurations cells[first[m] : first[m + 1]], one per tick.
+
+    Returns the numbers of the motions in order, with -1 for each tick of waiting, and whether the last place
+    can be reached. Raises OutOfTimeError if a deadline leaves no time.
     """
-    came = np.full((clear.shape[1], len(cell)), NEVER)
+    came = np.full((clear.shape[1], len(cell)), UNREACHED)
     came[0, 0] = WAITED
-    count = max(CELLS_AT_ONCE // len(cells), 1)
+    count = max(CELLS_PER_CLOCK_CHECK // len(cells), 1)
     for begin in range(0, len(came) - 1, count):
         check_timing("the grid of times")
         end = _reached(came, clear, cell, source, target, first, cells, begin, count)
@@ -40,20 +43,20 @@ def earliest(
 
 @njit(cache=True, nogil=True)
 def _reached(came, clear, cell, source, target, first, cells, begin, count):
-    """Go on through so many ticks from `begin`, and note in came[ticks, places] how a place is reached at a
-    tick: by which motion, or WAITED there. Returns the tick at which the last place is reached first; -1 if
-    it is none of these."""
+    """Go through `count` ticks from `begin`, and write to came[ticks, places] by which motion a place is
+    reached at a tick, or WAITED. Returns the tick at which the last place is first reached; -1 if it is none
+    of these."""
     places, ticks = len(cell), clear.shape[1]
     for now in range(begin, min(begin + count, ticks - 1)):
-        if came[now, places - 1] != NEVER:
+        if came[now, places - 1] != UNREACHED:
             return now
         for i in range(places):
-            rests = came[now, i] != NEVER and clear[cell[i], now + 1]
-            if rests and came[now + 1, i] == NEVER:
+            rests = came[now, i] != UNREACHED and clear[cell[i], now + 1]
+            if rests and came[now + 1, i] == UNREACHED:
                 came[now + 1, i] = WAITED
         for m in range(len(source)):
             there = now + first[m + 1] - first[m] - 1
-            if came[now, source[m]] == NEVER or there >= ticks or came[there, target[m]] != NEVER:
+            if came[now, source[m]] == UNREACHED or there >= ticks or came[there, target[m]] != UNREACHED:
                 continue
             free = True
             for k in range(first[m + 1] - first[m] - 1):
@@ -68,7 +71,8 @@ def _reached(came, clear, cell, source, target, first, cells, begin, count):
 
 @njit(cache=True)
 def _way_to(end, came, source, first):
-    """The motions by which the last place is reached at tick `end`, in order; -1 for each tick of waiting."""
+    """The numbers of the motions that reach the last place at tick `end`, in order; -1 for each tick of
+    waiting."""
     way = [0 for _ in range(0)]
     place = came.shape[1] - 1
     while end > 0:

@@ -1,21 +1,21 @@
-"""Planning in a scene that cameras saw a part of: what is taken for occupied beside what was seen.
+"""Planning in a scene of which cameras saw a part: assumptions about unknown space, for any planner.
 
-One way for all planners: a chain of assumptions, each the scene as seen with more obstacles, the most careful
-first; the first that has a motion answers. So every motion keeps clear of what was seen, and of as much
-beside it as lets it pass:
+An assumption is the scene as seen with more obstacles. The assumptions of the problem's policy are tried from
+the most careful to the least, and the first one with a motion gives the result. So every motion keeps clear
+of what was seen, and of as much more as lets it pass:
 
-- padded: points seen, padded by 9 cm, by 6, by 4; then as seen.
-- predicted: voxels that the completing network finds occupied with a probability above 0.1, 0.2, 0.35, 0.5;
-  then as seen. Of several motions of an assumption, one that sweeps little probability.
+- padded: observed points, inflated by 9 cm, by 6, by 4; then as seen.
+- predicted: voxels that the occupancy completion network predicts occupied with a probability above 0.1, 0.2,
+  0.35, 0.5; then as seen. Of several motions under an assumption, one that sweeps little probability.
 - occupied: every voxel that no view saw, and nothing after it.
 - optimistic: as seen.
 
-Start and goal are taken to be free, so space around them is carved out of these obstacles, not of what was
-seen.
+Start and goal are taken to be free: the space around them is carved out of the assumed obstacles, not of what
+was seen.
 """
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -24,53 +24,57 @@ from numpy import ndarray
 from robotdiffuse.collision.kernel_arrays import compile_scene_for
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import FIRST
-from robotdiffuse.perception.assumptions import Assumption, Voxels, assumptions
+from robotdiffuse.perception.assumptions import (
+    Assumption,
+    Voxels,
+    occupied_assumption,
+    padded_assumptions,
+    predicted_assumptions,
+)
 from robotdiffuse.perception.confidence import confidence
-from robotdiffuse.perception.depth_view import AssumedPoints
-from robotdiffuse.perception.observed_volume import observe
+from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
+from robotdiffuse.perception.observed_volume import ObservedVolume, observe
 from robotdiffuse.perception.unknown_space import UnknownSpace
-from robotdiffuse.planning.context import PlanningContext, Request
+from robotdiffuse.planning.attempt import Solver, attempt
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import usable_start_goal
-from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PREDICTED, JointGoal, Problem
+from robotdiffuse.problems.problem import OCCUPIED, OPTIMISTIC, PADDED, PREDICTED, JointGoal, Problem
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.scenes.scene import Scene
 
-if TYPE_CHECKING:
-    from robotdiffuse.planning.planner import Planner
-
-CANDIDATES, FEW = 8, 4
-"""First motions of an assumption that the one of least probability is chosen from, and how many of them at least,
-unless one is safe ..."""
-FAIR, SAFE = 2.0, 0.1
-"""Summed probability: no more than FEW are looked for if one sweeps no more than FAIR, none once one sweeps
-no more than SAFE."""
-AS_LIKELY = 0.01
-"""A shorter motion is taken whose confidence is less by no more than this."""
-RESERVED = 0.3
-"""Share of the time limit that is kept for the motion as seen, where it may be asked for."""
-SHARE = 0.25
-"""Of the rest that is left, for an assumption that others come after."""
-LEAST = 0.1
-"""Share of the time limit that every call of the planner has at least."""
-SHOWN = 0.2
-"""Probability above which pictures show a voxel."""
+MAX_FIRST_MOTIONS, MIN_FIRST_MOTIONS = 8, 4
+"""First motions under an assumption that the one of least probability is chosen from: most and fewest ..."""
+ACCEPTABLE_RISK, NEGLIGIBLE_RISK = 2.0, 0.1
+"""... the search for more of them ends after the fewest once one sweeps a summed probability of no more than
+the first, and at once when one sweeps no more than the second."""
+CONFIDENCE_TOLERANCE = 0.01
+"""A shorter motion is preferred if its confidence is lower by no more than this."""
+AS_SEEN_TIME_FRACTION = 0.3
+"""Part of the time limit that is reserved for the motion as seen, unless the policy excludes it."""
+ASSUMPTION_TIME_FRACTION = 0.25
+"""Part of the other time left that each assumption gets, if others come after it."""
+MIN_TIME_FRACTION = 0.1
+"""Part of the time limit that every attempt of the planner gets at least."""
+PICTURE_THRESHOLD = 0.2
+"""Pictures show voxels with a probability above this."""
 AS_SEEN = "as seen"
-"""The assumption without any further obstacles."""
+"""Name of the assumption without additional obstacles."""
 
 
 def plan_with_unknown_space(
-    planner: "Planner",
+    solver: Solver,
     problem: Problem,
-    time_limit: float,
-    seed: int,
-    request: Request,
+    request: PlanRequest,
     predicted: Float32[ndarray, "nx ny nz"] | None = None,
 ) -> PlanResult:
-    """A motion as the problem's policy asks for it, within the time limit [s]; see the head of this file.
+    """A motion under the problem's policy for unknown space, within the time limit; see the head of this
+    file.
 
-    `predicted`: the probability that each fine voxel of the observed volume is occupied, in place of what the
-    completing network says. The result says which assumption it comes from, how likely the motion is free in truth
-    and which unknown space it crosses.
+    predicted: the probability that each fine voxel of the observed volume is occupied; None: as the occupancy
+    completion network predicts, if the policy needs it.
+
+    The result says which assumption it comes from, its confidence (how likely the motion is free in the true
+    scene), and which unknown space it crosses.
     """
     if problem.unknown == PREDICTED and predicted is None:
         from robotdiffuse.learning.completion import bundled, predict  # PyTorch, before the clock starts
@@ -78,136 +82,152 @@ def plan_with_unknown_space(
         bundled()
     else:
         predict = None
-    context = PlanningContext(planner.name, problem, time_limit, seed, request)
+    context = PlanningContext(solver.name, problem, request)
     volume = observe(problem.views, problem.robot, problem.start)
     if predict is not None:
         predicted = predict(volume)
-    chain = _Chain(planner, context, request, UnknownSpace(problem, volume, predicted))
-    as_seen = replace(problem, views=())
+    attempts = _Attempts(solver, context, unknown_space_of(problem, volume, predicted))
+    as_seen, limit = replace(problem, views=()), request.time_limit
     if problem.unknown != OPTIMISTIC:
         goals = _goals(context, as_seen)
         if isinstance(goals, PlanResult):
             return goals
-        for assumption in assumptions(problem, volume, predicted):
-            last = problem.unknown == OCCUPIED
-            if (
-                not last
-                and (1 - RESERVED) * context.time_limit - context.elapsed < LEAST * context.time_limit
-            ):
+        only = problem.unknown == OCCUPIED
+        for assumption in assumptions_of(problem, volume, predicted):
+            left = (1 - AS_SEEN_TIME_FRACTION) * limit - context.elapsed
+            if not only and left < MIN_TIME_FRACTION * limit:
                 break
-            beside = with_assumption(problem, assumption, goals)
-            compile_scene_for(problem.robot, beside.scene)  # no part of the assumption's share of the time
-            left = (1 - RESERVED) * context.time_limit - context.elapsed
-            until = (
-                context.time_limit
-                if last
-                else context.elapsed + max(SHARE * left, LEAST * context.time_limit)
-            )
-            result = chain.best(beside, assumption.name, until)
-            if last and not result.solved:
+            assumed = with_assumption(problem, assumption, goals)
+            compile_scene_for(problem.robot, assumed.scene)  # now, outside the assumption's time
+            left = (1 - AS_SEEN_TIME_FRACTION) * limit - context.elapsed
+            share = max(ASSUMPTION_TIME_FRACTION * left, MIN_TIME_FRACTION * limit)
+            until = limit if only else context.elapsed + share
+            result = attempts.best(assumed, assumption.name, until)
+            if only and not result.solved:
                 why = "no motion keeps out of all space that no view saw"
                 return replace(result, reason=f"{why}: {result.reason}")
-            if last or result.solved:
+            if only or result.solved:
                 return result
-    return chain.best(as_seen, AS_SEEN, context.time_limit)
+    return attempts.best(as_seen, AS_SEEN, limit)
+
+
+def assumptions_of(
+    problem: Problem, volume: ObservedVolume, predicted: Float32[ndarray, "nx ny nz"] | None
+) -> Iterator[Assumption]:
+    """The assumptions of the problem's policy, the most careful first.
+
+    predicted: the probability that each fine voxel is occupied, for the policy "predicted".
+    """
+    robot, known = problem.robot, problem.known_scene
+    if problem.unknown == PADDED:
+        seen = [shape.points for shape in problem.scene.shapes if isinstance(shape, SeenPoints)]
+        yield from padded_assumptions(np.concatenate([np.zeros((0, 3)), *seen]))
+    elif problem.unknown == PREDICTED:
+        assert predicted is not None
+        yield from predicted_assumptions(predicted, robot, known)
+    elif problem.unknown == OCCUPIED:
+        yield occupied_assumption(volume, robot, known)
+
+
+def unknown_space_of(
+    problem: Problem, volume: ObservedVolume, predicted: Float32[ndarray, "nx ny nz"] | None
+) -> UnknownSpace:
+    """The space that no view of the problem saw, with its start and given goal configurations free."""
+    goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
+    return UnknownSpace(problem.robot, np.stack([problem.start, *goals]), volume, predicted)
 
 
 def predicted_obstacles(problem: Problem) -> AssumedPoints:
-    """What the completing network finds likely beside what the problem's views saw: for pictures."""
+    """The obstacles that the occupancy completion network predicts for the problem's views: for pictures."""
     from robotdiffuse.learning.completion import predict
 
     volume = observe(problem.views, problem.robot, problem.start)
     arm = placed_spheres(problem.robot, problem.start).astype(np.float32)
-    return Voxels("likely", predict(volume) > SHOWN, problem).obstacles(arm)
+    likely = predict(volume) > PICTURE_THRESHOLD
+    return Voxels("likely", likely, problem.robot, problem.known_scene).obstacles(arm)
 
 
 def _goals(context: PlanningContext, as_seen: Problem) -> Float[ndarray, "n dof"] | PlanResult:
-    """The goal configurations, those of a pose that are free of what was seen; or why there are none."""
+    """The goal configurations, of a pose those that are free of what was seen; or the result without any."""
     if isinstance(as_seen.goal, JointGoal):
         return as_seen.goal.positions
-    start_goal = usable_start_goal(
-        PlanningContext(context.planner, as_seen, context.time_limit, context.seed)
-    )
+    start_goal = usable_start_goal(PlanningContext(context.planner_name, as_seen, context.request))
     return start_goal if isinstance(start_goal, PlanResult) else np.stack(start_goal.goals)
 
 
 def with_assumption(problem: Problem, assumption: Assumption, goals: Float[ndarray, "n dof"]) -> Problem:
-    """The problem in the scene as seen with an assumption's obstacles; of several goals, with those that need the
+    """The problem in the scene as seen with an assumption's obstacles, and with those goals that need the
     least carving."""
-    start, *start_goal = (
-        placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals)
-    )
-    needed = np.array([assumption.touched(spheres) for spheres in start_goal] if len(start_goal) > 1 else [0])
+    start, *at_goals = (placed_spheres(problem.robot, q).astype(np.float32) for q in (problem.start, *goals))
+    needed = np.array([assumption.touched(spheres) for spheres in at_goals] if len(at_goals) > 1 else [0])
     easiest = np.flatnonzero(needed == needed.min())
-    obstacles = assumption.obstacles(np.concatenate([start, *(start_goal[i] for i in easiest)]))
+    obstacles = assumption.obstacles(np.concatenate([start, *(at_goals[i] for i in easiest)]))
     scene = Scene([*problem.scene.shapes, obstacles])
     return replace(problem, scene=scene, goal=JointGoal(goals[easiest]), views=())
 
 
-class _Chain:
-    """The calls of a planner within a call."""
+class _Attempts:
+    """The attempts of a planner under the assumptions of one call."""
 
-    def __init__(
-        self, planner: "Planner", context: PlanningContext, request: Request, unknown: UnknownSpace
-    ) -> None:
-        self.planner, self.context, self.request, self.unknown = planner, context, request, unknown
+    def __init__(self, solver: Solver, context: PlanningContext, unknown: UnknownSpace) -> None:
+        self.solver, self.context, self.unknown = solver, context, unknown
 
     def best(self, problem: Problem, assumption: str, until: float) -> PlanResult:
-        """A motion that is there by `until` [s since the call], or the result that says why there is none.
+        """A motion found by `until` [s since the call], or the result that says why there is none.
 
-        Where something is predicted, the shortest of those that are about as likely free as the likeliest:
-        of first motions, and of one made with the time that is left.
+        With a prediction, several first motions and one with the rest of the time are compared: of those with
+        about the highest confidence, the shortest is returned.
         """
+        request = self.context.request
         if self.unknown.probability is None:
-            result = self._attempt(problem, until, self.context.seed, self.request)
+            result = self._attempt(problem, until, request)
             return _Motion(result, assumption, self.unknown).result if result.solved else result
         found = list[_Motion]()
-        while len(found) < CANDIDATES:
-            quick = replace(self.request, until=FIRST)
-            result = self._attempt(problem, until, self.context.seed + len(found), quick)
+        while len(found) < MAX_FIRST_MOTIONS:
+            quick = replace(request, until=FIRST, seed=request.seed + len(found))
+            result = self._attempt(problem, until, quick)
             if not result.solved and not found:
                 return result
             if not result.solved:
                 break
             found.append(_Motion(result, assumption, self.unknown))
             least = min(motion.risk or 0.0 for motion in found)
-            if self.context.elapsed >= until or least <= (FAIR if len(found) >= FEW else SAFE):
+            acceptable = ACCEPTABLE_RISK if len(found) >= MIN_FIRST_MOTIONS else NEGLIGIBLE_RISK
+            if self.context.elapsed >= until or least <= acceptable:
                 break
-        if self.request.until != FIRST and self.context.elapsed < until:
-            result = self._attempt(problem, until, self.context.seed, self.request)
+        if request.until != FIRST and self.context.elapsed < until:
+            result = self._attempt(problem, until, request)
             found += [_Motion(result, assumption, self.unknown)] if result.solved else []
-        likeliest = max(motion.likely for motion in found)
-        likely = [motion for motion in found if motion.likely >= likeliest - AS_LIKELY]
-        chosen = min(likely, key=lambda motion: motion.length)
+        highest = max(motion.confidence for motion in found)
+        best = [motion for motion in found if motion.confidence >= highest - CONFIDENCE_TOLERANCE]
+        chosen = min(best, key=lambda motion: motion.length)
         return replace(chosen.result, planning_time=self.context.elapsed)
 
-    def _attempt(self, problem: Problem, until: float, seed: int, request: Request) -> PlanResult:
-        context, began = self.context, self.context.elapsed
-        limit = max(until - began, LEAST * context.time_limit)
-        result = self.planner.attempt(problem, limit, seed, request)
+    def _attempt(self, problem: Problem, until: float, request: PlanRequest) -> PlanResult:
+        whole, began = self.context.request, self.context.elapsed
+        limit = max(until - began, MIN_TIME_FRACTION * whole.time_limit)
+        result = attempt(self.solver, problem, replace(request, time_limit=limit))
         progress = tuple((began + at, length) for at, length in result.progress)
-        return replace(
-            result, planning_time=began + result.planning_time, progress=progress, seed=context.seed
-        )
+        return replace(result, planning_time=began + result.planning_time, progress=progress, seed=whole.seed)
 
 
 class _Motion:
-    """A motion of an assumption, and what it crosses of unknown space."""
+    """A motion under an assumption, and the unknown space that it crosses."""
 
     def __init__(self, result: PlanResult, assumption: str, unknown: UnknownSpace) -> None:
         assert result.path is not None
-        self._result, self._rung, self.length = result, assumption, result.path.length
+        self._result, self._assumption, self.length = result, assumption, result.path.length
         self._crossed = unknown.crossed(result.path)
         self.risk = self._crossed.risk
-        self.likely = confidence(assumption, self.risk)
+        self.confidence = confidence(assumption, self.risk)
 
     @property
     def result(self) -> PlanResult:
-        """With what is known of the motion in unknown space."""
+        """The result with its assumption, its confidence and the unknown space that it crosses."""
         return replace(
             self._result,
-            assumption=self._rung,
-            confidence=self.likely,
+            assumption=self._assumption,
+            confidence=self.confidence,
             swept_probability=self.risk,
             unknown_region=self._crossed.region,
         )

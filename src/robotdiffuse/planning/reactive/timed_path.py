@@ -1,4 +1,4 @@
-"""A path that is certified among what stands still, and how fast the arm goes along it."""
+"""Paths that are certified in the static scene, and speed profiles along them."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,59 +18,57 @@ from robotdiffuse.trajectories.timing import rounded_corners
 from robotdiffuse.trajectories.timing_kernel import controllable, sampled
 from robotdiffuse.validation.validator import Verifier
 
-VELOCITY, ACCELERATION = 0.99, 0.96
-"""Shares of the limits: what may happen between the places where they are kept."""
-APART = 1e-4
-"""Courses are longer than this [rad]."""
-FINE = 0.03
-"""Intervals in which the arm may stop are about so long [rad, joint-space L2]."""
+VELOCITY_FRACTION, ACCELERATION_FRACTION = 0.99, 0.96
+"""Parts of the limits that are used at the grid points; the rest covers what lies between them."""
+MIN_LENGTH = 1e-4
+"""Paths are longer than this [rad]."""
+LINE_INTERVAL = 0.03
+"""Approximate length of the grid intervals on straight pieces [rad, joint-space L2]."""
+CORNER_INTERVALS = 16
+"""Grid intervals in a rounded corner."""
 
 
-CORNER = 16
-"""Intervals in a rounded corner."""
-
-
-class Speeds(NamedTuple):
-    """A motion along a course: values of s, and the speed at each."""
+class SpeedProfile(NamedTuple):
+    """A motion along a path: values of the path parameter s, and the speed at each."""
 
     s: Float[ndarray, "m"]
     speeds: Float[ndarray, "m"]
 
     def after(self, time: float) -> tuple[float, float]:
-        """s and speed some time after the beginning [s]."""
+        """s and speed at a time after the beginning [s]."""
         return braking_kernel.after(self.s, self.speeds, time)
 
-    def rest(self, time: float) -> "Speeds":
-        """What is left of it some time after the beginning [s]."""
+    def rest(self, time: float) -> "SpeedProfile":
+        """The rest of the motion from a time after the beginning on [s]."""
         s, speed = self.after(time)
         ahead = self.s > s + 1e-12
-        return Speeds(np.append(s, self.s[ahead]), np.append(speed, self.speeds[ahead]))
+        return SpeedProfile(np.append(s, self.s[ahead]), np.append(speed, self.speeds[ahead]))
 
     @property
     def duration(self) -> float:
-        """Until the arm rests [s]."""
+        """Time until the arm rests [s]."""
         both = self.speeds[1:] + self.speeds[:-1]
         return float((2 * np.diff(self.s)[both > 0] / both[both > 0]).sum())
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
-    """A polyline with rounded corners that passed the validator, along which the arm need not stop."""
+class TimedPath:
+    """A polyline with rounded corners that passed the validator; the arm need not stop along it."""
 
     robot: Robot
     line: BlendedPolyline
     to_goal: bool
-    """Whether it, or what follows, ends at the goal."""
-    then: "Course | None" = None
-    """What follows after a stop at its end."""
+    """Whether it, or the path that follows, ends at the goal."""
+    then: "TimedPath | None" = None
+    """The path that follows after a stop at the end; None if this is the last."""
 
     @staticmethod
     def certified(
         robot: Robot, validator: Verifier, waypoints: Float[ndarray, "n dof"], to_goal: bool
-    ) -> "Course | None":
-        """The course through waypoints; None where the validator does not find them free, or all are the same."""
+    ) -> "TimedPath | None":
+        """The path through waypoints; None if the validator refuses it, or all waypoints are the same."""
         path = Path(robot.joint_names, waypoints)
-        if path.length < APART or not validator.collision_free(path):
+        if path.length < MIN_LENGTH or not validator.collision_free(path):
             return None
 
         def free(motion: Trajectory) -> bool:
@@ -78,18 +76,18 @@ class Course:
 
         rows, deviations = rounded_corners(robot, path, free, validator.collision_free)
         stops = [0, *(np.flatnonzero(deviations == 0) + 1).tolist(), len(rows) - 1]
-        course = None
+        timed = None
         for first, last in reversed(list(pairwise(stops))):
             part = rows[first : last + 1]
             line = BlendedPolyline(part, half_widths(part, deviations[first : last - 1]))
-            course = Course(robot, line, to_goal, course)
-        return course
+            timed = TimedPath(robot, line, to_goal, timed)
+        return timed
 
     @cached_property
     def _grid(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """The path's derivatives at the values of s where limits are kept, these, and the most ṡ² there."""
-        count = max(int(self.line.length / FINE), 8)
-        grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER))
+        """The path's first and second derivatives on the grid, the grid of s, and the largest ṡ² on it."""
+        count = max(int(self.line.length / LINE_INTERVAL), 8)
+        grid = timing_grid(self.line, TimingSettings(line_intervals=count, corner_intervals=CORNER_INTERVALS))
         one, two = self.line(grid, 1), self.line(grid, 2)
         return (
             one,
@@ -99,26 +97,26 @@ class Course:
                 one,
                 two,
                 grid,
-                VELOCITY * self.robot.velocity,
+                VELOCITY_FRACTION * self.robot.velocity,
                 *symmetric(self._acceleration, len(grid)),
             ),
         )
 
     @property
     def _acceleration(self) -> Float[ndarray, "dof"]:
-        return ACCELERATION * self.robot.acceleration
+        return ACCELERATION_FRACTION * self.robot.acceleration
 
-    def on_then_rest(self, s: float, speed: float, time: float) -> Speeds:
-        """As fast as possible towards the end for some time [s], then braking to rest."""
-        return Speeds(*braking_kernel.on_then_rest(*self._grid, s, speed, time, self._acceleration))
+    def on_then_rest(self, s: float, speed: float, time: float) -> SpeedProfile:
+        """The motion that drives as fast as possible towards the end for a time [s], then brakes to rest."""
+        return SpeedProfile(*braking_kernel.on_then_rest(*self._grid, s, speed, time, self._acceleration))
 
-    def onwards(self, s: float, speed: float) -> Speeds:
+    def onwards(self, s: float, speed: float) -> SpeedProfile:
         """The fastest motion to the end."""
         return self.on_then_rest(s, speed, np.inf)
 
     @property
     def end(self) -> float:
-        """A little before the last s."""
+        """A value of s just before the last."""
         return self.line.length - 1e-9
 
     def at(self, s: float) -> Float[ndarray, "dof"]:
@@ -126,13 +124,13 @@ class Course:
         return self.line(np.array([s]), 0)[0]
 
     def remaining(self, s: float) -> Float[ndarray, "n dof"]:
-        """Waypoints from s to the end of what follows."""
-        ahead = self.line.waypoints[self.line.knots > s + APART]
+        """Waypoints from s to the end, of the paths that follow too."""
+        ahead = self.line.waypoints[self.line.knots > s + MIN_LENGTH]
         after = self.then.remaining(0.0)[1:] if self.then is not None else ahead[:0]
         return np.concatenate([self.at(s)[None], ahead, after])
 
-    def rows(self, speeds: Speeds, sample_time: float) -> Trajectory:
-        """The motion; two rows at rest where there is none."""
+    def rows(self, speeds: SpeedProfile, sample_time: float) -> Trajectory:
+        """The trajectory of a motion; two rows at rest if it has no duration."""
         if speeds.duration <= 0:
             q = np.repeat(self.at(float(speeds.s[0]))[None], 2, axis=0)
             return Trajectory(self.robot.joint_names, np.array([0.0, sample_time]), q, 0 * q, 0 * q)

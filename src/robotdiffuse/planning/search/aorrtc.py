@@ -1,7 +1,7 @@
-"""AORRTC: a first path by RRT-Connect, then ever shorter ones by searches below a bound.
+"""AORRTC: a first path by RRT-Connect, then shorter ones by searches below a bound on length.
 
-Each round has fresh trees, which hold no path that is longer than a little above the best one known; what a
-round finds is simplified and tightened, and bounds the next if it is shorter.
+Each round grows new trees with paths little longer than the best one known. The path that a round finds is
+simplified and tightened; if it is the shortest, it bounds the next round.
 """
 
 from dataclasses import dataclass
@@ -9,21 +9,23 @@ from typing import Annotated
 
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS, Planner
+from robotdiffuse.planning.planner import Planner
 from robotdiffuse.planning.search.anytime import AnytimeSearch, SearchSettings, anytime
 from robotdiffuse.planning.start_goal import StartGoal
 
-STEP = 1_000
-"""Iterations between two questions whether more of them pay."""
+IMPROVEMENT_STEP = 1_000
+"""Iterations between two checks whether to search on."""
 
 
 @dataclass(frozen=True)
 class AORRTCSettings(SearchSettings, name="aorrtc"):
     gain: Annotated[float, Bound(least=0.0, below=1.0)] = 0.005
-    """Until "converged", the search ends when its last doubling took off a smaller share of the length ..."""
+    """With until "converged", the search ends when doubling its work shortened the path by less than this part
+    ..."""
     patience: Natural = 8_000
-    """... but not before so many iterations."""
+    """... but not before this many iterations."""
 
 
 class AORRTC(Planner[AORRTCSettings]):
@@ -31,7 +33,7 @@ class AORRTC(Planner[AORRTCSettings]):
 
     name = "aorrtc"
     settings_class = AORRTCSettings
-    keeps = frozenset({CONSTRAINTS, CLEARANCE})
+    supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -43,8 +45,7 @@ class AORRTC(Planner[AORRTCSettings]):
         search = AnytimeSearch(context, start_goal, settings, self.name)
         return anytime(
             context,
-            start_goal,
             search,
-            lambda: search.pays(settings.gain, settings.patience),
-            lambda: search.improve(context.search_until, STEP),
+            lambda: search.improves(settings.gain, settings.patience),
+            lambda: search.improve(context.search_until, IMPROVEMENT_STEP),
         )

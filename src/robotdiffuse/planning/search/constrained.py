@@ -1,7 +1,7 @@
-"""Search under path constraints: RRT-Connect on what they leave, shortened, in the loop of `aorrtc`.
+"""Search under path constraints: RRT-Connect with projected nodes, and simplification, in the anytime loop.
 
-What aorrtc, rrt_connect and robotdiffuse plan with where a problem has constraints. The search keeps a little
-room to the tolerances, which corners and rounding need; the validator proves what comes of it.
+The planners aorrtc, rrt_connect and robotdiffuse use it for problems with constraints. The search keeps a
+little more than the tolerances, which rounding of corners and numbers needs; the validator proves the result.
 """
 
 import numpy as np
@@ -16,24 +16,25 @@ from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.problems.compiled_constraints import PathConstraints
 
 STAGE = "constrained_rrt_connect"
-SLICE = 20
-"""Iterations between two looks at the clock; they take longer than those without constraints."""
-SHARE, AT_ENDS = 0.95, 1e-6
-"""Of the tolerances that the search keeps; where start or goal need more, they and this are kept."""
-SEARCHES = 2
-"""Until "converged": paths found, the shortest of which is the answer."""
+CLOCK_INTERVAL = 20
+"""Iterations between two readings of the clock; they take longer than those without constraints."""
+TOLERANCE_FRACTION, END_MARGIN = 0.95, 1e-6
+"""The search keeps this part of each tolerance; or the value at the start or a goal, plus the margin, if
+larger."""
+PATHS_TO_FIND = 2
+"""With until "converged": number of paths to find; the shortest is returned."""
 SHORTCUTS = 60
-"""Of each path that is found."""
+"""Shortcuts that are tried on each path found."""
 
 
 def plan_constrained(context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> PlanResult:
-    """The answer of a call on a problem with path constraints."""
+    """Plan for a problem with path constraints."""
     search = ConstrainedSearch(context, start_goal, settings)
 
     def improve() -> None:
-        search.improve(context.search_until, SLICE)
+        search.improve(context.search_until, CLOCK_INTERVAL)
 
-    return anytime(context, start_goal, search, lambda: search.found < SEARCHES, improve)
+    return anytime(context, search, lambda: search.found < PATHS_TO_FIND, improve)
 
 
 class ConstrainedSearch(AnytimeSearch):
@@ -41,12 +42,12 @@ class ConstrainedSearch(AnytimeSearch):
 
     def __init__(self, context: PlanningContext, start_goal: StartGoal, settings: SearchSettings) -> None:
         constraints = context.validator.constraints
-        assert constraints is not None  # or other searches would do
+        assert constraints is not None  # else AnytimeSearch would be used
         self.constraints: PathConstraints = constraints
         rows, start = constraints.rows, start_goal.start_lead
-        assert start is not None  # or there would be no ends
-        self.kept = constraints.limits(SHARE)
-        at_ends = constraints.values(np.stack([start, *start_goal.goal_leads])).max(axis=0) + AT_ENDS
+        assert start is not None  # a StartGoal without a start is refused before
+        self.kept = constraints.limits(TOLERANCE_FRACTION)
+        at_ends = constraints.values(np.stack([start, *start_goal.goal_leads])).max(axis=0) + END_MARGIN
         self.kept = np.minimum(np.maximum(self.kept, at_ends), rows.limit)
         super().__init__(context, start_goal, settings, STAGE, bounded=False)
         self.start, self.goals = start, np.stack(start_goal.goal_leads)
@@ -54,15 +55,15 @@ class ConstrainedSearch(AnytimeSearch):
 
     @property
     def shortest(self) -> bool:
-        """Never known: the shortest path under constraints is longer than the straight line."""
+        """Always False: the length of the shortest path under constraints is not known."""
         return False
 
     def keeps_clearance(self, q: Float[ndarray, "n dof"]) -> bool:
-        """Whether the way through configurations keeps clearance and constraints."""
+        """Whether the polyline through configurations keeps the clearance and the constraints."""
         return corner_kept(self.constraints, q) and super().keeps_clearance(q)
 
     def offer(self, path: Float[ndarray, "n dof"], stage: str) -> bool:
-        """Take a path between the ends that keeps the limits, simplified, if it is the shortest so far."""
+        """See `AnytimeSearch`; the path also keeps the constraints."""
         settings = self.settings
         path = constrained_kernel.simplify(self.limits, path, settings.smoothings, SHORTCUTS, self._state)
         length = constrained_kernel.length(path)
@@ -73,27 +74,29 @@ class ConstrainedSearch(AnytimeSearch):
         super().refuse(accepted)
         self._trees = None
 
-    def _enter(self, level: int) -> None:
-        super()._enter(level)
+    def _set_level(self, level: int) -> None:
+        super()._set_level(level)
         self.limits = constrained_kernel.Limits(self.space, self.constraints.rows, self.kept)
 
-    def _straight(self) -> None:
+    def _try_straight_lines(self) -> None:
         for goal in sorted(self.goals, key=lambda goal: float(np.linalg.norm(goal - self.start))):
             path = constrained_kernel.line(self.limits, self.start, goal)
             if len(path) and self.offer(path, self.name):
                 self.found += 1
                 return
 
-    def _slice(self) -> None:
+    def _iterate(self) -> None:
         settings = self.settings
         if (
             self._trees is None
-            or self._trees.sizes.max() >= self._trees.nodes.shape[1] - constrained_kernel.MOST_PIECES
+            or self._trees.sizes.max() >= self._trees.nodes.shape[1] - constrained_kernel.MAX_PIECES
         ):
-            room = settings.iterations + len(self.goals) + 2 * constrained_kernel.MOST_PIECES
-            self._trees = constrained_kernel.make_trees(self.start, self.goals, room)
-        path = constrained_kernel.search(self.limits, self._trees, settings.range, SLICE, self._state)
-        self.work, self._tried = self.work + SLICE, self._tried + SLICE
+            capacity = settings.iterations + len(self.goals) + 2 * constrained_kernel.MAX_PIECES
+            self._trees = constrained_kernel.make_trees(self.start, self.goals, capacity)
+        path = constrained_kernel.search(
+            self.limits, self._trees, settings.range, CLOCK_INTERVAL, self._state
+        )
+        self.work, self._tried = self.work + CLOCK_INTERVAL, self._tried + CLOCK_INTERVAL
         if len(path):
             self.found += 1
             self._trees = None
@@ -101,6 +104,7 @@ class ConstrainedSearch(AnytimeSearch):
 
 
 def corner_kept(constraints: PathConstraints | None, q: Float[ndarray, "n dof"]) -> bool:
-    """Whether the way through configurations, of a rounded corner say, keeps what the search keeps."""
+    """Whether the polyline through configurations, such as a rounded corner, keeps the constraints as closely
+    as the search does."""
     rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
-    return constraints is None or constraints.first(rows, share=SHARE) is None
+    return constraints is None or constraints.first(rows, share=TOLERANCE_FRACTION) is None

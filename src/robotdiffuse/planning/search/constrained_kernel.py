@@ -1,9 +1,9 @@
-"""Compiled search on what path constraints leave: RRT-Connect whose nodes are projected, and simplification.
+"""Compiled RRT-Connect under path constraints, with projected nodes, and simplification.
 
 D. Berenson, S. Srinivasa and J. Kuffner, "Task Space Regions: A framework for pose-constrained
-manipulation planning", IJRR 2011 (CBiRRT2), for trees whose steps are projected. Between nodes nothing is
-sampled and hoped for: a straight piece is taken where the constraints are proved along it, else its middle is
-projected and both halves are looked at.
+manipulation planning", IJRR 2011 (CBiRRT2), for trees with projected steps. Edges are proved, not sampled: a
+straight piece is accepted where the constraints are proved along it; else its middle is projected, and both
+halves are treated alike.
 """
 
 from typing import NamedTuple
@@ -16,42 +16,43 @@ from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import motion_free
 from robotdiffuse.problems.constraint_kernel import evaluate, make_work, project, proved
 
-DEPTH = 9
-"""A motion is split into halves so often at most."""
-LEAST_PIECE = 0.004
-"""Pieces are not shorter [rad]."""
-MOST_PIECES = 512
-ADDED = 0.2
-"""Share of its room that the value of a row may grow by along a straight piece, beyond its ends'."""
-COARSEST = 1 / 16
-"""Share of a piece down to which its proof splits it."""
-DRIFT = 0.85
-"""A projected middle is no further from either end than this share of the piece."""
-CLOSER = 0.95
-"""A step ends at most at this share of the distance that it began at."""
-LONGER = 2.0
-"""A step is at most so many times as long as the straight line that it replaces."""
-PAYS, PATIENCE = 0.99, 20
-"""A shortcut takes off at least one part in a hundred; after so many that did not, there are no more."""
-LEAST_MOVE = 0.005
-"""A corner that smoothing would move less than this stays [rad]."""
-FINE = 0.15
-"""Pieces of a path are made no longer than this before its simplification [rad]."""
+MAX_DEPTH = 9
+"""A motion is halved at most this many times."""
+MIN_PIECE = 0.004
+"""Shortest piece [rad]."""
+MAX_PIECES = 512
+MAX_GROWTH = 0.2
+"""Along a straight piece a row's value may exceed those at its ends by this part of the row's tolerance."""
+MIN_PROOF_PIECE = 1 / 16
+"""The proof of a piece splits it down to this part of its length."""
+MAX_DRIFT = 0.85
+"""A projected middle is no further from either end than this part of the piece's length."""
+MIN_APPROACH = 0.95
+"""A step must bring the distance to its target down to this part or less."""
+MAX_STEP_FACTOR = 2.0
+"""A step is at most this many times as long as the straight line that it replaces."""
+SHORTCUT_GAIN, MAX_FAILED_SHORTCUTS = 0.99, 20
+"""A shortcut counts if it leaves at most this part of the length; after this many in a row that do not, no
+more are tried."""
+MIN_CORNER_MOVE = 0.005
+"""Smoothing leaves corners that it would move by less than this [rad]."""
+MAX_INITIAL_PIECE = 0.15
+"""Pieces of a path are split down to this length before simplification [rad]."""
 
 
 class Limits(NamedTuple):
-    """What a search keeps."""
+    """What every edge of the search keeps."""
 
     space: tuple
     """`collision.kernels.motions.Space`"""
     rows: tuple
     """`problems.constraint_kernel.Rows`"""
     kept: np.ndarray
-    """[m] limits of the rows, with some room to those of the validator."""
+    """[m] limits of the rows, a little within those of the validator."""
 
 
 class Trees(NamedTuple):
-    """Two trees, from the start and from the goals; filled in place, so that a search can go on."""
+    """Two trees, from the start and from the goals; filled in place, so that a search can be continued."""
 
     nodes: np.ndarray
     """[2, capacity, dof]"""
@@ -69,7 +70,7 @@ class Memory(NamedTuple):
     """[m] limits along one piece."""
     stack: np.ndarray
     out: np.ndarray
-    """[MOST_PIECES, dof] the motion that `between` found."""
+    """[MAX_PIECES, dof] the motion that `between` found."""
     here: np.ndarray
     trial: np.ndarray
 
@@ -91,8 +92,8 @@ def _memory(limits):
         np.empty((dof, W), np.float32),
         make_work(limits.rows),
         np.empty(len(limits.kept)),
-        np.empty((DEPTH, dof)),
-        np.empty((MOST_PIECES, dof)),
+        np.empty((MAX_DEPTH, dof)),
+        np.empty((MAX_PIECES, dof)),
         np.empty(dof),
         np.empty(dof),
     )
@@ -117,15 +118,15 @@ def length(path):
 
 @njit(cache=True)
 def _straight(limits, a, b, memory):
-    """Whether the straight piece between two configurations keeps the constraints, adding little to the
-    values of its ends."""
+    """Whether the straight piece between two configurations is proved to keep the constraints, with values
+    little above those at its ends."""
     rows, work = limits.rows, memory.rows
     evaluate(rows, a, 0, work)
     evaluate(rows, b, 1, work)
     for m in range(len(limits.kept)):
-        most = max(work.values[0, m], work.values[1, m]) + ADDED * rows.room[m]
+        most = max(work.values[0, m], work.values[1, m]) + MAX_GROWTH * rows.room[m]
         memory.growing[m] = min(limits.kept[m], most)
-    return proved(rows, memory.growing, a, b, COARSEST, work)[1] < 0
+    return proved(rows, memory.growing, a, b, MIN_PROOF_PIECE, work)[1] < 0
 
 
 @njit(cache=True)
@@ -135,8 +136,11 @@ def _usable(limits, a, b, memory):
 
 @njit(cache=True)
 def between(limits, a, b, most, memory):
-    """A motion from a to b, both of which keep the constraints: straight pieces, whose ends after a are put
-    into memory.out. Returns their number, 0 if there is no such motion here or it is longer than `most`."""
+    """Find a motion from a to b, which keep the constraints, as straight pieces; write their ends to
+    memory.out.
+
+    Returns their number; 0 if none was found, or it is longer than `most` [rad].
+    """
     memory.stack[0] = b
     memory.here[:] = a
     top, count, done = 1, 0, 0.0
@@ -146,7 +150,7 @@ def between(limits, a, b, most, memory):
         if done + gap > most:
             return 0
         if _straight(limits, memory.here, target, memory):
-            if count == MOST_PIECES:
+            if count == MAX_PIECES:
                 return 0
             if not motion_free(limits.space, memory.here, target, memory.block, memory.space):
                 return 0
@@ -154,14 +158,14 @@ def between(limits, a, b, most, memory):
             memory.here[:] = target
             top, count, done = top - 1, count + 1, done + gap
             continue
-        if top == DEPTH or gap < LEAST_PIECE:
+        if top == MAX_DEPTH or gap < MIN_PIECE:
             return 0
         middle = memory.stack[top]
         for j in range(len(middle)):
             middle[j] = 0.5 * (memory.here[j] + target[j])
         if not project(limits.rows, limits.kept, middle, memory.rows):
             return 0
-        if max(_distance(memory.here, middle), _distance(middle, target)) > DRIFT * gap:
+        if max(_distance(memory.here, middle), _distance(middle, target)) > MAX_DRIFT * gap:
             return 0
         top += 1
     return count
@@ -206,14 +210,14 @@ def search(limits, trees, longest, iterations, state):
             if _distance(nodes[other, there], sample) == 0.0:
                 return _joined(nodes, parents, tree, here, there)
             there = _stepped(limits, trees, other, there, sample, longest, memory)
-        if max(sizes[0], sizes[1]) >= capacity - MOST_PIECES:
+        if max(sizes[0], sizes[1]) >= capacity - MAX_PIECES:
             break
     return np.empty((0, dof))
 
 
 @njit(cache=True)
 def _extended(limits, trees, tree, q, longest, memory):
-    """A step from the nearest node towards q; the last node that it adds, -1 for none."""
+    """Step from the nearest node towards q; returns the last node added, -1 for none."""
     best, near = np.inf, 0
     for n in range(trees.sizes[tree]):
         total = 0.0
@@ -226,7 +230,7 @@ def _extended(limits, trees, tree, q, longest, memory):
 
 @njit(cache=True)
 def _stepped(limits, trees, tree, near, q, longest, memory):
-    """A step from a node towards q."""
+    """Step from a node towards q; returns the last node added, -1 for none."""
     origin = trees.nodes[tree, near]
     gap = _distance(origin, q)
     share = min(1.0, longest / max(gap, 1e-12))
@@ -236,11 +240,11 @@ def _stepped(limits, trees, tree, near, q, longest, memory):
     if share < 1.0:
         if not project(limits.rows, limits.kept, end, memory.rows):
             return -1
-        if _distance(end, q) > max(CLOSER * gap, gap - 0.5 * longest):
+        if _distance(end, q) > max(MIN_APPROACH * gap, gap - 0.5 * longest):
             return -1
-    if trees.sizes[tree] + MOST_PIECES > trees.nodes.shape[1]:
+    if trees.sizes[tree] + MAX_PIECES > trees.nodes.shape[1]:
         return -1
-    count = between(limits, origin, end, LONGER * min(gap, longest), memory)
+    count = between(limits, origin, end, MAX_STEP_FACTOR * min(gap, longest), memory)
     parent = near
     for i in range(count):
         here = trees.sizes[tree]
@@ -271,20 +275,20 @@ def _joined(nodes, parents, tree, here, there):
 
 @njit(cache=True, nogil=True)
 def simplify(limits, path, rounds, tries, state):
-    """A path between the same ends that is no longer: `tries` shortcuts between random places, then in each
-    of the rounds corners smoothed, and waypoints left out where a straight piece keeps the constraints."""
+    """A path with the same ends that is no longer: try shortcuts between random places, `tries` of them; then
+    in each of `rounds` rounds smooth the corners and leave out waypoints that a straight piece can skip."""
     memory = _memory(limits)
     points, lost = _finer(path), 0
     for _ in range(tries):
         n = len(points)
-        if n < 3 or lost > PATIENCE:
+        if n < 3 or lost > MAX_FAILED_SHORTCUTS:
             break
         i = min(int(random(state) * (n - 2)), n - 3)
         k = min(i + 2 + int(random(state) * (n - i - 2)), n - 1)
         before = length(points[i : k + 1])
         if before <= _distance(points[i], points[k]) * 1.0001:
             continue
-        count = between(limits, points[i], points[k], PAYS * before, memory)
+        count = between(limits, points[i], points[k], SHORTCUT_GAIN * before, memory)
         lost += 1
         if count > 0:
             found = np.concatenate((points[i : i + 1], memory.out[:count]))
@@ -298,13 +302,13 @@ def simplify(limits, path, rounds, tries, state):
 
 @njit(cache=True)
 def _finer(path):
-    """The path with its pieces split until they are no longer than FINE."""
+    """The path with its pieces split until they are no longer than MAX_INITIAL_PIECE."""
     total = 1
     for i in range(len(path) - 1):
-        total += max(1, int(np.ceil(_distance(path[i], path[i + 1]) / FINE)))
+        total += max(1, int(np.ceil(_distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
     out, n = np.empty((total, path.shape[1])), 0
     for i in range(len(path) - 1):
-        parts = max(1, int(np.ceil(_distance(path[i], path[i + 1]) / FINE)))
+        parts = max(1, int(np.ceil(_distance(path[i], path[i + 1]) / MAX_INITIAL_PIECE)))
         for part in range(parts):
             out[n] = path[i] + part / parts * (path[i + 1] - path[i])
             n += 1
@@ -314,7 +318,7 @@ def _finer(path):
 
 @njit(cache=True)
 def _skipped(limits, path, memory):
-    """The path less waypoints that straight pieces can skip, in growing steps."""
+    """The path without waypoints that straight pieces can skip, in growing steps."""
     out, n, i = np.empty(path.shape), 0, 0
     while True:
         out[n] = path[i]
@@ -329,7 +333,7 @@ def _skipped(limits, path, memory):
 
 @njit(cache=True)
 def _smoothed(limits, path, memory):
-    """The path with the middles of its pieces as waypoints, and its corners drawn towards them."""
+    """The path with the middles of its pieces as waypoints, and its corners moved towards them."""
     finer, dof = np.empty((2 * len(path) - 1, path.shape[1])), path.shape[1]
     for i in range(len(path)):
         finer[2 * i] = path[i]
@@ -339,7 +343,7 @@ def _smoothed(limits, path, memory):
     for i in range(2, len(finer) - 1, 2):
         for j in range(dof):
             trial[j] = 0.5 * finer[i, j] + 0.25 * (finer[i - 1, j] + finer[i + 1, j])
-        if _distance(trial, finer[i]) < LEAST_MOVE:
+        if _distance(trial, finer[i]) < MIN_CORNER_MOVE:
             continue
         if (
             project(limits.rows, limits.kept, trial, memory.rows)

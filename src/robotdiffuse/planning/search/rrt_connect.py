@@ -1,22 +1,22 @@
-"""RRT-Connect with simplification: the fast classical planner, and with restarts the control of the
-others."""
+"""RRT-Connect with simplification: a fast classical planner; with restarts, the control for the others."""
 
 from dataclasses import dataclass
 
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, NotNegative
+from robotdiffuse.planning import CLEARANCE, PATH_CONSTRAINTS
 from robotdiffuse.planning.context import PlanningContext
-from robotdiffuse.planning.planner import CLEARANCE, CONSTRAINTS, Planner
-from robotdiffuse.planning.search.anytime import SLICE, AnytimeSearch, SearchSettings, anytime
+from robotdiffuse.planning.planner import Planner
+from robotdiffuse.planning.search.anytime import CLOCK_INTERVAL, AnytimeSearch, SearchSettings, anytime
 from robotdiffuse.planning.start_goal import StartGoal
 
 
 @dataclass(frozen=True)
 class RRTConnectSettings(SearchSettings, name="rrt_connect"):
     searches: Count = 2
-    """Until "converged": paths found, the shortest of which is the answer."""
+    """With until "converged": number of paths to find; the shortest is returned."""
     optimize_time: NotNegative = 0.0
-    """... and time spent on restarts after the first path [s]."""
+    """With until "short": time for restarts after the first path [s]."""
 
 
 class RRTConnect(Planner[RRTConnectSettings]):
@@ -25,7 +25,7 @@ class RRTConnect(Planner[RRTConnectSettings]):
 
     name = "rrt_connect"
     settings_class = RRTConnectSettings
-    keeps = frozenset({CONSTRAINTS, CLEARANCE})
+    supports = frozenset({PATH_CONSTRAINTS, CLEARANCE})
 
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
@@ -36,9 +36,11 @@ class RRTConnect(Planner[RRTConnectSettings]):
             return plan_constrained(context, start_goal, settings)
         search = AnytimeSearch(context, start_goal, settings, self.name, bounded=False)
 
-        def pays() -> bool:
+        def improves() -> bool:
             return (
                 search.found < settings.searches or context.elapsed < search.first_at + settings.optimize_time
             )
 
-        return anytime(context, start_goal, search, pays, lambda: search.improve(context.search_until, SLICE))
+        return anytime(
+            context, search, improves, lambda: search.improve(context.search_until, CLOCK_INTERVAL)
+        )

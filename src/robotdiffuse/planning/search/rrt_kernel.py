@@ -1,4 +1,4 @@
-"""Compiled RRT-Connect, and AORRTC: the same with trees that know their costs and keep below a bound.
+"""Compiled RRT-Connect and AORRTC, which adds costs to the trees and a bound on the length of paths.
 
 J. Kuffner and S. LaValle, "RRT-Connect: An efficient approach to single-query path planning", ICRA 2000;
 balanced trees as in J. Kuffner and S. LaValle, "An efficient approach to path planning using balanced
@@ -20,18 +20,19 @@ from robotdiffuse.collision.kernels.simd import W, lane, load
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _TAU = np.float32(6.283185307179586)
 _NOWHERE = np.float32(1e15)
-"""A coordinate that no node has, and whose square is a number [rad]."""
+"""A coordinate far from all nodes, with a finite square [rad]."""
 
 
 class Trees(NamedTuple):
-    """Two trees, from the start and from the goals; filled in place, so that a search can go on."""
+    """Two trees, from the start and from the goals; filled in place, so that a search can be continued."""
 
     nodes: np.ndarray
     """[2, capacity, dof]"""
     columns: np.ndarray
-    """[2 * dof, capacity in full lanes] the same by joint, to search through; nowhere beyond the last."""
+    """[2 * dof, capacity in full lanes] the nodes by joint, for the nearest-node search; _NOWHERE beyond the
+    last."""
     costs: np.ndarray
-    """[2, capacity in full lanes] lengths of the ways from the roots [rad]; theirs is 0, they come first."""
+    """[2, capacity in full lanes] path lengths from the roots [rad]; roots come first and have 0."""
     parents: np.ndarray
     """[2, capacity] -1 for roots."""
     sizes: np.ndarray
@@ -59,22 +60,24 @@ def make_trees(start, goals, capacity):
 def search(space, trees, goals, bound, longest, iterations, state):
     """Grow the trees for a number of iterations, or until they hold a path shorter than `bound` [rad].
 
-    `longest` bounds extensions [rad]; `bound` may be infinite, the search is RRT-Connect then. Returns the
-    waypoints [n, dof] from the start to a goal, with n = 0 if none was found yet. Stops early when a tree is
-    full.
+    longest: largest extension [rad].
+    bound: infinite for RRT-Connect.
+
+    Returns the waypoints [n, dof] from the start to a goal; n = 0 if none was found yet. Stops early when a
+    tree is full.
     """
     nodes, costs, parents, sizes = trees.nodes, trees.costs, trees.parents, trees.sizes
     dof, bounded = nodes.shape[2], bound < np.float32(np.inf)
     work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
     sample, new = np.empty(dof, np.float32), np.empty(dof, np.float32)
-    shares = _shares(nodes[0, 0], goals, bound) if bounded else np.empty(0, np.float32)
+    shares = goal_shares(nodes[0, 0], goals, bound) if bounded else np.empty(0, np.float32)
     for _ in range(iterations):
         tree = 0 if sizes[0] <= sizes[1] else 1
         other = 1 - tree
         if sizes[tree] >= nodes.shape[1] or sizes[other] >= nodes.shape[1]:
             break
         if bounded:
-            _sample_within(space, nodes[0, 0], goals, shares, bound, sample, state)
+            sample_within(space, nodes[0, 0], goals, shares, bound, sample, state)
         else:
             _sample_box(space, sample, state)
         roots, other_roots = (len(goals), 1) if tree else (1, len(goals))
@@ -134,7 +137,7 @@ def _add(trees, tree, q, cost, parent):
 
 @allocation_free(fastmath=True)
 def _to_roots(nodes, tree, roots, q):
-    """Distance to the nearest root: no way to it is shorter [rad]."""
+    """Distance to the nearest root, a lower bound of the cost of q [rad]."""
     least = np.float32(1e9)
     for r in range(roots):
         least = min(least, distance(nodes[tree, r], q))
@@ -143,10 +146,10 @@ def _to_roots(nodes, tree, roots, q):
 
 @allocation_free()
 def _nearest(trees, tree, q, allowed):
-    """The nearest node by position and cost of those that reach q at a cost of at most `allowed`.
+    """The nearest node, by position and cost, of those that reach q at a cost of at most `allowed`.
 
-    The cost of q itself is thought to be `allowed`. Without a bound the nearest by position; where no node is
-    near enough, the nearest root.
+    The cost of q is taken to be `allowed`. Without a bound, the nearest node by position; if no node reaches
+    q, the nearest root.
     """
     bounded = allowed < np.float32(np.inf)
     best, where = np.float32(np.inf), -1
@@ -189,8 +192,8 @@ def _squared(trees, tree, part, q):
 
 @njit(cache=True)
 def _cheaper(space, trees, tree, roots, near, cost, new, block, work, state):
-    """A parent that reaches `new` more cheaply, and that cost: cheaper ones are drawn until one is not
-    free."""
+    """A parent that reaches `new` at a lower cost, and that cost: draws cheaper ones until an edge
+    collides."""
     least = _to_roots(trees.nodes, tree, roots, new)
     while cost > least:
         allowed = least + random(state) * (cost - least)
@@ -211,8 +214,8 @@ def _sample_box(space, q, state):
 
 
 @njit(cache=True)
-def _shares(start, goals, bound):
-    """Cumulative shares of the samples that go to the goals, by the volumes of their spheroids."""
+def goal_shares(start, goals, bound):
+    """Cumulative shares of the samples for each goal, by the volumes of their hyperspheroids."""
     shares, total = np.empty(len(goals), np.float32), _ZERO
     for g in range(len(goals)):
         straight = distance(start, goals[g])
@@ -224,9 +227,9 @@ def _shares(start, goals, bound):
 
 
 @njit(cache=True)
-def _sample_within(space, start, goals, shares, bound, q, state):
-    """Uniform in the prolate hyperspheroid of the ways between start and a goal shorter than `bound`, clamped
-    to the limits; the goal is drawn by `shares`."""
+def sample_within(space, start, goals, shares, bound, q, state):
+    """Sample q uniformly in the prolate hyperspheroid of paths from the start to a goal shorter than `bound`,
+    clamped to the limits; the goal is drawn by `shares`."""
     dof, u, g = len(q), random(state), 0
     while g < len(goals) - 1 and u > shares[g]:
         g += 1
@@ -239,7 +242,7 @@ def _sample_within(space, start, goals, shares, bound, q, state):
     scale = random(state) ** (_ONE / np.float32(dof)) / np.sqrt(max(norm, np.float32(1e-12)))
     for j in range(dof):
         q[j] *= scale * (_HALF * bound if j == 0 else across)
-    # the reflection that takes the first axis to the direction of the goal
+    # Householder reflection of the first axis onto the direction of the goal
     along, total = _ZERO, _ZERO
     for j in range(dof):
         v = (_ONE if j == 0 else _ZERO) - (goals[g, j] - start[j]) / max(straight, np.float32(1e-9))

@@ -1,10 +1,10 @@
-"""The lattice that searches walk on, compiled: nodes, edges, which of them are free, and what is left to go.
+"""The lattice, compiled: nodes, edges, collision checks of both, and heuristics.
 
-Costs are whole numbers, UNITS to a step of the lattice: edges are rounded up and heuristics down, so sums are
-exact, heuristics are consistent to the last bit, and both searches find the same cost.
+Costs are integers, UNITS to a step of the lattice. Edges are rounded up and heuristics down, so sums are
+exact, heuristics are exactly consistent, and both searches find the same cost.
 
-An edge is free if both of its nodes are and the motion from the first to the second, in the order of the
-moves, is: so it is the same edge from either side.
+An edge is free if both of its nodes are, and the motion from the first to the second in the order of the
+moves; so the check is the same from either side.
 
 `space` is a `collision.kernels.motions.Space`.
 """
@@ -22,11 +22,11 @@ from robotdiffuse.planning.baselines.lattice.table import BLOCKED, FREE, NO_ROOM
 UNITS = 1 << 20
 """Cost of one step of one joint."""
 ROUNDING = 1e-3
-"""What floating point may be wrong by [units]; far more than it is."""
+"""Bound on rounding errors of floating point [units]."""
 
 
 class Lattice(NamedTuple):
-    """Where the nodes are and what joins them. Coordinates count steps from the lowest node of each joint."""
+    """The geometry of the lattice. Coordinates count steps from the lowest node of each joint."""
 
     origin: np.ndarray
     """[dof] the lowest node [rad]"""
@@ -41,25 +41,25 @@ class Lattice(NamedTuple):
     costs: np.ndarray
     """[moves] [units]"""
     slope: float
-    """Least cost of a move for each joint that it moves [steps]."""
+    """Smallest cost of a move per joint that it moves [steps]."""
     goals: np.ndarray
     """[k, dof] [rad]"""
     goals_at: np.ndarray
-    """[k, dof] their coordinates, not whole."""
+    """[k, dof] coordinates of the goals, not integers."""
     cells: np.ndarray
-    """[k, dof] coordinates of the lowest corner of the cell that each is in."""
+    """[k, dof] coordinates of the lowest corner of each goal's cell."""
 
 
 class Scratch(NamedTuple):
-    """Memory of one thread."""
+    """Working memory of one thread."""
 
     at: np.ndarray
     other: np.ndarray
     """[dof] coordinates"""
     near: np.ndarray
-    """[moves] the nodes beside a node, -1 for none."""
+    """[moves] the neighbours of a node, -1 for none."""
     pending: np.ndarray
-    """[16] nodes to be checked."""
+    """[16] nodes to check."""
     a: np.ndarray
     b: np.ndarray
     block: np.ndarray
@@ -107,7 +107,7 @@ def key_beside(lattice, key, at, m):
 
 @allocation_free(inline="always")
 def check_nodes(space, lattice, table, count, scratch):
-    """Finds the states of the first nodes in `pending`, up to 16 at once."""
+    """Check the first `count` nodes in `pending`, up to 16, and set their states."""
     for i in range(W):
         coordinates(lattice, table.keys[scratch.pending[min(i, count - 1)]], scratch.other)
         _configuration(lattice, scratch.other, scratch.a)
@@ -120,8 +120,10 @@ def check_nodes(space, lattice, table, count, scratch):
 
 @allocation_free(inline="always")
 def look_around(space, lattice, table, node, scratch):
-    """Writes the nodes beside a node to `near`, and its coordinates to `at`; new ones are added and checked.
-    False if there is no room for them."""
+    """Write the neighbours of a node to `near`, and its coordinates to `at`; add and check new neighbours.
+
+    Returns False if memory is full.
+    """
     key, waiting = table.keys[node], 0
     coordinates(lattice, key, scratch.at)
     for m in range(len(lattice.moves)):
@@ -166,7 +168,7 @@ def last_free(space, lattice, at, goal, scratch):
 
 @allocation_free()
 def corner_of_cell(lattice, goal, at):
-    """Which corner of the goal's cell the coordinates are, as bits; -1 if none."""
+    """The corner of the goal's cell at these coordinates, as bits; -1 if there is none."""
     corner = 0
     for j in range(len(at)):
         d = at[j] - lattice.cells[goal, j]
@@ -178,8 +180,10 @@ def corner_of_cell(lattice, goal, at):
 
 @allocation_free()
 def corner_node(lattice, table, number, at):
-    """The node at a corner of a goal's cell, by goal and corner, and its coordinates; -1 beyond the joint
-    limits."""
+    """The node at a corner of a goal's cell, `number` = goal and corner bits; writes its coordinates to `at`.
+
+    -1 beyond the joint limits, NO_ROOM if memory is full.
+    """
     dof, key = len(at), np.int64(0)
     goal, corner = number >> dof, number & ((1 << dof) - 1)
     for j in range(dof):
@@ -202,11 +206,11 @@ def last_cost(lattice, goal, at):
 
 @allocation_free()
 def least_to_goal(lattice, at):
-    """A lower bound of the cost to the nearest goal, consistent.
+    """A consistent lower bound of the cost to the nearest goal.
 
-    The larger of the straight distance and of what the moves cost by joint: no move is cheaper than `slope`
-    for each joint that it moves, and the last edge, from a corner of the goal's cell, is at least as long as
-    its projection on the diagonal.
+    The larger of the straight distance and the cost by joint: a move costs at least `slope` for each joint
+    that it moves, and the last edge, from a corner of the goal's cell, is at least as long as its projection
+    on the diagonal.
     """
     best = np.inf
     dof = len(at)

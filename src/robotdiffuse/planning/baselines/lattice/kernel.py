@@ -1,4 +1,4 @@
-"""Compiled A* and D* Lite on a lattice of configurations that is never written down.
+"""Compiled A* and D* Lite on a lattice of configurations, whose nodes are created as they are reached.
 
 A*: P. Hart, N. Nilsson and B. Raphael, "A formal basis for the heuristic determination of minimum cost
 paths", IEEE Trans. SSC 1968. D* Lite: S. Koenig and M. Likhachev, "D* Lite", AAAI 2002, optimized version.
@@ -45,12 +45,12 @@ from robotdiffuse.planning.baselines.lattice.table import (
 )
 
 GOING, FOUND, EXHAUSTED, FULL = 0, 1, 2, 3
-"""How a slice of a search ends: there is more to do, a path is known, there is none, no room for nodes."""
+"""How a call of a search ends: to be continued, with a path, without one, with memory full."""
 
 
 @njit(cache=True, nogil=True)
 def begin_a_star(lattice, table, start_key, inflation):
-    """Queues the start; it must be free."""
+    """Queue the start, which must be free."""
     at = np.empty(len(lattice.counts), np.int64)
     start = find_or_add(table, start_key)
     coordinates(lattice, start_key, at)
@@ -60,8 +60,9 @@ def begin_a_star(lattice, table, start_key, inflation):
 
 @njit(cache=True, nogil=True)
 def a_star(space, lattice, table, inflation, expansions):
-    """Weighted A* for up to so many expansions. Nodes are expanded once, which keeps the cost within
-    `inflation` of the least, as the heuristic is consistent (M. Likhachev et al., "ARA*", NIPS 2003)."""
+    """Weighted A* for up to `expansions` expansions. Each node is expanded once; as the heuristic is
+    consistent, the cost is still within the factor `inflation` of the least (M. Likhachev et al., "ARA*",
+    NIPS 2003)."""
     scratch = make_scratch(space, lattice)
     half = len(lattice.moves) // 2
     for _ in range(expansions):
@@ -92,14 +93,14 @@ def a_star(space, lattice, table, inflation, expansions):
                 continue
             table.g[v], table.parent[v] = cost, u
             coordinates(lattice, table.keys[v], scratch.other)
-            # of equally promising nodes, the one that is farthest on its way
+            # ties go to the node with the larger cost from the start
             put(table, v, cost + np.int64(inflation * least_to_goal(lattice, scratch.other)), -cost)
     return GOING
 
 
 @allocation_free(inline="always")
 def _edge_free(space, lattice, table, v, w, m, scratch):
-    """Whether the edge by move m from v to w is free; it is checked once."""
+    """Whether the edge by move m from v to w is free; checked once and remembered."""
     if table.state[v] != FREE or table.state[w] != FREE:
         return False
     half = len(lattice.moves) // 2
@@ -124,11 +125,11 @@ def _queue_if_inconsistent(lattice, table, node, start_at, offset, scratch):
 
 @allocation_free()
 def _cost_by_neighbours(space, lattice, table, last, node, scratch):
-    """rhs anew: the least over all free edges, which are checked as far as they matter."""
+    """rhs of a node: the smallest cost over its free edges; edges that cannot lower it are not checked."""
     if table.state[node] != FREE:
         return np.int64(INFINITE)
     key, best = table.keys[node], np.int64(INFINITE)
-    # not `at`: that belongs to the node that is being expanded
+    # not `at`, which holds the coordinates of the node being expanded
     at = scratch.other
     coordinates(lattice, key, at)
     for goal in range(len(lattice.goals)):
@@ -148,12 +149,14 @@ def _cost_by_neighbours(space, lattice, table, last, node, scratch):
 
 @njit(cache=True, nogil=True)
 def update(space, lattice, table, last, start, offset, near, reaches):
-    """Finds anew what changed shapes may have changed, and then rhs.
+    """Check again the nodes and edges that changed shapes may affect, and update rhs.
 
-    near[capacity] is how far from them the arm is at each node, reaches[moves / 2] how far any point of it
-    gets by half of each move [m]: a motion stays as it was if both of its ends are farther away than that.
-    Edges to the goals, last[k, 2 ^ dof], are all checked. False if there is no room for the corners of the
-    goals' cells.
+    near[capacity]: distance of the arm from the changed shapes at each node [m]. reaches[moves / 2]: how far
+    any point of the arm moves by half of each move [m]; an edge is unchanged if both of its nodes are farther
+    away than that.
+
+    Edges to the goals, last[k, 2 ^ dof], are all checked. Returns False if memory is too small for the
+    corners of the goals' cells.
     """
     scratch = make_scratch(space, lattice)
     at, dof, half = scratch.at, len(lattice.counts), len(lattice.moves) // 2
@@ -181,7 +184,7 @@ def update(space, lattice, table, last, start, offset, near, reaches):
         if table.state[node] != was[node]:
             changed[node] = True
             if table.state[node] == BLOCKED:
-                # no path can lead through it: consistent as it is, and its neighbours are changed below
+                # no path leads through it: it is consistent, and its neighbours are updated below
                 table.g[node], table.rhs[node] = INFINITE, INFINITE
                 take(table, node)
         for m in range(half):
@@ -215,8 +218,8 @@ def update(space, lattice, table, last, start, offset, near, reaches):
 
 @njit(cache=True, nogil=True)
 def d_star_lite(space, lattice, table, last, start, offset, expansions):
-    """ComputeShortestPath of the paper, for up to so many expansions. Edges that could not make a node
-    cheaper are left unchecked."""
+    """ComputeShortestPath of the paper, for up to `expansions` expansions. Edges that cannot lower a node's
+    cost are not checked."""
     scratch, start_at = make_scratch(space, lattice), np.empty(len(lattice.counts), np.int64)
     coordinates(lattice, table.keys[start], start_at)
     g, rhs = table.g, table.rhs
@@ -261,8 +264,8 @@ def d_star_lite(space, lattice, table, last, start, offset, expansions):
 
 @njit(cache=True)
 def path_from(lattice, table, last, start):
-    """After D* Lite found a path: the keys of its nodes; the goal that it ends at goes to `count`. What makes
-    rhs of a node is known to be free, so nothing is checked."""
+    """The keys of the nodes of the path that D* Lite found; writes its goal to `table.count`. Edges that
+    determine rhs are known to be free, so nothing is checked."""
     at, node, half = np.empty(len(lattice.counts), np.int64), start, len(lattice.moves) // 2
     keys = [table.keys[start]]
     while True:

@@ -3,19 +3,18 @@
 A*: P. Hart, N. Nilsson and B. Raphael, "A formal basis for the heuristic determination of minimum cost
 paths", IEEE Trans. SSC 1968. D* Lite: S. Koenig and M. Likhachev, "D* Lite", AAAI 2002, optimized version.
 
-The lattice: nodes lie whole numbers of steps of `spacing` from the start in each planned joint, edges change
-one joint by a step (or several, `joints_per_move`), cost is joint-space length [rad], and the corners of the
-cell that a goal lies in are joined to it by exact last edges. Nodes and edges come into being, and are
-checked, when a search gets to them. What is found is the path along the lattice, with no shortcuts.
+The lattice. In each planned joint, nodes lie whole steps of `spacing` from the start. Edges change one joint
+by a step (or up to `joints_per_move` joints); their cost is joint-space length [rad]. The corners of the cell
+around a goal are connected to it by exact last edges. Nodes and edges are created and checked when a search
+reaches them. The result is the path along the lattice, without shortcuts.
 
-Where this fails, with seven joints. A node has 14 neighbours, 2,186 if all joints may move at once, and a
-spacing of 0.3 rad makes 10^9 nodes. The heuristic knows nothing of obstacles: before the search turns away
-from one, it fills the whole pocket in front of it, whose size grows with the seventh power of its width.
-With inflation 1 it must also expand every node whose straight-line estimate is below the cost, and all
-orders in which the joints can make the same steps are ties. So optimal search ends in good time only where
-the way is nearly straight; inflation buys speed with length. Passages narrower than a step are not seen at
-all: no path on the lattice does not mean no path. And a path of single-joint steps is a staircase, up to
-sqrt(dof) times as long as the straight line that it stands for.
+Limits, with seven joints. A node has 14 neighbours, or 2,186 if all joints may move at once, and a spacing of
+0.3 rad makes 10^9 nodes. The heuristic ignores obstacles: before the search leaves one, it fills the whole
+pocket in front of it, whose size grows with the seventh power of its width. With inflation 1 it also expands
+every node whose straight-line estimate is below the cost, and all orders of the same steps are ties. So
+optimal search is fast only where the path is nearly straight; inflation trades length for speed. Passages
+narrower than a step are not found: no path on the lattice does not mean no path. A path of single-joint steps
+is a staircase, up to sqrt(dof) times as long as the straight line that it follows.
 """
 
 from collections.abc import Callable
@@ -36,8 +35,7 @@ from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
 from robotdiffuse.core.types import Status
 from robotdiffuse.planning.baselines.lattice import graph as lattice_graph
-from robotdiffuse.planning.baselines.lattice import kernel
-from robotdiffuse.planning.baselines.lattice import table as table
+from robotdiffuse.planning.baselines.lattice import kernel, table
 from robotdiffuse.planning.baselines.lattice.graph import UNITS, Lattice
 from robotdiffuse.planning.context import PlanningContext
 from robotdiffuse.planning.planner import Planner, ever_finer
@@ -45,16 +43,16 @@ from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-SLICE = 4000
-"""Edges that are met between two looks at the clock, about: some take 10 microseconds."""
-MOST_MOVES = 100_000
-"""Edges that a node may have."""
-MOST_KEYS = 2**62
-"""Nodes that can be told apart."""
+CLOCK_INTERVAL = 4000
+"""Approximate number of edges between two readings of the clock; some take 10 microseconds."""
+MAX_MOVES = 100_000
+"""Largest number of edges of a node."""
+MAX_NODE_KEYS = 2**62
+"""Largest number of nodes of a lattice."""
 ROUNDING = 1e-4
-"""What single precision may be wrong by [m]; far more than it is."""
-INSIDE = 1e-9
-"""The lattice keeps this much away from the joint limits [steps]."""
+"""Bound on rounding errors of single precision [m]."""
+LIMIT_MARGIN = 1e-9
+"""Distance of the lattice from the joint limits [steps]."""
 
 
 @dataclass(frozen=True)
@@ -62,12 +60,12 @@ class LatticeSettings(Settings):
     spacing: Positive = 0.4
     """Step of the lattice [rad], [m] for prismatic joints."""
     joints_per_move: Count = 1
-    """Most joints that an edge moves, each by one step."""
+    """Largest number of joints that an edge moves, each by one step."""
     max_nodes: Annotated[int, Bound(least=1.0, below=2.0**31 - 1)] = 2_000_000
-    """Most nodes that are kept; some 60 to 80 bytes each, and more with `joints_per_move`."""
+    """Largest number of nodes in memory; each takes 60 to 80 bytes, more with `joints_per_move`."""
     resolution: Positive = 0.05
-    """No point of the arm moves further than this between two checks of an edge [m]; a path that the validator
-    refuses is searched again at half the distance."""
+    """No point of the arm moves further than this between two checks of an edge [m]; after a path that the
+    validator refuses, the search starts again at half the distance."""
     clearance: NotNegative = 0.002
     """Distance to obstacles that paths keep where start and goal allow it [m]."""
 
@@ -75,8 +73,9 @@ class LatticeSettings(Settings):
 @dataclass(frozen=True)
 class AStarSettings(LatticeSettings, name="a_star"):
     joints_per_move: Count = 2
-    """See LatticeSettings. More make paths shorter (2.1, 1.6, 1.35 and 1.2 times the straight line with 1, 2,
-    3 and 7 on ROP problems) and the search slower: an expansion checks up to 14, 98, 378 and 2,186 edges."""
+    """See LatticeSettings. Higher values make paths shorter (2.1, 1.6, 1.35 and 1.2 times the straight line
+    with 1, 2, 3 and 7 on ROP problems) and the search slower: an expansion checks up to 14, 98, 378 and 2,186
+    edges."""
     inflation: Annotated[float, Bound(least=1.0, most=1000.0)] = 1.5
     """Factor on the heuristic (weighted A*): paths are at most this much longer than the shortest of the
     lattice; 1 finds the shortest, with seven joints often not in time."""
@@ -87,19 +86,19 @@ class DStarLiteSettings(LatticeSettings, name="d_star_lite"):
     """No inflation: repairs are right only with a consistent heuristic."""
 
 
-Own = TypeVar("Own", bound=LatticeSettings)
+LatticePlannerSettings = TypeVar("LatticePlannerSettings", bound=LatticeSettings)
 
 
 class Outcome(Enum):
-    """How far a search is."""
+    """State of a search."""
 
     GOING = kernel.GOING
-    """It was stopped, and can go on."""
+    """Stopped; it can be continued."""
     FOUND = kernel.FOUND
     EXHAUSTED = kernel.EXHAUSTED
     """No path on the lattice."""
     FULL = kernel.FULL
-    """`max_nodes` are in use."""
+    """`max_nodes` nodes are in use."""
 
 
 class _Graph(NamedTuple):
@@ -120,25 +119,25 @@ def _make_graph(
 ) -> _Graph:
     spacing, lower, upper = settings.spacing, robot.lower.astype(float), robot.upper.astype(float)
     start = start.astype(np.float64)
-    below = np.maximum(np.floor((start - lower) / spacing - INSIDE), 0).astype(np.int64)
-    above = np.maximum(np.floor((upper - start) / spacing - INSIDE), 0).astype(np.int64)
+    below = np.maximum(np.floor((start - lower) / spacing - LIMIT_MARGIN), 0).astype(np.int64)
+    above = np.maximum(np.floor((upper - start) / spacing - LIMIT_MARGIN), 0).astype(np.int64)
     counts = below + above + 1
-    if (total := np.prod(counts.astype(float))) >= MOST_KEYS:
+    if (total := np.prod(counts.astype(float))) >= MAX_NODE_KEYS:
         raise InputError(
             f"{settings.settings_name}.spacing is {spacing:g}; on {robot.name} that makes {total:.0e} nodes, "
-            f"which must be below {MOST_KEYS:.0e}: a spacing of "
-            f"{spacing * (total / MOST_KEYS) ** (1 / robot.dof) * 1.1:.2g} does it"
+            f"which must be below {MAX_NODE_KEYS:.0e}: a spacing of "
+            f"{spacing * (total / MAX_NODE_KEYS) ** (1 / robot.dof) * 1.1:.2g} does it"
         )
     edges = [comb(robot.dof, k) * 2**k for k in range(1, robot.dof + 1)]
-    if sum(edges[: settings.joints_per_move]) > MOST_MOVES:
-        most = int(np.searchsorted(np.cumsum(edges), MOST_MOVES, side="right"))
+    if sum(edges[: settings.joints_per_move]) > MAX_MOVES:
+        most = int(np.searchsorted(np.cumsum(edges), MAX_MOVES, side="right"))
         raise InputError(
             f"{settings.settings_name}.joints_per_move is {settings.joints_per_move}; on {robot.name} that "
             f"makes {sum(edges[: settings.joints_per_move])} edges of a node; it must be at most {most}"
         )
     strides = np.concatenate([[1], np.cumprod(counts[:-1])]).astype(np.int64)
     origin = start - spacing * below
-    half = _moves(robot.dof, settings.joints_per_move)
+    half = lattice_moves(robot.dof, settings.joints_per_move)
     moves = np.concatenate([half, -half])
     goals_at = (goals.astype(np.float64) - origin) / spacing
     lattice = Lattice(
@@ -156,8 +155,9 @@ def _make_graph(
     return _Graph(lattice, lower, upper, int(below @ strides))
 
 
-def _moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
-    """One of each pair of opposite moves: the first joint that moves, moves up. Few joints first."""
+def lattice_moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
+    """One of each pair of opposite moves, that in which the first moving joint moves up; those of few joints
+    first."""
     if joints == 1:
         return np.eye(dof, dtype=np.int64)
     moves = []
@@ -171,7 +171,7 @@ def _moves(dof: int, joints: int) -> Int[ndarray, "moves dof"]:
 
 
 class _Search:
-    """What both searches share: the graph, the table of nodes, and the path along it."""
+    """Base of both searches: the graph, the table of nodes, and the path along it."""
 
     def __init__(
         self,
@@ -185,13 +185,13 @@ class _Search:
         self.checker, self.settings, self.padding = checker, settings, padding
         self.goals = goals
         self._graph = _make_graph(checker.robot, start, goals, settings)
-        self._expansions = max(SLICE // len(self._graph.lattice.moves), 1)
+        self._expansions = max(CLOCK_INTERVAL // len(self._graph.lattice.moves), 1)
         self._table = table.make_table(self._graph.lattice, settings.max_nodes, incremental)
         self._space = search_space(checker, settings.resolution, padding)
 
     @property
     def expansions(self) -> int:
-        """Nodes expanded so far; one that is expanded again counts again."""
+        """Number of expansions so far; a node may be expanded several times."""
         return int(self._table.count[table.EXPANSIONS])
 
     @property
@@ -203,7 +203,7 @@ class _Search:
         return float("inf") if units >= table.INFINITE else units * self.settings.spacing / UNITS
 
     def _waypoints(self, keys: Int[ndarray, "n"]) -> Float[ndarray, "m dof"]:
-        """The nodes at which the path turns, and the goal."""
+        """The start, the nodes at which the path turns, and the goal."""
         lattice = self._graph.lattice
         at = keys[:, None] // lattice.strides % lattice.counts
         turns = np.ones(len(keys), np.bool_)
@@ -213,7 +213,7 @@ class _Search:
 
 
 class AStarSearch(_Search):
-    """One search from the start. `start` and at least one of the goals should be free of collision."""
+    """A* from the start. `start` and at least one of the goals should be free of collision."""
 
     def __init__(
         self,
@@ -223,13 +223,13 @@ class AStarSearch(_Search):
         settings: AStarSettings,
         padding: float = 0.0,
     ) -> None:
-        """`padding` [m] is a distance to obstacles that is kept."""
+        """`padding` is the distance to obstacles that paths keep [m]."""
         super().__init__(checker, start, goals, settings, padding, incremental=False)
         self._inflation = float(settings.inflation)
         kernel.begin_a_star(self._graph.lattice, self._table, self._graph.start_key, self._inflation)
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
-        """Search on until there is a path, none, no more room, or `stop` says so."""
+        """Search until there is a path, there is none, memory is full, or `stop` returns True."""
         while True:
             code = kernel.a_star(
                 self._space, self._graph.lattice, self._table, self._inflation, self._expansions
@@ -255,7 +255,7 @@ class AStarSearch(_Search):
 
 
 class DStarLiteSearch(_Search):
-    """A search from the goals that can be repaired when obstacles move and when the arm does."""
+    """D* Lite from the goals, which can be repaired when obstacles or the arm have moved."""
 
     def __init__(
         self,
@@ -265,18 +265,19 @@ class DStarLiteSearch(_Search):
         settings: DStarLiteSettings,
         padding: float = 0.0,
     ) -> None:
-        """`padding` [m] is a distance to obstacles that is kept. Memory for 2^dof edges to each goal."""
+        """`padding` is the distance to obstacles that paths keep [m]. Needs memory for 2^dof edges to each
+        goal."""
         super().__init__(checker, start, goals, settings, padding, incremental=True)
         self._last = np.zeros((len(goals), 2 ** len(start)), np.uint8)
         moves = np.abs(self._graph.lattice.moves[: len(self._graph.lattice.moves) // 2])
         self._reaches = (0.5 * settings.spacing * moves @ levers(checker.robot)).astype(np.float32)
-        """How far any point of the arm gets by half of each move [m]."""
+        """How far any point of the arm moves by half of each move [m]."""
         self._offset = 0
         self._start = int(table.find_or_add(self._table, self._graph.start_key))
         self._has_room = self._update(np.full(len(self._table.keys), np.inf, np.float32))
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> Outcome:
-        """Search on until there is a path, none, no more room, or `stop` says so."""
+        """Search until there is a path, there is none, memory is full, or `stop` returns True."""
         if self._table.state[self._start] == table.BLOCKED:
             return Outcome.EXHAUSTED
         if not self._has_room:
@@ -296,26 +297,27 @@ class DStarLiteSearch(_Search):
 
     @property
     def cost(self) -> float:
-        """Length of the path that `run` found [rad]; infinite if it found none."""
+        """Length of the path that `run` found [rad]; infinite if there is none."""
         return self._radians(int(self._table.rhs[self._start]))
 
     def path(self) -> Float[ndarray, "n dof"] | None:
-        """Waypoints from the start to a goal, after `run` came back with FOUND; None if there are none."""
+        """Waypoints from the start to a goal, after `run` returned FOUND; None if there is no path."""
         if self._table.rhs[self._start] >= table.INFINITE:
             return None
         return self._waypoints(kernel.path_from(self._graph.lattice, self._table, self._last, self._start))
 
     def update(self, checker: CollisionChecker, start: Float[ndarray, "dof"] | None = None) -> None:
-        """The scene changed, and the arm may stand at another node of the lattice; `run` then repairs.
+        """Take over a changed scene, and a new start at another node of the lattice; `run` then repairs the
+        search.
 
         Shapes that are the same objects in both scenes are taken to be unchanged. Only nodes and known edges
-        that are within reach of the others are checked again. Raises InputError for another robot or a start
-        that is no node.
+        within reach of the other shapes are checked again. Raises InputError for another robot, and for a
+        start that is no node.
         """
         if checker.robot is not self.checker.robot:
             raise InputError(
-                f"checker is of the robot {checker.robot.name}; it must be of the one that the search began "
-                f"with, {self.checker.robot.name}"
+                f"checker has the robot {checker.robot.name}; it must have that of the search, "
+                f"{self.checker.robot.name}"
             )
         if start is not None:
             self._move_start(start)
@@ -325,7 +327,8 @@ class DStarLiteSearch(_Search):
         self._has_room = self._update(near)
 
     def _distances_to_changes(self, checker: CollisionChecker) -> Float[ndarray, "capacity"]:
-        """How far the arm is, at each node, from all shapes that came, went or moved [m], at most."""
+        """A lower bound of the distance of the arm at each node from shapes that were added, removed or moved
+        [m]."""
         near = np.full(len(self._table.keys), np.inf, np.float32)
         before, after = self.checker.scene.shapes, checker.scene.shapes
         kept = {id(shape) for shape in before} & {id(shape) for shape in after}
@@ -350,10 +353,12 @@ class DStarLiteSearch(_Search):
         before = self._table.keys[self._start] // lattice.strides % lattice.counts
         node = int(table.find_or_add(self._table, int(whole @ lattice.strides)))
         if node < 0:
-            raise InputError(f"start is {np.round(start, 4)}; the search never saw it and has no room for it")
+            raise InputError(
+                f"start is {np.round(start, 4)}; the search has not reached it, and memory is full"
+            )
         steps = np.abs(whole - before)
         way = max(float(np.linalg.norm(steps)), float(steps.sum()) * lattice.slope)
-        # rounded up: what is queued must stay below its true key
+        # rounded up: queued keys must stay lower bounds
         self._offset += ceil(UNITS * way + lattice_graph.ROUNDING) if way else 0
         self._start = node
 
@@ -364,8 +369,8 @@ class DStarLiteSearch(_Search):
         )
 
 
-class _LatticePlanner(Planner[Own]):
-    """The same path for every seed, but for the configurations of a goal pose."""
+class _LatticePlanner(Planner[LatticePlannerSettings]):
+    """Base of both planners. The path depends on the seed only through the configurations of a goal pose."""
 
     search: Callable[..., AStarSearch | DStarLiteSearch]
 
@@ -379,8 +384,8 @@ class _LatticePlanner(Planner[Own]):
             if path is None:
                 status = Status.TIMEOUT if outcome is Outcome.GOING else Status.NO_PATH
                 return context.fail(status, _reason(outcome, settings, search))
-            done = f"solved by {context.planner}: {search.expansions} expansions"
-            result = context.finish(start_goal.complete(path), context.planner, reason=done)
+            done = f"solved by {context.planner_name}: {search.expansions} expansions"
+            result = context.finish(start_goal.complete(path), context.planner_name, reason=done)
             if result is not None:
                 return result
             if settings.resolution <= FINEST:
@@ -397,7 +402,7 @@ class AStar(_LatticePlanner[AStarSettings]):
 
 
 class DStarLite(_LatticePlanner[DStarLiteSettings]):
-    """D* Lite on a lattice, for one problem; `DStarLiteSearch` is what can be repaired."""
+    """D* Lite on a lattice, for one problem; `DStarLiteSearch` can be repaired after changes."""
 
     name, settings_class, search = "d_star_lite", DStarLiteSettings, DStarLiteSearch
 

@@ -1,5 +1,5 @@
-"""The memory of a search on a lattice: a hash table of nodes (open addressing) and a heap of those that wait,
-which knows where each of them is."""
+"""The memory of a search on a lattice: a hash table of nodes (open addressing), and a queue as a binary heap
+with the place of each node in it."""
 
 from typing import NamedTuple
 
@@ -9,7 +9,7 @@ from numba import njit
 from robotdiffuse.collision.kernels.compiled import allocation_free
 
 INFINITE = 1 << 60
-"""Cost of what is not reached."""
+"""Cost of nodes that are not reached."""
 UNKNOWN, FREE, BLOCKED, CLOSED = 0, 1, 2, 3
 """States of nodes and edges; CLOSED is a free node that A* has expanded."""
 NODES, QUEUED, EXPANSIONS, GOAL = 0, 1, 2, 3
@@ -17,7 +17,7 @@ NODES, QUEUED, EXPANSIONS, GOAL = 0, 1, 2, 3
 AT_GOAL = 0
 """The node that stands for the goals."""
 NO_ROOM = -2
-"""In place of a node."""
+"""Returned in place of a node when memory is full."""
 _FACTOR_1, _FACTOR_2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 
 
@@ -41,17 +41,17 @@ class Table(NamedTuple):
     heap: np.ndarray
     """[capacity] queued nodes."""
     place: np.ndarray
-    """[capacity] place in the heap + 1, 0 if not queued."""
+    """[capacity] place in the heap + 1; 0 for nodes that are not queued."""
     first: np.ndarray
     second: np.ndarray
     """[capacity] the keys by which the queue is sorted."""
     count: np.ndarray
-    """[4] see NODES and what follows."""
+    """[4] counts at the places NODES, QUEUED, EXPANSIONS, GOAL."""
 
 
 @njit(cache=True)
 def make_table(lattice, max_nodes, incremental):
-    """Room for `max_nodes`; the system hands out the memory as it is used."""
+    """An empty table for `max_nodes` nodes; the system allocates its memory as it is used."""
     capacity, slots = max_nodes + 1, 1
     while slots < 2 * capacity:
         slots *= 2
@@ -91,13 +91,13 @@ def _slot(table, key):
 
 @allocation_free()
 def find(table, key):
-    """The node of a key; -1 if it was not seen yet."""
+    """The node of a key; -1 if there is none yet."""
     return np.int64(table.slots[_slot(table, key)]) - 1
 
 
 @allocation_free()
 def find_or_add(table, key):
-    """The node of a key; -1 if it is new and there is no room for it."""
+    """The node of a key, added if it is new; -1 if memory is full."""
     i = _slot(table, key)
     if table.slots[i] != 0:
         return np.int64(table.slots[i]) - 1
@@ -121,7 +121,7 @@ def _before(table, a, b):
 
 @allocation_free()
 def _settle(table, i):
-    """Moves the node at place i of the heap up or down to where its keys belong."""
+    """Move the node at place i of the heap up or down to where its keys belong."""
     heap, place, node = table.heap, table.place, np.int64(table.heap[i])
     while i > 0 and _before(table, node, heap[(i - 1) // 2]):
         heap[i] = heap[(i - 1) // 2]
@@ -143,7 +143,7 @@ def _settle(table, i):
 
 @allocation_free()
 def put(table, node, first, second):
-    """Queues a node, or changes its keys if it is queued."""
+    """Queue a node, or change its keys if it is queued."""
     table.first[node], table.second[node] = first, second
     if table.place[node] == 0:
         table.heap[table.count[QUEUED]] = node
@@ -154,7 +154,7 @@ def put(table, node, first, second):
 
 @allocation_free()
 def take(table, node):
-    """Takes a node out of the queue, if it is there."""
+    """Remove a node from the queue, if it is there."""
     i = np.int64(table.place[node]) - 1
     if i < 0:
         return

@@ -1,4 +1,4 @@
-"""A compiled k-d tree that grows by one point at a time: the near neighbours of the sampling planners.
+"""A compiled k-d tree that grows by one point at a time, for nearest-neighbour queries of sampling planners.
 
 J. L. Bentley, "Multidimensional binary search trees used for associative searching", CACM 1975, with buckets
 at the leaves; a query descends nearest side first and keeps the exact distance to each cell (S. Arya and
@@ -13,9 +13,9 @@ from numba import njit
 from robotdiffuse.collision.kernels.compiled import allocation_free
 
 BUCKET = 16
-"""Points of a leaf."""
+"""Largest number of points of a leaf."""
 DEPTH = 64
-"""Cells that a query may have waiting; halves of buckets bound the depth far below."""
+"""Size of a query's stack of cells; the depth of the tree stays far below, as splits halve buckets."""
 
 
 class KdTree(NamedTuple):
@@ -24,7 +24,7 @@ class KdTree(NamedTuple):
     axis: np.ndarray
     """[cells] coordinate that a cell is split in, -1 for leaves."""
     value: np.ndarray
-    """[cells] where it is split."""
+    """[cells] value at which it is split."""
     children: np.ndarray
     """[cells, 2]"""
     bucket: np.ndarray
@@ -36,7 +36,7 @@ class KdTree(NamedTuple):
 
 
 class Neighbours(NamedTuple):
-    """The answer of a query, and its scratch."""
+    """The result of a query, and its working memory."""
 
     index: np.ndarray
     """[k] nearest first."""
@@ -64,7 +64,7 @@ def make_kd_tree(capacity):
 
 @njit(cache=True)
 def make_neighbours(most, dof):
-    """Room for the answer to queries of up to `most` points."""
+    """Memory for queries of up to `most` points."""
     return Neighbours(
         np.zeros(most, np.int32),
         np.zeros(most, np.float32),
@@ -76,7 +76,7 @@ def make_neighbours(most, dof):
 
 @allocation_free()
 def insert(tree, points, index):
-    """Add the point points[index]. A point that fills a bucket with copies of itself is left out."""
+    """Add the point points[index]. It is left out if its leaf is full of copies of it."""
     cell = 0
     while tree.axis[cell] >= 0:
         cell = tree.children[cell, 1 if points[index, tree.axis[cell]] >= tree.value[cell] else 0]
@@ -108,7 +108,7 @@ def _split(tree, points, cell):
             tree.bucket[cell, k] = tree.bucket[cell, k - 1]
             k -= 1
         tree.bucket[cell, k] = moved
-    # the middle, moved to a place where neighbours differ
+    # the median, moved to where neighbours differ
     middle = BUCKET // 2
     while (
         middle < BUCKET
@@ -134,7 +134,7 @@ def _split(tree, points, cell):
 
 @allocation_free(fastmath=True)
 def query(tree, points, q, k, out):
-    """The k nearest points to q; returns how many were found (fewer than k only in a smaller tree)."""
+    """Find the k points nearest to q; returns their number (fewer than k only in a smaller tree)."""
     dof = len(q)
     found, waiting = 0, 1
     out.cells[0], out.bounds[0] = 0, np.float32(0.0)
@@ -151,7 +151,7 @@ def query(tree, points, q, k, out):
             near = 1 if offset >= np.float32(0.0) else 0
             far_bound = bound - out.offsets[slot, axis] * out.offsets[slot, axis] + offset * offset
             if found < k or far_bound < out.distance[k - 1]:
-                # the far side takes this slot, the descent goes on one above
+                # the far side takes this slot; the descent goes on in the slot above
                 out.cells[slot], out.bounds[slot] = tree.children[cell, 1 - near], far_bound
                 for j in range(dof):
                     out.offsets[slot + 1, j] = out.offsets[slot, j]

@@ -24,22 +24,22 @@ from robotdiffuse.planning.search.shared_tree.tree import (
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _INFINITY = np.float32(np.inf)
 NEIGHBOURS = 64
-"""Most near neighbours that are looked at; e (1 + 1 / dof) ln n is below it up to 10^8 nodes of 7 joints."""
-PESSIMISM = np.float32(0.5)
-"""Share of a goal's present excess over the straight line that is taken to remain."""
-LEAST_PROMISE = np.float32(0.03)
-"""So that no goal that might still win is left out for ever."""
-DRAWS = 32
+"""Largest number of near neighbours; e (1 + 1 / dof) ln n is below it up to 10^8 nodes of 7 joints."""
+REMAINING_EXCESS = np.float32(0.5)
+"""Part of a goal's present excess over the straight line that is expected to remain."""
+MIN_PROMISE = np.float32(0.03)
+"""Smallest promise of a goal that may still have the shortest path, so that none is left out forever."""
+MAX_DRAWS = 32
 """Draws from a hyperspheroid before a sample outside the joint limits is clamped to them."""
 
 
 @allocation_free()
 def draw_goal(tree, state):
-    """A goal drawn by its promise; -1 if no path can be shortened.
+    """Draw a goal by its promise; -1 if no path can be shortened.
 
-    Promise: by how much the best path would fall if the goal's own path lost its hoped-for share of the
-    excess over the straight line; while no goal is reached, nearness. Searches for the goal alone that found
-    nothing lower it.
+    Promise: how much shorter the best path would get if the goal's own path lost the expected part of its
+    excess over the straight line; while no goal is reached, its nearness. Failed searches for the goal alone
+    lower it.
     """
     best = best_cost(tree)
     total, chosen = _ZERO, -1
@@ -48,8 +48,8 @@ def draw_goal(tree, state):
             continue
         if best < _INFINITY:
             cost = min(goal_cost(tree, g), np.float32(1.5) * best)
-            hope = best - tree.bound[g] - PESSIMISM * (cost - tree.bound[g])
-            promise = max(hope / best, _ZERO) + LEAST_PROMISE
+            hope = best - tree.bound[g] - REMAINING_EXCESS * (cost - tree.bound[g])
+            promise = max(hope / best, _ZERO) + MIN_PROMISE
         else:
             promise = _ONE / (tree.bound[g] * tree.bound[g] + np.float32(0.1))
         promise /= _ONE + tree.failures[g]
@@ -69,7 +69,7 @@ def _gaussian(state):
 
 @allocation_free()
 def sample_hyperspheroid(a, b, length, lower, upper, state, out):
-    """Uniform among the points through which a path from a to b can be shorter than `length`.
+    """Sample uniformly among the points through which a path from a to b can be shorter than `length`.
 
     J. Gammell, S. Srinivasa and T. Barfoot, "Informed RRT*", IROS 2014: a ball, stretched, and turned here by
     a Householder reflection onto the axis of the foci.
@@ -78,7 +78,7 @@ def sample_hyperspheroid(a, b, length, lower, upper, state, out):
     gap = distance(a, b)
     axis = _HALF * length
     radius = _HALF * np.sqrt(max(length * length - gap * gap, _ZERO))
-    for _ in range(DRAWS):
+    for _ in range(MAX_DRAWS):
         norm = _ZERO
         for j in range(dof):
             out[j] = _gaussian(state)
@@ -88,7 +88,7 @@ def sample_hyperspheroid(a, b, length, lower, upper, state, out):
         for j in range(1, dof):
             out[j] *= scale * radius
         if gap > np.float32(1e-6):
-            # the reflection that swaps the first axis and the direction from a to b
+            # Householder reflection that swaps the first axis and the direction from a to b
             toward = (b[0] - a[0]) / gap
             square = np.float32(2.0) * (_ONE - toward)
             if square > np.float32(1e-9):

@@ -1,25 +1,25 @@
 """Shared-Tree Informed RRT*, the paper's planner for data: one tree, many goals, a safety distance.
 
-What is in the paper's section on data sets, and where it is here:
+The parts of the paper's section on data sets, and where they are here:
 
 - *Shared spanning tree*: one tree from the start is searched towards all goal configurations of a target
-  pose at once; every goal keeps its own best cost, the cheapest one is returned. Goals are not taken in
-  turn, as in the authors' code, but drawn by promise (`kernel.draw_goal`).
+  pose at once; every goal keeps its own best cost, the cheapest one is returned. Goals are drawn
+  by promise (`kernel.draw_goal`); the authors' code takes them in turn.
 - *Informed*: samples come from the prolate hyperspheroid of the drawn goal (`kernel.sample_hyperspheroid`;
   J. Gammell et al., IROS 2014). The authors reject uniform samples instead.
 - *RRT\\**: choose-parent and rewiring among the k nearest nodes, k = e (1 + 1/d) ln n, which asymptotic
   optimality needs (S. Karaman and E. Frazzoli, IJRR 2011; `kernel.add_node`). The authors rewire within a
   fixed radius of 1.2 and have choose-parent commented out. Neighbours come from a k-d tree.
 - *Node security defence*: nodes and edges keep a safety distance to obstacles; near a start or goal that is
-  itself closer it is relaxed in steps (`collision.kernels.motions.padding_near`), and where no path is
-  found the whole distance is lowered stepwise. The authors enlarge the obstacles by
-  5 cm. What was kept is recorded.
+  itself closer it is relaxed in steps (`collision.kernels.motions.padding_near`), and if no path is
+  found, the whole distance is lowered in steps. The authors enlarge the obstacles by 5 cm. The distance kept
+  is recorded.
 - *Cost*: joint-space length. The authors' is that of the end effector plus a little for orientation, which
   makes detours of the joints cheap.
 
-Beyond the paper, because it brings the cost down within milliseconds: each round also asks RRT-Connect for
-one path, shortens it, and grafts it onto the tree if it is the shortest to its goal, and shortens the best
-path; so the hyperspheroids shrink early. Both only add branches, so the tree stays one of RRT*.
+Beyond the paper, to lower the cost within milliseconds: each round also asks RRT-Connect for one path,
+shortens it, and adds it to the tree if it is the shortest to its goal; and it shortens the best path. So the
+hyperspheroids shrink early. Both only add branches, so the tree remains one of RRT*.
 """
 
 from collections.abc import Callable
@@ -44,7 +44,7 @@ from robotdiffuse.planning.start_goal import StartGoal
 from robotdiffuse.trajectories.simplification import shortcut
 
 END_MARGIN = 0.0005
-"""What an end that is closer than the safety distance keeps less than it has [m]."""
+"""Near a start or goal closer than the safety distance, paths keep its clearance less this margin [m]."""
 
 
 @dataclass(frozen=True)
@@ -52,16 +52,16 @@ class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     safety_distance: NotNegative = 0.05
     """Distance to obstacles that nodes and edges keep [m]; the default is what the authors' scenes imply."""
     steps: Natural = 5
-    """Steps in which the safety distance is lowered to zero where no path is found; one more is what the
-    start has, and one what the goal farthest from obstacles has."""
+    """Steps in which the safety distance is lowered to zero if no path is found; the clearances of the start
+    and of the goal farthest from obstacles are two more steps."""
     step_rounds: Count = 4
-    """Rounds without a path before it is lowered."""
+    """Rounds without a path before the safety distance is lowered."""
     range: Positive = 1.0
     """Longest extension of a tree [rad, joint-space L2]."""
     resolution: Positive = 0.05
     """No point of the arm moves further than this between two checks of a motion [m]."""
     goal_bias: Annotated[float, Bound(least=0.0, below=1.0)] = 0.1
-    """Share of the samples at a goal that is not reached yet."""
+    """Part of the samples that are at a goal, while it is not reached."""
     growth: Count = 150
     """Iterations of RRT* in a round."""
     connect_iterations: Count = 1_000
@@ -71,15 +71,15 @@ class SharedTreeSettings(Settings, name="shared_tree_rrt_star"):
     rounds: Count = 100_000
     """Most rounds."""
     improvement: NotNegative = 0.005
-    """The search ends when the best cost fell by less than this share in `patience` rounds; 0: never."""
+    """The search ends when the best cost fell by less than this part in `patience` rounds; 0: never."""
     patience: Count = 20
     """See `improvement`."""
     capacity: Count = 2_000
-    """Nodes that a tree has room for at first; it is doubled when full."""
+    """Initial capacity of the tree [nodes]; it is doubled when the tree is full."""
 
 
 class SharedTreeSearch:
-    """One search: ends, tree, and what was found so far. The same state gives the same search."""
+    """One search: start, goals, the tree, and the costs so far. The same state gives the same search."""
 
     def __init__(
         self,
@@ -137,17 +137,17 @@ class SharedTreeSearch:
                 if before < np.inf and before - costs[-1] < settings.improvement * before:
                     return True
         elif self._step == len(self._distances) - 1 and self._rounds_at_step >= 3 * settings.step_rounds:
-            # nothing at any distance: three times the usual number of rounds, then it is given up
+            # no path at any distance: give up after three times the usual number of rounds
             return settings.improvement > 0
         return len(costs) >= settings.rounds
 
     def run(self, stop: Callable[[], bool] = lambda: False) -> None:
-        """Rounds until the search is finished, or `stop` says so."""
+        """Search until it is finished, or `stop` returns True."""
         while not (self.finished or stop()):
             self.round()
 
     def round(self) -> None:
-        """One path by RRT-Connect, RRT* iterations, and a shortening of the best path."""
+        """Run a round: one path by RRT-Connect, RRT* iterations, and shortcuts of the best path."""
         settings = self.settings
         g = kernel.draw_goal(self._tree, self.state)
         if g >= 0:
@@ -164,16 +164,16 @@ class SharedTreeSearch:
             self._enter_step()
 
     def _safety_distances(self) -> list[float]:
-        """What is tried, falling [m]."""
+        """The safety distances to try, falling [m]."""
         most, steps = self.settings.safety_distance, max(self.settings.steps, 1)
         start_goal = (self._clearances[0], self._clearances[1:].max())
         between = {max(float(distance) - END_MARGIN, 0.0) for distance in start_goal if distance < most}
         return sorted({most * step / steps for step in range(steps + 1)} | between, reverse=True)
 
     def _enter_step(self) -> None:
-        """Set the safety distance of the step; what the tree holds stays valid, as distances only fall."""
+        """Set the safety distance of the step; the tree stays valid, as distances only fall."""
         self.safety_distance = self._distances[self._step]
-        """Distance to obstacles that is kept but near ends that are closer themselves [m]."""
+        """Distance to obstacles that paths keep, except near a start or goal that is closer [m]."""
         self._rounds_at_step = 0
         close = self._clearances < self.safety_distance
         allowed = np.maximum(self._clearances[close] - END_MARGIN, 0.0)
@@ -209,7 +209,7 @@ class SharedTreeSearch:
         tree.graft(self._tree, shorter, g)
 
     def _make_room(self, nodes: int) -> bool:
-        """Double the tree's room if less than this is left; whether that was done."""
+        """Double the tree's capacity if less than this is left; returns whether that was done."""
         if self.nodes + nodes < len(self._tree.nodes):
             return False
         self._tree = tree.grown(self._tree, 2 * (len(self._tree.nodes) + nodes))
@@ -217,7 +217,7 @@ class SharedTreeSearch:
 
 
 class SharedTreeRRTStar(Planner[SharedTreeSettings]):
-    """Shared-Tree Informed RRT* as a planner: anytime, until it hardly improves or time runs out."""
+    """Shared-Tree Informed RRT* as an anytime planner: it ends when it hardly improves or time runs out."""
 
     name = "shared_tree_rrt_star"
     settings_class = SharedTreeSettings
@@ -225,7 +225,7 @@ class SharedTreeRRTStar(Planner[SharedTreeSettings]):
     def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
         """See `planning.planner.Planner`."""
         for settings, attempt in ever_finer(context, self.settings):
-            state = random_state(context.seed, attempt)
+            state = random_state(context.request.seed, attempt)
             search = SharedTreeSearch(start_goal.checker, *start_goal.rows(), settings, state)
 
             def out_of_time(search: SharedTreeSearch = search) -> bool:

@@ -12,7 +12,7 @@ from robotdiffuse.planning.search.shared_tree import kd_tree
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _INFINITY = np.float32(np.inf)
 GAIN = np.float32(1e-4)
-"""Costs must fall by more than this share to count: less is rounding."""
+"""A cost must fall by more than this part to count; less is rounding."""
 
 
 class Tree(NamedTuple):
@@ -27,7 +27,7 @@ class Tree(NamedTuple):
     sibling: np.ndarray
     """[capacity] next child of the same parent, -1 for the last."""
     cost: np.ndarray
-    """[capacity] length of the way from the start [rad]."""
+    """[capacity] length of the path from the start [rad]."""
     size: np.ndarray
     """[1]"""
     near: kd_tree.KdTree
@@ -38,12 +38,12 @@ class Tree(NamedTuple):
     bound: np.ndarray
     """[k] the straight distance from the start: no path to the goal is shorter [rad]."""
     failures: np.ndarray
-    """[k] searches for this goal alone that found no path."""
+    """[k] failed searches for this goal alone."""
 
 
 @njit(cache=True)
 def make_tree(start, goals, capacity):
-    """A tree of the start alone."""
+    """A tree with only the start."""
     k, dof = goals.shape
     nodes = np.empty((capacity, dof), np.float32)
     nodes[0] = start
@@ -69,7 +69,7 @@ def make_tree(start, goals, capacity):
 
 @njit(cache=True)
 def grown(tree, capacity):
-    """A copy of the tree with more room."""
+    """A copy of the tree with a larger capacity."""
     wider = make_tree(tree.nodes[0], tree.goals, capacity)
     n = tree.size[0]
     wider.nodes[:n], wider.parent[:n], wider.child[:n] = tree.nodes[:n], tree.parent[:n], tree.child[:n]
@@ -89,7 +89,7 @@ def goal_cost(tree, g):
 
 @allocation_free()
 def best_goal(tree):
-    """The goal with the cheapest path; -1 if none is reached."""
+    """The goal with the shortest path; -1 if none is reached."""
     best, where = _INFINITY, -1
     for g in range(len(tree.goals)):
         cost = goal_cost(tree, g)
@@ -112,7 +112,7 @@ def goal_is_open(tree, g, best):
 
 @allocation_free()
 def append(tree, q, parent, cost):
-    """A new node; there must be room for it."""
+    """Add a node; the tree must not be full."""
     node = tree.size[0]
     for j in range(len(q)):
         tree.nodes[node, j] = q[j]
@@ -126,7 +126,7 @@ def append(tree, q, parent, cost):
 
 @allocation_free()
 def rewire(tree, node, parent, cost):
-    """Hang a node, and all that grows from it, under another parent."""
+    """Move a node, with its subtree, to another parent."""
     old = tree.parent[node]
     if tree.child[old] == node:
         tree.child[old] = tree.sibling[node]
@@ -171,7 +171,8 @@ def path_to(tree, g):
 
 @njit(cache=True)
 def graft(tree, path, g):
-    """Add a free path from the start to a goal as a branch, if it is the shortest known; whether it was."""
+    """Add a free path from the start to a goal as a branch if it is the shortest known; returns whether it
+    was."""
     cost = path_length(path)
     if cost >= goal_cost(tree, g) * (_ONE - GAIN) or tree.size[0] + len(path) >= len(tree.nodes):
         return False

@@ -1,0 +1,32 @@
+"""One attempt of a planner at a problem in its scene as it is; the pipeline makes one or several."""
+
+from typing import ClassVar, Protocol, runtime_checkable
+
+from robotdiffuse.core.deadline import OutOfTimeError
+from robotdiffuse.core.results import PlanResult
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
+from robotdiffuse.planning.start_goal import StartGoal, usable_start_goal
+from robotdiffuse.problems.problem import Problem
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """What the pipeline needs of a planner."""
+
+    name: ClassVar[str]
+
+    def solve(self, context: PlanningContext, start_goal: StartGoal) -> PlanResult:
+        """Search from the start to a goal; see `planning.planner.Planner.solve`."""
+        ...
+
+
+def attempt(solver: Solver, problem: Problem, request: PlanRequest) -> PlanResult:
+    """Plan from the problem's start to its goal, without its waypoints, moving obstacles, start velocity and
+    unknown space, which the pipeline handles."""
+    context = PlanningContext(solver.name, problem, request)
+    with context.deadline():
+        try:
+            start_goal = usable_start_goal(context)
+            return start_goal if isinstance(start_goal, PlanResult) else solver.solve(context, start_goal)
+        except OutOfTimeError as error:
+            return context.out_of_time(error)

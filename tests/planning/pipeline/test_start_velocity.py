@@ -1,0 +1,60 @@
+"""Motions from a start velocity."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import robotdiffuse as rd
+from robotdiffuse.core.errors import InputError
+from robotdiffuse.core.types import Status
+from robotdiffuse.validation.validator import verify_trajectory
+
+PANDA = rd.load_robot("panda")
+START, END = np.array([-1.0, 0.3, 0, -1.8, 0, 2.1, 0.8]), np.array([1.0, 0.3, 0, -1.8, 0, 2.1, 0.8])
+VELOCITIES = [np.eye(7)[0] * 2.0, np.array([0.5, 0.1, 0.3, -0.4, 0.1, 0, 0.6]), -np.eye(7)[0]]
+
+
+@pytest.mark.parametrize("velocity", VELOCITIES)
+def test_motions_begin_with_the_start_velocity(velocity: np.ndarray) -> None:
+    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
+    found = rd.load_planner("rrt_connect").plan(task, 5.0)
+    assert found.status is Status.SOLVED, found.reason
+    assert found.trajectory is not None
+    assert np.allclose(found.trajectory.velocities[0], velocity, atol=1e-9)
+    assert (np.abs(found.trajectory.velocities) <= PANDA.velocity * (1 + 1e-6)).all()
+    assert (np.abs(found.trajectory.accelerations) <= PANDA.acceleration * (1 + 1e-3)).all()
+    assert verify_trajectory(task, found.trajectory).valid
+    at_rest = verify_trajectory(replace(task, start_velocity=None), found.trajectory).violation
+    assert at_rest is not None
+    assert at_rest.kind in ("rest", "acceleration")
+
+
+@pytest.mark.parametrize(
+    ("velocity", "message"),
+    [
+        ([0.1] * 6, "start_velocity is .*; it must be 7 finite numbers"),
+        ([np.nan] * 7, "start_velocity is .*; it must be 7 finite numbers"),
+        ([9.0, 0, 0, 0, 0, 0, 0], "start_velocity: panda_joint1 is 9; its velocity limit is 2.17"),
+    ],
+)
+def test_invalid_start_velocities_are_refused(velocity: list[float], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=velocity)
+
+
+def test_start_velocity_into_a_limit() -> None:
+    start = START.copy()
+    start[0] = PANDA.upper[0] - 0.01
+    task = rd.Problem(PANDA, rd.Scene(), start, END, start_velocity=np.eye(7)[0] * 2.0)
+    found = rd.load_planner("rrt_connect").plan(task)
+    assert found.status is Status.INVALID_START
+    assert "panda_joint1 cannot stop" in found.reason
+
+
+def test_start_velocity_beyond_what_scaling_leaves() -> None:
+    task = rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=np.eye(7)[0] * 2.0)
+    with pytest.raises(InputError, match=r"velocity_scaling leaves it 1\.08"):
+        rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
+    with pytest.raises(InputError, match="jerk cannot be combined with start_velocity"):
+        rd.load_planner("rrt_connect").plan(task, jerk=100.0)
