@@ -50,7 +50,7 @@ from robotdiffuse.perception.confidence import MIN_RISK, confidence
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.observed_volume import observe
 from robotdiffuse.perception.ray_caster import DepthNoise, ray_cast
-from robotdiffuse.planning import context, load_planner
+from robotdiffuse.planning import load_planner
 from robotdiffuse.planning.context import PlanRequest
 from robotdiffuse.planning.next_view import next_view, poses_around
 from robotdiffuse.planning.pipeline.unknown_space import plan_with_unknown_space
@@ -361,7 +361,7 @@ def plan_with_second_views(problem: Problem, family: str, number: int) -> Row:
 def _plan_on(problem: Problem, *seen: DepthView) -> tuple[Problem, PlanResult]:
     known = Scene(problem.scene.shapes[:1])
     partial = Problem(problem.robot, known, problem.start, problem.goal, views=seen, unknown=PREDICTED)
-    return partial, plan_with_unknown_space(PLANNER, partial, LIMIT, 0, Request())
+    return partial, plan_with_unknown_space(PLANNER, partial, PlanRequest(LIMIT))
 
 
 def report_next_view(rows: list[Row]) -> None:

@@ -162,7 +162,9 @@ def network_methods(planner: RobotDiffuse, cases: list[Case]) -> dict[str, Draw]
             f"{name}, both": from_network(of, other, hidden=True),
         }
         if model.settings.null_condition:
-            found[f"{name}, condition hidden"] = from_network(RobotDiffuse(replace(of.settings, guidance_scale=0.0)))
+            found[f"{name}, condition hidden"] = from_network(
+                RobotDiffuse(replace(of.settings, guidance_scale=0.0))
+            )
     control = without_network(planner.settings, model.settings.waypoints)
     return found | {"control: guidance of line and bumps": control}
 

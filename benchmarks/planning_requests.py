@@ -57,7 +57,7 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
 from robotdiffuse.core.types import Trajectory
-from robotdiffuse.planning.context import PlanningContext
+from robotdiffuse.planning.context import PlanningContext, PlanRequest
 from robotdiffuse.planning.start_goal import usable_start_goal
 from robotdiffuse.problems.files import load_motion_bench_maker
 from robotdiffuse.problems.goals import Goal, JointGoal, PoseGoal, PosesGoal, poses_of
@@ -119,7 +119,7 @@ def carried(folder: Path, places: int) -> Iterator[NamedProblem]:
             goal = PoseGoal(CAN, _place(scene, entry.problem.scene, rng), [0, 0, 0], [0, 0, np.pi])
             problem = Problem(holding, scene, q, goal)
             if not isinstance(
-                usable_start_goal(PlanningContext("places", problem, PLACE_LIMIT, 0)), PlanResult
+                usable_start_goal(PlanningContext("places", problem, PlanRequest(PLACE_LIMIT))), PlanResult
             ):
                 yield NamedProblem(f"{entry.name}-{kept}", problem)
                 kept += 1

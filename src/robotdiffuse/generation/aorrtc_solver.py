@@ -67,7 +67,9 @@ class AORRTCSearch:
         problem = Problem(
             checker.robot, checker.scene, start.astype(np.float64), JointGoal(goals.astype(np.float64))
         )
-        context = PlanningContext("aorrtc", problem, PlanRequest(NO_TIME_LIMIT, int(state[0] >> np.uint64(32))))
+        context = PlanningContext(
+            "aorrtc", problem, PlanRequest(NO_TIME_LIMIT, int(state[0] >> np.uint64(32)))
+        )
         has = checker.link_clearances(np.stack([start, *goals]).astype(np.float32)).min(axis=1, initial=1.0)
         self._distances = _descending_distances(settings, (float(has[0]), float(has[1:].max())))
         search = SearchSettings(range=settings.range, resolution=settings.resolution)

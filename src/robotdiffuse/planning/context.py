@@ -5,7 +5,6 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from numbers import Integral, Real
 from typing import Annotated
 
 import numpy as np
@@ -15,7 +14,6 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.compiled import compile_seconds
 from robotdiffuse.core.bounds import MAX_COORDINATE
 from robotdiffuse.core.deadline import OutOfTimeError, check_left, deadline
-from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Natural, OneOf, Settings
 from robotdiffuse.core.types import CONVERGED, UNTIL, Path, Status, Trajectory

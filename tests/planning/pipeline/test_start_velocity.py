@@ -58,3 +58,9 @@ def test_start_velocity_beyond_what_scaling_leaves() -> None:
         rd.load_planner("rrt_connect").plan(task, velocity_scaling=0.5)
     with pytest.raises(InputError, match="jerk cannot be combined with start_velocity"):
         rd.load_planner("rrt_connect").plan(task, jerk=100.0)
+
+
+def test_start_velocities_of_nearly_nothing_are_rest() -> None:
+    """1e-300 rad/s divided by its square's root, which is 0."""
+    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-300] * 7).start_velocity is None
+    assert rd.Problem(PANDA, rd.Scene(), START, END, start_velocity=[1e-5] * 7).start_velocity is not None
