@@ -103,7 +103,7 @@ def random_edges(checker: CollisionChecker, rng: Generator) -> tuple[ndarray, nd
 
 def checked_configurations(space: Space, starts: ndarray, ends: ndarray) -> Int[ndarray, "n"]:
     """Configurations of each edge if it is checked in full."""
-    travel = np.abs(ends - starts) @ space.levers
+    travel = np.abs(ends - starts) @ space.motion_radii
     return W * np.maximum(np.ceil(travel / space.resolution / W), 1).astype(int)
 
 

@@ -34,7 +34,7 @@ import robotdiffuse as rd
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.collision.kernel_arrays import compile_robot
-from robotdiffuse.collision.motions import levers
+from robotdiffuse.collision.motions import largest_motion_radii
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.transforms import inverse, rotation_from_rpy, transform
@@ -256,7 +256,7 @@ def attaching() -> None:
             held = robot.attach(rd.Box([0, 0, 0.15], rng.uniform(0.03, 0.1, 3), name="box"), "panda_hand")
             if prepared:
                 compile_robot(held)
-                levers(held)
+                largest_motion_radii(held)
             spent.append(1e3 * (time.process_time() - began))
         rows.append((what, f"{np.median(spent):.0f} ms", f"{np.max(spent[1:]):.0f} ms"))
     print_table("A box on the hand, CPU time of 30", ("", "median", "most"), rows)

@@ -13,7 +13,7 @@ import trimesh
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import Prover, Stretches
-from robotdiffuse.certificates.checker import described, hash_of
+from robotdiffuse.certificates.checker import describe_claim, hash_of
 from robotdiffuse.certificates.content import robot_parts, scene_parts
 from robotdiffuse.certificates.proof import Certificate, Proof, Tolerances, load_certificate
 from robotdiffuse.certificates.search import NotValidError, certify
@@ -310,7 +310,7 @@ def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
     parts = robot_parts(robot), scene_parts(problem.scene), hash_of(motion)
     certificate = Certificate(robot.name, *parts, Tolerances(), motion, none, 0.5, 0.5, proof)
     assert certificate.check(problem).differences == tuple(
-        f"proof: nothing is said of {described(claim)} from row 0 to row 0" for claim in claims
+        f"proof: nothing is said of {describe_claim(claim)} from row 0 to row 0" for claim in claims
     )
 
 

@@ -14,7 +14,7 @@ import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import Stretches
 from robotdiffuse.certificates.checker import hash_of
-from robotdiffuse.certificates.constraints import kept
+from robotdiffuse.certificates.constraints import constraint_bounds
 from robotdiffuse.certificates.content import request_parts
 from robotdiffuse.certificates.moving_obstacles import MovingProver
 from robotdiffuse.certificates.proof import Certificate, load_certificate
@@ -170,7 +170,7 @@ def test_bounds_of_constraints_are_bounds() -> None:
             rd.CartesianLine(frame, 0.1, 0.1),
         ]
         problem = Problem(robot, rd.Scene(), rows[0], rows[-1], constraints=constraints)
-        shown = kept(problem, rows, 0.0)
+        shown = constraint_bounds(problem, rows, 0.0)
         s = np.linspace(0, 1, 60)[:, None]
         dense = np.concatenate([rows[i] + s * (rows[i + 1] - rows[i]) for i in range(3)])
         values = PathConstraints(problem).values(dense).reshape(3, 60, -1).max(axis=1)

@@ -15,7 +15,7 @@ from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
 from robotdiffuse.certificates.content import request_parts
 from robotdiffuse.certificates.proof import Certificate, load_certificate
 from robotdiffuse.certificates.search import certify
-from robotdiffuse.certificates.torques import inverse_dynamics, most_torques
+from robotdiffuse.certificates.torques import inverse_dynamics, torque_bounds
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
@@ -59,8 +59,8 @@ def test_bounds_are_bounds(name: str, step: float) -> None:
         motion = wild(problem.robot, rng, step)
         looks = np.linspace(0, motion.times[-1], 201)[1:-1]
         for one, at in ((motion, looks), (Path(motion.joint_names, motion.positions), looks / step)):
-            few = most_torques(problem, one, np.zeros(0))
-            dense = most_torques(problem, one, at)
+            few = torque_bounds(problem, one, np.zeros(0))
+            dense = torque_bounds(problem, one, at)
             rows = np.sort(np.concatenate([motion.times / step, looks / step]))
             piece = np.clip(((rows[1:] + rows[:-1]) / 2).astype(int), 0, len(few) - 1)
             assert (dense <= few[piece] + 1e-9).all()

@@ -19,7 +19,7 @@ from robotdiffuse.collision.kernel_arrays import compile_scene, robot_groups
 from robotdiffuse.collision.kernels.lane_clearance import block_clearances
 from robotdiffuse.collision.kernels.lane_collision import block_hits, free_many, make_workspace
 from robotdiffuse.collision.kernels.motions import motion_free
-from robotdiffuse.collision.point_cloud_grid import THINNING, build_grid, cover, thin
+from robotdiffuse.collision.point_cloud_grid import THINNING, build_grid, cover_triangles, thin_points
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.rop import ROP
@@ -341,7 +341,7 @@ def test_a_point_cloud_is_many_spheres() -> None:
 def test_a_dense_cloud_is_joined_on_the_safe_side() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.3, 0.3, (20_000, 3)) * (1, 1, 0.01)
-    joined = thin(points, 0.02, 1.5)
+    joined = thin_points(points, 0.02, 1.5)
     assert len(joined) < 0.25 * len(points)
     for point in points[::97]:
         assert (np.linalg.norm(joined[:, :3] - point, axis=1) + 0.02 <= joined[:, 3] + 1e-9).any()
@@ -353,7 +353,7 @@ def test_the_nearest_of_a_dense_cloud() -> None:
     robot, rng = with_spheres("box_arm"), np.random.default_rng(3)
     points = rng.normal(size=(3000, 3))
     points = 0.4 * points / np.linalg.norm(points, axis=1, keepdims=True) + np.array([0.7, 0.5, 0])
-    cloud = thin(points, 0.004, 2.0)
+    cloud = thin_points(points, 0.004, 2.0)
     scene = Scene([Sphere(c[:3], c[3]) for c in cloud])
     q = rows(robot, 200)
     right = CollisionChecker(robot, scene)
@@ -436,7 +436,7 @@ def box_triangles(size: tuple[float, float, float]) -> tuple[ndarray, ndarray]:
 
 def test_mesh_obstacles_are_covered() -> None:
     vertices, faces = box_triangles((0.5, 0.3, 0.4))
-    spheres, rng = cover(vertices[faces], 1.5), np.random.default_rng(0)
+    spheres, rng = cover_triangles(vertices[faces], 1.5), np.random.default_rng(0)
     weights = rng.dirichlet((1, 1, 1), 300)
     points = np.einsum("nk,nkd->nd", weights, vertices[faces[rng.integers(len(faces), size=300)]])
     gap = np.linalg.norm(points[:, None] - spheres[:, :3], axis=-1) - spheres[:, 3]
@@ -459,7 +459,7 @@ def test_mesh_obstacles_against_the_exact_surface() -> None:
 def test_a_ground_of_huge_triangles_is_as_fine_as_a_small_one() -> None:
     far = 1e4
     vertices = np.array([[-far, -far, -0.2], [far, -far, -0.2], [0.0, 2 * far, -0.2]])
-    spheres = cover(vertices[None], 1.5)
+    spheres = cover_triangles(vertices[None], 1.5)
     assert spheres[:, 3].max() < 0.03
     assert np.linalg.norm(spheres[:, :3], axis=1).max() < 2
     on_ground = np.array([[0.0, 0, -0.2], [1.2, 0.3, -0.2], [-0.5, -1.1, -0.2]])

@@ -7,7 +7,7 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.collision.moving_obstacles import FIRST_CONTACT, MovingCollision
+from robotdiffuse.collision.moving_obstacles import CONTACT_TIME_TOLERANCE, MovingCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Trajectory
@@ -70,7 +70,7 @@ def test_certificate_is_coals_verdict() -> None:
         touching, least = as_coal_sees(moves, times, q)
         if touching is not None:
             assert sweep.contact is not None
-            assert sweep.contact.time <= touching + FIRST_CONTACT, "later than Coal"
+            assert sweep.contact.time <= touching + CONTACT_TIME_TOLERANCE, "later than Coal"
             assert sweep.contact.time >= touching - 2 * STEP
             assert sweep.clearance == 0.0
         elif least > 0.005:  # nearer than that, something may have happened between two moments

@@ -46,7 +46,7 @@ def test_steps_are_begun_while_there_is_time_and_long_ones_if_it_is_enough() -> 
 
 
 def test_a_grid_of_too_many_points_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernel_arrays, "GRID_SECONDS", 1e3)
+    monkeypatch.setattr(kernel_arrays, "GRID_SECONDS_PER_POINT", 1e3)
     result = RRTConnect().plan(problem(wall()), time_limit=20.0)
     assert result.status is Status.TIMEOUT
     assert "time limit of 20 s is too short to prepare the scene" in result.reason
@@ -67,7 +67,7 @@ def test_a_tree_of_the_validator_that_takes_too_long_is_refused(
     tip = link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
     vertices = wall().vertices - wall().vertices.mean(axis=0) + tip
     asked = problem(rd.PointCloud(vertices, 0.01) if cloud else rd.Mesh(vertices, wall().faces))
-    monkeypatch.setattr(exact_meshes, "TREE_SECONDS", 1e3)
+    monkeypatch.setattr(exact_meshes, "TREE_SECONDS_PER_ELEMENT", 1e3)
     refused = RRTConnect().plan(asked, time_limit=20.0)
     assert refused.status is Status.TIMEOUT
     assert "the validator's tree over the" in refused.reason

@@ -20,7 +20,7 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
+from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
 from robotdiffuse.validation.validator import (
     Report,
     VerifySettings,
@@ -378,7 +378,7 @@ def test_times_compressed_under_rates_of_zero(factor: float, kind: str) -> None:
     assert verify_trajectory(problem, good).valid
     still = np.zeros_like(good.velocities)
     quick = replace(good, times=good.times / factor, velocities=still, accelerations=still)
-    kinds = {wrong.kind for wrong in wrong_rates(robot, quick, RATES)}
+    kinds = {wrong.kind for wrong in rate_violations(robot, quick, RATES)}
     assert kinds == ({kind, "velocity", "rates"} if kind else {"rates"})
     assert not verify_trajectory(problem, quick).valid
 
@@ -390,7 +390,7 @@ def test_rates_that_are_not_those_of_the_positions(what: str, factor: float) -> 
     problem, _ = problem_and_path(SWING)
     good = trajectory(1.0)
     bad = replace(good, **{what: factor * getattr(good, what)})
-    found = {wrong.kind: wrong for wrong in wrong_rates(problem.robot, bad, RATES)}
+    found = {wrong.kind: wrong for wrong in rate_violations(problem.robot, bad, RATES)}
     assert set(found) == {"rates"}
     assert refused(verify_trajectory(problem, bad), "rates").subject == "j0"
     assert what[:5] in found["rates"].message
@@ -403,7 +403,7 @@ def test_motions_begin_and_end_at_rest(end: int) -> None:
     good = trajectory(2.0)
     moving = good.velocities.copy()
     moving[end, 0] = 0.5
-    kinds = {w.kind for w in wrong_rates(problem.robot, replace(good, velocities=moving), RATES)}
+    kinds = {w.kind for w in rate_violations(problem.robot, replace(good, velocities=moving), RATES)}
     assert "rest" in kinds
     assert not verify_trajectory(problem, replace(good, velocities=moving)).valid
     times = np.linspace(0, 1.2, 121)
@@ -430,7 +430,7 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     accelerations = np.concatenate([fine, fine[-1:]])[rows]
     place += rng.uniform(-1, 1, place.shape) * 0.99 * RATES.resolution
     motion = Trajectory(robot.joint_names, rows * step, place[rows], speed[rows], accelerations)
-    wrong = {w.message for w in wrong_rates(robot, motion, replace(RATES, agreement=2.0))}
+    wrong = {w.message for w in rate_violations(robot, motion, replace(RATES, agreement=2.0))}
     assert not wrong
 
 
@@ -448,7 +448,7 @@ def test_micro_steps_hide_no_velocity(step: float, time: float) -> None:
     """Each of them within the resolution of positions, all of them 1.9 to 95 times as fast as the arm."""
     quick = in_micro_steps(step, time, max(step, 0.01))
     problem = Problem(box_arm(), Scene(), quick.positions[0], JointGoal(quick.positions[-1:]))
-    found = {wrong.kind: wrong.message for wrong in wrong_rates(problem.robot, quick, RATES)}
+    found = {wrong.kind: wrong.message for wrong in rate_violations(problem.robot, quick, RATES)}
     assert "j0 at" in found["velocity"]
     assert not verify_trajectory(problem, quick).valid
 
@@ -461,7 +461,7 @@ def test_micro_steps_hide_no_acceleration(back: bool) -> None:
         place = 1e-3 * np.abs((quick.times / 1e-3 + 0.5) % 1 - 0.5)
         quick = replace(quick, positions=np.outer(place, [1.9, 0, 0]))
     problem = Problem(box_arm(), Scene(), quick.positions[0], JointGoal(quick.positions[-1:]))
-    found = {wrong.kind: wrong.message for wrong in wrong_rates(problem.robot, quick, RATES)}
+    found = {wrong.kind: wrong.message for wrong in rate_violations(problem.robot, quick, RATES)}
     assert set(found) == {"rates", "acceleration"}
     assert "by its positions over 1 ms and more" in found["acceleration"]
     assert not verify_trajectory(problem, quick).valid
@@ -482,7 +482,7 @@ def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None
     ball = Sphere(1.1 * vector(np.cos(0.73), np.sin(0.73), 0), 0.02)
     found = refused(verify_trajectory(replace(problem, scene=Scene([ball])), out), "scene_collision")
     assert 1.0 < found.time < 1.5
-    times, positions = between_rows(out, 1e-3)
+    times, positions = sample_cubics(out, 1e-3)
     assert np.isin(out.times, times).all()
     assert np.abs(positions[:, 0]).max() == pytest.approx(0.75, abs=1e-3)
 

@@ -17,7 +17,14 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.certificates.kinematics import Linkage, Postures
-from robotdiffuse.certificates.obstacles import BEYOND, CAP, MOST, Obstacles, Rounded, Surface
+from robotdiffuse.certificates.obstacles import (
+    CLEARANCE_CAP,
+    MAX_ARRAY_SIZE,
+    PLANE_RANGE,
+    Obstacles,
+    Rounded,
+    Surface,
+)
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -71,7 +78,7 @@ class Bounds:
     """In the middles of stretches, and from there to their ends."""
 
     clearance: Float[ndarray, "n"]
-    """[m], at most CAP."""
+    """[m], at most CLEARANCE_CAP."""
     displacement: Float[ndarray, "n"]
     """[m]"""
 
@@ -136,7 +143,7 @@ class Prover:
         middle = (ends[:, 0] + ends[:, 1]) / 2
         spans = self.spans(ends[:, 0], ends[:, 1], middle)
         postures = self.linkage.place(self.at(middle))
-        clearance = np.full(len(which), CAP)
+        clearance = np.full(len(which), CLEARANCE_CAP)
         displacement = np.zeros(len(which))
         for pairs in (False, True):
             is_pair = np.array([claim.against != SCENE for claim in self.claims], bool)
@@ -177,10 +184,10 @@ class Prover:
             moved = moved & ~self._moved[nearer]
             distances = self._to_links(postures, at, centers, nearer[row])
         else:
-            distances = self.obstacles.distances(centers).min(axis=1, initial=CAP)
+            distances = self.obstacles.distances(centers).min(axis=1, initial=CLEARANCE_CAP)
         went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
         clearance = np.minimum.reduceat(distances - radius, begin)
-        return np.minimum(clearance, CAP), np.maximum.reduceat(went, begin) + others
+        return np.minimum(clearance, CLEARANCE_CAP), np.maximum.reduceat(went, begin) + others
 
     def _displaced(
         self, postures: Postures, posture: ndarray, links: ndarray, moved: ndarray, spans: ndarray
@@ -201,7 +208,7 @@ class Prover:
     def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
         """From points to the spheres of a link each."""
         found = np.empty(len(at))
-        step = MOST // 64
+        step = MAX_ARRAY_SIZE // 64
         for first in range(0, len(at), step):
             some = slice(first, first + step)
             row, ball, begin = self._expand(link[some])
@@ -225,7 +232,7 @@ class Prover:
         normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
         for plane in planes:
             normals.setdefault(plane[:3], []).append(plane.normal)
-        least, left = np.full(len(marked), CAP), np.full(len(marked), CAP)
+        least, left = np.full(len(marked), CLEARANCE_CAP), np.full(len(marked), CLEARANCE_CAP)
         places = [(self.claims[stretches.claim[i]], postures.T[which[i]]) for i in marked]
         standing = [placed(self.parts[claim.link], T[self._of[claim.link]]) for claim, T in places]
         in_scene = [k for k, (claim, _) in enumerate(places) if claim.against == SCENE]
@@ -261,11 +268,11 @@ class Prover:
                         widest = gaps(part, body, n).max(axis=-1)
                         remaining = (gaps(part, body, n, nearer) - against).max(axis=-1)
                         least_of, left_of = np.maximum(apart[o], widest), np.maximum(along[o], remaining)
-                        beyond = BEYOND if isinstance(body, Surface) else CAP
+                        beyond = PLANE_RANGE if isinstance(body, Surface) else CLEARANCE_CAP
                         apart[o] = max(apart[o], least_of.min(initial=beyond))
                         along[o] = max(along[o], left_of.min(initial=beyond - displacement[k]))
-                least[k] = min(least[k], apart.min(initial=CAP))
-                left[k] = min(left[k], along.min(initial=CAP))
+                least[k] = min(least[k], apart.min(initial=CLEARANCE_CAP))
+                left[k] = min(left[k], along.min(initial=CLEARANCE_CAP))
         return least, least - left
 
     def others(self, claim: Claim, T: ndarray, part: Part) -> Sequence[Rounded | Surface | Part]:

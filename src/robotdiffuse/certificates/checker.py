@@ -20,8 +20,8 @@ from robotdiffuse.certificates.content import (
     scene_parts,
 )
 from robotdiffuse.certificates.moving_obstacles import MovingProver
-from robotdiffuse.certificates.proof import AGREEMENT, Certificate, Proof, Tolerances
-from robotdiffuse.certificates.requests import configurations, wrong
+from robotdiffuse.certificates.proof import BOUND_TOLERANCE, Certificate, Proof, Tolerances
+from robotdiffuse.certificates.requests import configurations, requirement_errors
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
@@ -49,8 +49,8 @@ def check(
 
     Robot, scene and motion must be those that were certified, by content; the motion must keep the limits,
     begin at the start and end at the goal; and every stretch must be proved. Stops at waypoints, twitching,
-    and whether rates agree with positions beyond their limits are left to the validator. Raises InputError for a
-    certificate without a problem where none is given, and for shapes that certificates do not know.
+    and whether rates agree with positions beyond their limits are left to the validator. Raises InputError
+    for a certificate without a problem where none is given, and for shapes that certificates do not know.
     """
     if problem is None:
         if certificate.problem is None:
@@ -70,10 +70,10 @@ def check(
     if certificate.motion_hash != hash_of(certificate.motion):
         found.append("motion: it is not the one that was certified: its hash differs")
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is a difference
-        found += wrong(problem, certificate)
+        found += requirement_errors(problem, certificate)
         if tuple(certificate.motion.joint_names) == problem.robot.joint_names:
-            found += _unproved(problem, certificate)
-            found += _unproved_in_time(problem, certificate)
+            found += _proof_errors(problem, certificate)
+            found += _moving_proof_errors(problem, certificate)
     return Findings(tuple(found))
 
 
@@ -83,15 +83,15 @@ def hash_of(motion: Path | Trajectory) -> str:
     return motion_hash(motion.joint_names, motion.positions, *rates)
 
 
-def _unproved(problem: Problem, certificate: Certificate) -> Iterator[str]:
+def _proof_errors(problem: Problem, certificate: Certificate) -> Iterator[str]:
     prover = Prover(problem.robot, problem.scene, configurations(certificate.motion, certificate.between))
     proof = certificate.proof
     said = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
     of_pairs = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
-    yield from _of_proof(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, said)
+    yield from _bound_errors(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, said)
 
 
-def _unproved_in_time(problem: Problem, certificate: Certificate) -> Iterator[str]:
+def _moving_proof_errors(problem: Problem, certificate: Certificate) -> Iterator[str]:
     """Of obstacles that move."""
     motion, proof = certificate.motion, certificate.moving
     if not problem.moving or not isinstance(motion, Trajectory) or not (np.diff(motion.times) > 0).all():
@@ -102,20 +102,20 @@ def _unproved_in_time(problem: Problem, certificate: Certificate) -> Iterator[st
     times = np.sort(np.concatenate([motion.times, certificate.between]), kind="stable")
     prover = MovingProver(problem.robot, problem.moving, configurations(motion, certificate.between), times)
     every, said = np.ones(len(proof.stretches.claim), bool), {"scene": certificate.scene_clearance}
-    yield from _of_proof(prover, proof, {"scene": every}, said)
+    yield from _bound_errors(prover, proof, {"scene": every}, said)
 
 
-def _of_proof(
+def _bound_errors(
     prover: Prover, proof: Proof, kinds: dict[str, ndarray], said: dict[str, float]
 ) -> Iterator[str]:
     """What is wrong with a proof that leaves so much of each kind of stretches."""
     stretches, known = proof.stretches, {claim: k for k, claim in enumerate(prover.claims)}
     for claim in proof.claims:
         if claim not in known:
-            yield f"proof: nothing is to be proved of {described(claim)}"
+            yield f"proof: nothing is to be proved of {describe_claim(claim)}"
             return
     for missing in known.keys() - set(proof.claims):
-        yield f"proof: nothing is said of {described(missing)}"
+        yield f"proof: nothing is said of {describe_claim(missing)}"
     if len(set(proof.claims)) < len(proof.claims):
         yield "proof: a claim is there twice"
         return
@@ -131,7 +131,7 @@ def _of_proof(
     bounds = prover.bounds(stretches._replace(claim=own), proof.by_planes, list(proof.planes))
     for what in ("clearance", "displacement"):
         written, right = getattr(proof, what), getattr(bounds, what)
-        off = np.flatnonzero(np.abs(written - right) > AGREEMENT)
+        off = np.flatnonzero(np.abs(written - right) > BOUND_TOLERANCE)
         if len(off):
             i = int(off[0])
             more = f" ({len(off) - 1} more)" if len(off) > 1 else ""
@@ -141,7 +141,7 @@ def _of_proof(
         least = said[what]
         if not least > 0:
             yield f"proof: a {what} clearance of {least:g} m is none"
-        unproved = np.flatnonzero(which & (left < min(least, CAP) - AGREEMENT))
+        unproved = np.flatnonzero(which & (left < min(least, CAP) - BOUND_TOLERANCE))
         if len(unproved):
             i = int(unproved[0])
             yield f"proof: {_place(proof, i)} is clear by {left[i]:.6f} m, not by {least:.6f} m"
@@ -163,14 +163,14 @@ def _gaps(proof: Proof, last: float) -> Iterator[str]:
         broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, empty))
         if len(broken):
             low, high = (float(side[broken[0]]) for side in edges)
-            yield f"proof: nothing is said of {described(claim)} from row {low:g} to row {high:g}"
+            yield f"proof: nothing is said of {describe_claim(claim)} from row {low:g} to row {high:g}"
 
 
-def described(claim: Claim) -> str:
+def describe_claim(claim: Claim) -> str:
     return f"{claim.link} against {'the scene' if claim.against == SCENE else claim.against}"
 
 
 def _place(proof: Proof, i: int) -> str:
     stretches = proof.stretches
     claim = proof.claims[int(stretches.claim[i])]
-    return f"{described(claim)} from row {stretches.start[i]:g} to row {stretches.stop[i]:g}"
+    return f"{describe_claim(claim)} from row {stretches.start[i]:g} to row {stretches.stop[i]:g}"

@@ -21,7 +21,7 @@ from robotdiffuse.problems.goals import JointGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 
 
-class Kept(NamedTuple):
+class ConstraintBound(NamedTuple):
     """What is said of one quantity of a constraint."""
 
     name: str
@@ -44,7 +44,7 @@ class _Body(NamedTuple):
         return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
 
 
-class _Along(NamedTuple):
+class _FrameMotion(NamedTuple):
     """A frame from each of n + 1 configurations to the next."""
 
     p: Float[ndarray, "n1 3"]
@@ -60,7 +60,7 @@ class _Along(NamedTuple):
     joints: int
 
 
-def kept(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[Kept]:
+def constraint_bounds(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[ConstraintBound]:
     """Bounds along the straight lines through configurations, and along motions which those leave by at most
     `chord`, each joint [rad] or [m]. Raises InputError for a line whose goal does not say one pose."""
     linkage = Linkage(problem.robot)
@@ -69,30 +69,30 @@ def kept(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[Kep
     placed = linkage.place(q, *frames) if len(frames) == 1 else linkage.place(q)
     found = []
     for constraint in problem.constraints:
-        along = _along(linkage, placed, q, constraint.frame)
+        along = _frame_motion(linkage, placed, q, constraint.frame)
         name = f"{constraint.kind} of {constraint.frame}"
         if isinstance(constraint, AxisCone):
             cosines = along.R @ constraint.axis @ constraint.direction
             least = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
             bounds = np.arccos(np.clip(least, -1.0, 1.0)) + chord * along.joints
-            found.append(Kept(name, constraint.angle, bounds))
+            found.append(ConstraintBound(name, constraint.angle, bounds))
             continue
         if isinstance(constraint, CartesianLine):
-            T_start, T_goal = _ends(problem, linkage, constraint)
+            T_start, T_goal = _line_poses(problem, linkage, constraint)
             body = _segment(T_start[:3, 3], T_goal[:3, 3])
         else:
             body = _body(constraint)
         limit = 0.0 if isinstance(constraint, PositionBox) else constraint.tolerance
         apart = body.distances(along.p)
         bounds = np.maximum(apart[1:], apart[:-1]) + along.sag + chord * along.slack
-        found.append(Kept(name, limit, bounds))
+        found.append(ConstraintBound(name, limit, bounds))
         if isinstance(constraint, CartesianLine) and constraint.angle is not None:
-            bounds = _turned(along, T_start, T_goal, chord)
-            found.append(Kept(f"{name}, its angle", constraint.angle, bounds))
+            bounds = _angle_bounds(along, T_start, T_goal, chord)
+            found.append(ConstraintBound(f"{name}, its angle", constraint.angle, bounds))
     return found
 
 
-def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
+def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
     """A line for each frame that is faster than its constraint allows, by more than a share, at some row."""
     linkage, lines = Linkage(problem.robot), []
     for one in problem.constraints:
@@ -106,7 +106,7 @@ def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
     return lines
 
 
-def _along(linkage: Linkage, postures: Postures, q: ndarray, frame: str) -> _Along:
+def _frame_motion(linkage: Linkage, postures: Postures, q: ndarray, frame: str) -> _FrameMotion:
     T, (joints, rates) = postures.T[:, linkage.links.index(frame)], linkage.rates(postures, frame)
     step = np.abs(np.diff(q, axis=0))[:, joints]
     lengths = np.linalg.norm(rates[:-1], axis=2)
@@ -118,7 +118,7 @@ def _along(linkage: Linkage, postures: Postures, q: ndarray, frame: str) -> _Alo
         before = step[:, :j].sum(axis=1)
         sag += lengths[:, j] * step[:, j] * (step[:, j] + 2 * before) / 8
     turn = step[:, ~linkage.slides[joints]].sum(axis=1)
-    return _Along(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), len(joints))
+    return _FrameMotion(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), len(joints))
 
 
 def _body(constraint: Constraint) -> _Body:
@@ -146,7 +146,7 @@ def _with_z(z: ndarray) -> Float[ndarray, "3 3"]:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _ends(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndarray, ndarray]:
+def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndarray, ndarray]:
     """T_base_frame at start and goal."""
     k = linkage.links.index(line.frame)
     start, goal = linkage.place(problem.start[None]).T[0], problem.goal
@@ -159,7 +159,7 @@ def _ends(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndar
     raise InputError(f"cartesian_line of {line.frame}: the goal does not say one pose of it")
 
 
-def _turned(along: _Along, T_start: ndarray, T_goal: ndarray, chord: float) -> ndarray:
+def _angle_bounds(along: _FrameMotion, T_start: ndarray, T_goal: ndarray, chord: float) -> ndarray:
     """The angle from the orientation that belongs to the frame's share of the segment."""
     way = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(way))

@@ -13,14 +13,14 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
 
-DIGITS = 9
+HASH_DECIMALS = 9
 """Numbers count up to this decimal: rotations from quaternions differ in the last bits by machine."""
-LENGTH = 16
+HASH_LENGTH = 16
 """Hexadecimal digits of the hash of a part; a whole has all 64 of SHA-256."""
 LIMITS = ("lower", "upper", "velocity", "acceleration")
 
 
-def whole(parts: Mapping[str, str]) -> str:
+def combined_hash(parts: Mapping[str, str]) -> str:
     """The hash of all parts."""
     return hashlib.sha256(json.dumps(sorted(parts.items())).encode()).hexdigest()
 
@@ -102,6 +102,6 @@ def _numbers(shape: Shape) -> list[object]:
 def _hash(names: object, *numbers: object) -> str:
     digest = hashlib.sha256(json.dumps(names).encode())
     for values in numbers:
-        rounded = np.round(np.asarray(values, np.float64), DIGITS) + 0.0  # no negative zeros
+        rounded = np.round(np.asarray(values, np.float64), HASH_DECIMALS) + 0.0  # no negative zeros
         digest.update(str(rounded.shape).encode() + rounded.tobytes())
-    return digest.hexdigest()[:LENGTH]
+    return digest.hexdigest()[:HASH_LENGTH]

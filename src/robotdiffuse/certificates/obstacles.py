@@ -12,13 +12,13 @@ from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
-CAP = 1.0
+CLEARANCE_CAP = 1.0
 """Clearances are not told apart beyond this [m]."""
-BEYOND = 0.2
+PLANE_RANGE = 0.2
 """Elements of surfaces further from a part's ball than this [m] count as being there, and need no planes."""
-NEAR = 4.0
+EXACT_TRIANGLE_RANGE = 4.0
 """Triangles further away than this many times their size count as balls."""
-MOST = 1_000_000
+MAX_ARRAY_SIZE = 1_000_000
 """Numbers in an array at a time."""
 
 
@@ -68,20 +68,20 @@ class Obstacles:
         self._indices = {i: _Index(body) for i, body in enumerate(self.bodies) if isinstance(body, Surface)}
 
     def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n obstacles"]:
-        """How far points are from each obstacle [m], at most CAP; 0 or less inside."""
-        found = np.full((len(points), len(self.bodies)), CAP)
-        step = max(MOST // max(3 * len(self._at), 1), 1)
+        """How far points are from each obstacle [m], at most CLEARANCE_CAP; 0 or less inside."""
+        found = np.full((len(points), len(self.bodies)), CLEARANCE_CAP)
+        step = max(MAX_ARRAY_SIZE // max(3 * len(self._at), 1), 1)
         for first in range(0, len(points), step):
             some = slice(first, first + step)
-            found[some, self._at] = np.minimum(self._to_rounded(points[some]), CAP)
+            found[some, self._at] = np.minimum(self._to_rounded(points[some]), CLEARANCE_CAP)
         for i, index in self._indices.items():
             found[:, i] = index.distances(points)
         return found
 
     def near(self, center: Float[ndarray, "3"], radius: float) -> tuple[Rounded | Surface, ...]:
-        """The bodies; of surfaces, at least the elements that come within BEYOND of a ball."""
+        """The bodies; of surfaces, at least the elements that come within PLANE_RANGE of a ball."""
         return tuple(
-            self._indices[i].near(center, radius + BEYOND) if isinstance(body, Surface) else body
+            self._indices[i].near(center, radius + PLANE_RANGE) if isinstance(body, Surface) else body
             for i, body in enumerate(self.bodies)
         )
 
@@ -125,23 +125,24 @@ class _Index:
         self._classes = [(KDTree(middles), rows, size) for middles, rows, size in _by_size(surface.corners)]
 
     def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        """To the nearest element [m], at most CAP: exactly where that is near, else to the ball around it."""
-        found = np.full(len(points), CAP)
+        """To the nearest element [m], at most CLEARANCE_CAP: exactly where that is near, else to the ball
+        around it."""
+        found = np.full(len(points), CLEARANCE_CAP)
         for tree, rows, size in self._classes:
             to_middle = tree.query(points)[0]
-            near = (to_middle <= NEAR * size) & (to_middle - size < found)
+            near = (to_middle <= EXACT_TRIANGLE_RANGE * size) & (to_middle - size < found)
             if len(self.surface.corners[0]) == 1:
                 near[:] = False
             found = np.where(near, found, np.minimum(found, to_middle - size))
             which = np.flatnonzero(near)
             within = tree.query_ball_point(points[which], to_middle[which] + size)
             counts = np.array([len(some) for some in within], int)
-            for some in np.array_split(np.arange(len(which)), counts.sum() * 9 // MOST + 1):
+            for some in np.array_split(np.arange(len(which)), counts.sum() * 9 // MAX_ARRAY_SIZE + 1):
                 if len(some):
                     of = np.repeat(which[some], counts[some])
                     triangles = self.surface.corners[rows[np.concatenate(within[some]).astype(int)]]
                     np.minimum.at(found, of, _to_triangles(points[of], triangles))
-        return np.minimum(found - self.surface.radius, CAP)
+        return np.minimum(found - self.surface.radius, CLEARANCE_CAP)
 
     def near(self, center: Float[ndarray, "3"], reach: float) -> Surface:
         """Those that come within a distance of a point, and perhaps more."""

@@ -16,7 +16,7 @@ from robotdiffuse.certificates.obstacles import Rounded, Surface
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 
-MOST_PLANES = 64
+MAX_PLANES = 64
 """Of a part and a surface: concave ones need several."""
 DECIMALS = 7
 """Of normals."""
@@ -81,7 +81,7 @@ def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterat
     shown = np.full(len(surface.corners), -np.inf)
     order = np.argsort(np.sqrt(((surface.corners - part.center) ** 2).sum(axis=-1)).min(axis=1))
     asked = np.zeros(len(order), bool)
-    for _ in range(MOST_PLANES):
+    for _ in range(MAX_PLANES):
         left = order[(shown[order] < needed) & ~asked[order]]
         if not len(left):
             return

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
     from robotdiffuse.certificates.checker import Findings
     from robotdiffuse.problems.problem import Problem
 
-MARK, VERSION = "robotdiffuse certificate", 1
-AGREEMENT = 1e-6
+FILE_MARK, VERSION = "robotdiffuse certificate", 1
+BOUND_TOLERANCE = 1e-6
 """Bounds may be this far from what a certificate says [m] or [rad]: they are rounded there."""
 DECIMALS = 7
 """Of bounds in files [m]."""
-ROWS = ("times", "velocities", "accelerations")
-FIELDS = ("claims", "start", "stop", "by_planes", "clearance", "displacement", "planes")
+RATE_ROWS = ("times", "velocities", "accelerations")
+STRETCH_FIELDS = ("claims", "start", "stop", "by_planes", "clearance", "displacement", "planes")
 
 
 @dataclass(frozen=True)
@@ -129,14 +129,14 @@ def load_certificate(file: str | FilePath) -> Certificate:
 
 def is_certificate(record: object) -> bool:
     """Whether this is the content of a certificate file."""
-    return isinstance(record, dict) and record.get("is") == MARK
+    return isinstance(record, dict) and record.get("is") == FILE_MARK
 
 
 def _record(certificate: Certificate) -> dict[str, Any]:
     motion, proof = certificate.motion, certificate.proof
     timed = isinstance(motion, Trajectory)
     return {
-        "is": MARK,
+        "is": FILE_MARK,
         "version": VERSION,
         "robot": certificate.robot,
         "robot_parts": certificate.robot_parts,
@@ -149,7 +149,7 @@ def _record(certificate: Certificate) -> dict[str, Any]:
         "motion": {
             "joint_names": list(motion.joint_names),
             "positions": motion.positions.tolist(),
-            **({name: getattr(motion, name).tolist() for name in ROWS} if timed else {}),
+            **({name: getattr(motion, name).tolist() for name in RATE_ROWS} if timed else {}),
         },
         "between": certificate.between.tolist(),
         "proof": _proof_record(proof),
@@ -214,7 +214,7 @@ def _certificate(record: dict[str, Any]) -> Certificate:
 
 def _motion(record: dict[str, Any]) -> Path | Trajectory:
     names = tuple(map(str, record["joint_names"]))
-    rows = {name: numbers(record[name]) for name in ("positions", *ROWS) if name in record}
+    rows = {name: numbers(record[name]) for name in ("positions", *RATE_ROWS) if name in record}
     shape = (len(rows["positions"]) if rows["positions"] is not None else 0, len(names))
     for name, array in rows.items():
         wanted = shape[:1] if name == "times" else shape
@@ -226,11 +226,11 @@ def _motion(record: dict[str, Any]) -> Path | Trajectory:
 
 
 def _proof(record: list[dict[str, Any]]) -> Proof:
-    claims, columns, planes = [], {name: [np.zeros(0)] for name in ("claim", *FIELDS[1:6])}, []
+    claims, columns, planes = [], {name: [np.zeros(0)] for name in ("claim", *STRETCH_FIELDS[1:6])}, []
     begin = 0
     for k, entry in enumerate(record):
         claims.append(Claim(str(entry["link"]), str(entry["against"])))
-        found = {name: _vector(name, entry[name]) for name in FIELDS[1:6] if name != "by_planes"}
+        found = {name: _vector(name, entry[name]) for name in STRETCH_FIELDS[1:6] if name != "by_planes"}
         count = len(found["start"])
         if any(len(values) != count for values in found.values()):
             raise InputError(f"proof of {claims[-1].link}: its columns must be of one length")

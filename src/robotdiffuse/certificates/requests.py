@@ -6,20 +6,20 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.certificates.constraints import kept, too_fast
+from robotdiffuse.certificates.constraints import constraint_bounds, frame_speed_errors
 from robotdiffuse.certificates.kinematics import Linkage
-from robotdiffuse.certificates.proof import AGREEMENT, Certificate, Tolerances
-from robotdiffuse.certificates.torques import most_torques
+from robotdiffuse.certificates.proof import BOUND_TOLERANCE, Certificate, Tolerances
+from robotdiffuse.certificates.torques import torque_bounds
 from robotdiffuse.core.errors import joined
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 
-WINDOWS = (1e-3, 4e-3, 16e-3)
+AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
 """Rows closer to each other than the first of these [s] must keep limits over windows of at least these
 lengths too: from one row to the next, the slack of positions hides any rate."""
-SHORTEST = 1e-12
+MIN_TIME = 1e-12
 """Shorter times count as this one [s]: rates over them are not finite."""
 
 
@@ -58,7 +58,7 @@ def not_covered(problem: Problem, motion: Path | Trajectory) -> list[str]:
     return ["moving, without times"] if untimed and problem.moving else []
 
 
-def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
+def requirement_errors(problem: Problem, certificate: Certificate) -> Iterator[str]:
     """A line for each thing that the motion does not do."""
     robot, motion, tolerances = problem.robot, certificate.motion, certificate.tolerances
     for name in not_covered(problem, motion):
@@ -78,13 +78,13 @@ def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
         yield "motion: it does not end at the goal"
     if isinstance(motion, Trajectory):
         begins = np.zeros(robot.dof) if problem.start_velocity is None else problem.start_velocity
-        yield from _wrong_rates(robot, motion, certificate, begins)
-        yield from too_fast(problem, motion, tolerances.rate_slack)
-    yield from _not_kept(problem, certificate, q)
-    yield from _not_borne(problem, certificate)
+        yield from _rate_errors(robot, motion, certificate, begins)
+        yield from frame_speed_errors(problem, motion, tolerances.rate_slack)
+    yield from _constraint_errors(problem, certificate, q)
+    yield from _torque_errors(problem, certificate)
 
 
-def _not_borne(problem: Problem, certificate: Certificate) -> Iterator[str]:
+def _torque_errors(problem: Problem, certificate: Certificate) -> Iterator[str]:
     """What is not shown of the torques of a payload, or not as the certificate says."""
     motion, said = certificate.motion, dict(certificate.torques)
     if problem.payload is None:
@@ -96,32 +96,34 @@ def _not_borne(problem: Problem, certificate: Certificate) -> Iterator[str]:
         return
     if isinstance(motion, Trajectory) and not (np.diff(motion.times) > 0).all():
         return
-    most = most_torques(problem, motion, certificate.looks).max(axis=0)
+    most = torque_bounds(problem, motion, certificate.looks).max(axis=0)
     allowed = problem.robot.effort * (1 + certificate.tolerances.rate_slack)
     for name, torque, limit in zip(said, most, allowed, strict=True):
-        if abs(torque - said[name]) > AGREEMENT:
+        if abs(torque - said[name]) > BOUND_TOLERANCE:
             yield f"torques: {name} bears at most {torque:.6f}, not {said[name]:.6f}"
         if not torque <= limit:
             yield f"torques: {name} is not shown to keep its limit: {torque:.6f}, of {limit:.6f}"
 
 
-def _not_kept(problem: Problem, certificate: Certificate, q: Float[ndarray, "n dof"]) -> Iterator[str]:
+def _constraint_errors(
+    problem: Problem, certificate: Certificate, q: Float[ndarray, "n dof"]
+) -> Iterator[str]:
     """What is not shown of path constraints, or not as the certificate says."""
     if not problem.constraints and not certificate.constraints:
         return
-    shown = kept(problem, q, certificate.tolerances.chord)
+    shown = constraint_bounds(problem, q, certificate.tolerances.chord)
     if [one.name for one in shown] != [name for name, _ in certificate.constraints]:
         yield "constraints: the certificate is not about those of the problem"
         return
     for one, (_, said) in zip(shown, certificate.constraints, strict=True):
         most = float(one.bounds.max())
-        if abs(most - said) > AGREEMENT:
+        if abs(most - said) > BOUND_TOLERANCE:
             yield f"constraints: {one.name} is at most {most:.6f}, not {said:.6f}"
         if not most <= one.limit:
             yield f"constraints: {one.name} is not shown to be kept: {most:.6f}, of {one.limit:.6f}"
 
 
-def _wrong_rates(
+def _rate_errors(
     robot: Robot, motion: Trajectory, certificate: Certificate, begins: Float[ndarray, "dof"]
 ) -> Iterator[str]:
     tolerances, step = certificate.tolerances, np.diff(motion.times)[:, None]
@@ -132,7 +134,10 @@ def _wrong_rates(
     if len(np.unique(times)) != len(times) or times[0] < motion.times[0] or times[-1] > motion.times[-1]:
         yield "motion: the times between its rows are not between them"
         return
-    if len(motion.times) > 1 and not _widest_chord(motion, times) <= tolerances.chord * (1 + 1e-6) + 1e-12:
+    if (
+        len(motion.times) > 1
+        and not _largest_chord_error(motion, times) <= tolerances.chord * (1 + 1e-6) + 1e-12
+    ):
         yield "motion: its cubics leave the straight lines that were certified"
     v, a, share = motion.velocities, motion.accelerations, 1 + tolerances.rate_slack
     mean, change = np.diff(motion.positions, axis=0) / step, np.diff(v, axis=0) / step
@@ -143,14 +148,14 @@ def _wrong_rates(
         ("mean acceleration between rows", change, robot.acceleration),
     )
     unsure = 2 * tolerances.limit_slack
-    blur = {"mean velocity between rows": unsure / np.maximum(step, SHORTEST)}
+    blur = {"mean velocity between rows": unsure / np.maximum(step, MIN_TIME)}
     for what, values, limit in rates:
         over = ~(np.abs(values) <= share * limit + blur.get(what, 0.0)) & (limit > 0)
         for j in np.flatnonzero(over.any(axis=0)):
             most = np.abs(values[:, j]).max()
             yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {most:.4g} > {limit[j]:.4g}"
-    yield from _too_far(robot, motion, share, unsure)
-    yield from _too_bent(robot, motion, begins, share, unsure, tolerances.rate_slack)
+    yield from _position_errors(robot, motion, share, unsure)
+    yield from _acceleration_errors(robot, motion, begins, share, unsure, tolerances.rate_slack)
     known = np.where(robot.velocity > 0, robot.velocity, np.abs(v).max(axis=0, initial=0.0))
     off = np.abs(np.stack([v[0] - begins, v[-1]]))
     if (off > tolerances.rate_slack * known + tolerances.rest).any():
@@ -158,7 +163,7 @@ def _wrong_rates(
         yield f"motion: it does not begin {how} at rest"
 
 
-def _too_far(robot: Robot, motion: Trajectory, share: float, unsure: float) -> Iterator[str]:
+def _position_errors(robot: Robot, motion: Trajectory, share: float, unsure: float) -> Iterator[str]:
     """Joints that get further, from any row to any later one, than their velocity limits allow in that time.
 
     Positions are not known better than `unsure`, once for the two rows and, for rows far apart, once for each
@@ -166,7 +171,7 @@ def _too_far(robot: Robot, motion: Trajectory, share: float, unsure: float) -> I
     """
     step, q = np.diff(motion.times)[:, None], motion.positions
     allowed = np.zeros_like(q)
-    most = share * robot.velocity * step + unsure * np.minimum(step / WINDOWS[0], 1.0)
+    most = share * robot.velocity * step + unsure * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
     np.cumsum(most, axis=0, out=allowed[1:])
     furthest = np.zeros(q.shape[1])
     for way in (q, -q):
@@ -179,7 +184,7 @@ def _too_far(robot: Robot, motion: Trajectory, share: float, unsure: float) -> I
         yield f"motion: {name} exceeds its limit of mean velocity from one row to another: {how}"
 
 
-def _too_bent(
+def _acceleration_errors(
     robot: Robot,
     motion: Trajectory,
     begins: Float[ndarray, "dof"],
@@ -193,8 +198,8 @@ def _too_bent(
     from the mean velocity before a row to that after it, is one of those that the joint must have had.
     """
     times, q, limit = motion.times, motion.positions, robot.acceleration
-    fine = np.diff(times).min(initial=np.inf) < WINDOWS[0]
-    for window in WINDOWS if fine else WINDOWS[:1]:
+    fine = np.diff(times).min(initial=np.inf) < AVERAGING_WINDOWS[0]
+    for window in AVERAGING_WINDOWS if fine else AVERAGING_WINDOWS[:1]:
         at = np.concatenate([[times[0] - window], times, [times[-1] + window]])
         rows = np.concatenate([q[:1] - window * begins, q, q[-1:]])
         first = np.searchsorted(at, times - window, side="right") - 1
@@ -213,7 +218,7 @@ def _too_bent(
             return
 
 
-def _widest_chord(motion: Trajectory, times: Float[ndarray, "n"]) -> float:
+def _largest_chord_error(motion: Trajectory, times: Float[ndarray, "n"]) -> float:
     """How far the cubics leave the straight lines between certified configurations at most [rad] or [m]: an
     eighth of the greatest second derivative times the square of the time between them. It is linear in time,
     so greatest at an end."""

@@ -1,8 +1,8 @@
 """Writing certificates: the search for a proof that the checker can re-check without one.
 
-A motion that the validator calls valid is cut, for each claim apart, until every stretch is proved by the bounds
-that the checker uses. Where spheres are too coarse, planes are laid through the middle between the nearest
-points of convex bodies, which Coal finds.
+A motion that the validator calls valid is cut, for each claim apart, until every stretch is proved by the
+bounds that the checker uses. Where spheres are too coarse, planes are laid through the middle between the
+nearest points of convex bodies, which Coal finds.
 """
 
 from dataclasses import replace
@@ -14,31 +14,31 @@ from numpy import ndarray
 
 from robotdiffuse.certificates.bounds import CAP, SCENE, Plane, Prover, Stretches
 from robotdiffuse.certificates.checker import hash_of
-from robotdiffuse.certificates.constraints import kept
+from robotdiffuse.certificates.constraints import constraint_bounds
 from robotdiffuse.certificates.content import request_parts, robot_parts, scene_parts
 from robotdiffuse.certificates.moving_obstacles import MovingProver
 from robotdiffuse.certificates.planes import PlaneFinder
 from robotdiffuse.certificates.proof import DECIMALS, Certificate, Proof, Tolerances
 from robotdiffuse.certificates.requests import configurations, not_covered
-from robotdiffuse.certificates.torques import most_torques
+from robotdiffuse.certificates.torques import torque_bounds
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.validation.validator import DEFAULT, VerifySettings, verify, verify_trajectory
 
-SHARE = 0.5
+CLEARANCE_SHARE = 0.5
 """Of the clearances that the validator certifies: what the certificate proves. More takes more stretches."""
-MOST_PARTS = 8
+MAX_SPLIT = 8
 """A stretch is cut into at most this many at a time."""
 PLANES_BELOW = 0.02
 """Sphere clearance [m] below which planes are looked for: spheres stick out by about as much."""
-DISPLACED = 0.1
+PLANES_DISPLACEMENT = 0.1
 """Longest displacement of stretches that planes are looked for [m]."""
-SPARE = 2e-6
+ROUNDING_RESERVE = 2e-6
 """What is left over at least, for rounding [m]."""
-MOST_STRETCHES = 200_000
+MAX_STRETCHES = 200_000
 PLACE_DECIMALS = 7
-HALVINGS = 20
+MAX_HALVINGS = 20
 """Of the way between two configurations until path constraints are shown to be kept there."""
 
 
@@ -63,12 +63,17 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         raise NotValidError(
             f"the motion is not valid: {report.violation.message} (at {report.violation.time:.3f})"
         )
-    least = {SCENE: SHARE * (report.scene_clearance or 0.0), "": SHARE * (report.self_clearance or 0.0)}
+    least = {
+        SCENE: CLEARANCE_SHARE * (report.scene_clearance or 0.0),
+        "": CLEARANCE_SHARE * (report.self_clearance or 0.0),
+    }
     tolerances = Tolerances(**{name: getattr(settings, name) for name in Tolerances.__dataclass_fields__})
     if problem.constraints:
         tolerances = replace(tolerances, chord=settings.constraint_chord)
-    between, bounds = _keeping(problem, motion, _between(motion, tolerances.chord), tolerances.chord)
-    looks, torques = _bearing(problem, motion, tolerances.rate_slack)
+    between, bounds = _prove_constraints(
+        problem, motion, _between(motion, tolerances.chord), tolerances.chord
+    )
+    looks, torques = _prove_torques(problem, motion, tolerances.rate_slack)
     q = configurations(motion, between)
     proof, left = _prove(Prover(problem.robot, problem.scene, q), least)
     moving = None
@@ -96,7 +101,7 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
     )
 
 
-def _keeping(
+def _prove_constraints(
     problem: Problem, motion: Path | Trajectory, between: Float[ndarray, "k"], chord: float
 ) -> tuple[Float[ndarray, "m"], tuple[tuple[str, float], ...]]:
     """Times, or places of a path, between the rows from which to which all path constraints are shown to be
@@ -105,20 +110,20 @@ def _keeping(
         return between, ()
     timed = isinstance(motion, Trajectory)
     rows = motion.times if timed else np.arange(len(motion.positions), dtype=float)
-    for _ in range(HALVINGS):
-        shown = kept(problem, configurations(motion, between), chord)
+    for _ in range(MAX_HALVINGS):
+        shown = constraint_bounds(problem, configurations(motion, between), chord)
         open_ = np.any([one.bounds > one.limit for one in shown], axis=0)
         if not open_.any():
             return between, tuple((one.name, float(one.bounds.max())) for one in shown)
         at = np.sort(np.concatenate([rows, between]), kind="stable")
         more = (at[:-1] + at[1:])[open_[: len(at) - 1]] / 2
         between = np.sort(np.concatenate([between, more]))
-        if len(between) > MOST_STRETCHES:
+        if len(between) > MAX_STRETCHES:
             break
     raise InputError("no proof was found for the path constraints: the motion is too near to their limits")
 
 
-def _bearing(
+def _prove_torques(
     problem: Problem, motion: Path | Trajectory, slack: float
 ) -> tuple[Float[ndarray, "k"], tuple[tuple[str, float], ...]]:
     """Times, or places of a path, between the rows from which to which all torques are shown to be within
@@ -128,13 +133,13 @@ def _bearing(
         return looks, ()
     timed = isinstance(motion, Trajectory)
     rows = motion.times if timed else np.arange(len(motion.positions), dtype=float)
-    for _ in range(HALVINGS):
-        most = most_torques(problem, motion, looks)
+    for _ in range(MAX_HALVINGS):
+        most = torque_bounds(problem, motion, looks)
         open_ = (most > problem.robot.effort * (1 + slack)).any(axis=1)
         if not open_.any():
             return looks, tuple(zip(problem.robot.joint_names, most.max(axis=0).tolist(), strict=True))
         at = np.sort(np.concatenate([rows, looks]))
-        if len(at) == 1 or len(at) > MOST_STRETCHES:
+        if len(at) == 1 or len(at) > MAX_STRETCHES:
             break
         looks = np.sort(np.concatenate([looks, ((at[:-1] + at[1:]) / 2)[open_]]))
     raise InputError("no proof was found for the torques: the motion is too near to their limits")
@@ -158,7 +163,7 @@ def _between(motion: Path | Trajectory, chord: float) -> Float[ndarray, "k"]:
     bend = np.maximum(np.abs(6 * mean - 4 * v0 - 2 * v1), np.abs(6 * mean - 2 * v0 - 4 * v1)) / h
     off = (bend * h**2 / 8).max(axis=1, initial=0.0)
     parts = np.maximum(np.ceil(np.sqrt(off / chord)), 1).astype(int)
-    if parts.sum() > MOST_STRETCHES:
+    if parts.sum() > MAX_STRETCHES:
         raise InputError("the motion bends too much between its rows to be certified; give more rows")
     within = [t + d * np.arange(1, n) / n for t, d, n in zip(motion.times, h[:, 0], parts, strict=False)]
     return np.concatenate([np.zeros(0), *within])
@@ -177,7 +182,7 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
     count, last = len(prover.claims), float(len(prover.q) - 1)
     todo = Stretches(np.arange(count), np.zeros(count), np.full(count, last))
     against_scene = np.array([claim.against == SCENE for claim in prover.claims], bool)
-    targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + SPARE
+    targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + ROUNDING_RESERVE
     in_time = isinstance(prover, MovingProver)
     tools = None if in_time else PlaneFinder(prover)
     done: list[_Found] = []
@@ -187,7 +192,11 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
         found = prover.bounds(todo, np.zeros(n, bool), [])
         clearance, displacement = _down(found.clearance), _up(found.displacement)
         by_planes, planes, target = np.zeros(n, bool), list[Plane](), targets[todo.claim]
-        close = (clearance - displacement < target) & (clearance < PLANES_BELOW) & (displacement < DISPLACED)
+        close = (
+            (clearance - displacement < target)
+            & (clearance < PLANES_BELOW)
+            & (displacement < PLANES_DISPLACEMENT)
+        )
         if tools is not None and close.any():
             rows = np.flatnonzero(close)
             planes = tools.planes(todo, rows, displacement[rows] + target[rows])
@@ -197,12 +206,12 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
             chosen = by_planes[rows]
             clearance[rows[chosen]], displacement[rows[chosen]] = better[chosen], less[chosen]
         proved = clearance - displacement >= target
-        done.append(_kept(todo, proved, by_planes, clearance, displacement, planes))
+        done.append(_proved_part(todo, proved, by_planes, clearance, displacement, planes))
         total += n
-        if total > MOST_STRETCHES:
-            raise InputError(f"no proof of less than {MOST_STRETCHES:,} stretches was found for the motion")
+        if total > MAX_STRETCHES:
+            raise InputError(f"no proof of less than {MAX_STRETCHES:,} stretches was found for the motion")
         todo = _cut(todo, clearance, displacement, target, ~proved)
-    return _joined(prover, done)
+    return _join(prover, done)
 
 
 def _renumbered(planes: list[Plane], rows: ndarray) -> list[Plane]:
@@ -210,7 +219,7 @@ def _renumbered(planes: list[Plane], rows: ndarray) -> list[Plane]:
     return [plane._replace(stretch=number[plane.stretch]) for plane in planes]
 
 
-def _kept(
+def _proved_part(
     todo: Stretches,
     proved: ndarray,
     by_planes: ndarray,
@@ -231,10 +240,10 @@ def _cut(
     todo: Stretches, clearance: ndarray, displacement: ndarray, target: ndarray, which: ndarray
 ) -> Stretches:
     """Those that are not proved, in as many parts as their displacement asks for."""
-    spare = np.maximum(clearance - target, displacement / MOST_PARTS)
+    spare = np.maximum(clearance - target, displacement / MAX_SPLIT)
     # where spheres are too near, until planes may help
-    asked = np.where(clearance < PLANES_BELOW, displacement / DISPLACED, 1.2 * displacement / spare)
-    parts = np.clip(np.ceil(asked), 2, MOST_PARTS).astype(int)
+    asked = np.where(clearance < PLANES_BELOW, displacement / PLANES_DISPLACEMENT, 1.2 * displacement / spare)
+    parts = np.clip(np.ceil(asked), 2, MAX_SPLIT).astype(int)
     claims, starts, stops = [], [], []
     for i in np.flatnonzero(which).tolist():
         low, high, n = float(todo.start[i]), float(todo.stop[i]), int(parts[i])
@@ -250,7 +259,7 @@ def _cut(
     return Stretches(np.concatenate(claims), np.concatenate(starts), np.concatenate(stops))
 
 
-def _joined(prover: Prover, done: list[_Found]) -> tuple[Proof, dict[str, float]]:
+def _join(prover: Prover, done: list[_Found]) -> tuple[Proof, dict[str, float]]:
     claim, start, stop = (np.concatenate(parts) for parts in zip(*(f.stretches for f in done), strict=True))
     order = np.lexsort((start, claim))
     place = np.empty(len(order), int)

@@ -19,7 +19,7 @@ from robotdiffuse.robots.inertias import Inertia
 
 GRAVITY = 9.81
 """Along -z of the world [m/s²]."""
-ALMOST = 1e-9
+MIN_MASS = 1e-9
 """Lightest mass that counts [kg]."""
 
 
@@ -57,20 +57,20 @@ class States(NamedTuple):
     """Of accelerations."""
 
 
-def most_torques(
+def torque_bounds(
     problem: Problem, motion: Path | Trajectory, looks: Float[ndarray, "k"]
 ) -> Float[ndarray, "m dof"]:
     """What each joint bears at most from each look to the next [N m] or [N]. Looks are the rows and, between
     them, further times, or places of a path: rows plus shares."""
     states = _states(motion, looks)
     torques = np.abs(inverse_dynamics(problem, states.q, states.v, states.a))
-    bends = _bends(problem, states)
+    bends = _second_derivative_bounds(problem, states)
     return np.maximum(torques[:-1], torques[1:]) + bends * states.lasts[:, None] ** 2 / 8
 
 
 def _states(motion: Path | Trajectory, looks: Float[ndarray, "k"]) -> States:
     if not isinstance(motion, Trajectory) or len(motion.times) == 1:
-        return _held(motion.positions, looks)
+        return _static_states(motion.positions, looks)
     times, h = motion.times, np.diff(motion.times)[:, None]
     at = np.sort(np.concatenate([times, looks]))
     row = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
@@ -99,7 +99,7 @@ def _states(motion: Path | Trajectory, looks: Float[ndarray, "k"]) -> States:
     )
 
 
-def _held(positions: Float[ndarray, "n dof"], looks: Float[ndarray, "k"]) -> States:
+def _static_states(positions: Float[ndarray, "n dof"], looks: Float[ndarray, "k"]) -> States:
     rows = np.arange(len(positions))
     at = np.sort(np.concatenate([rows, looks]))
     q = np.column_stack([np.interp(at, rows, joint) for joint in positions.T])
@@ -132,7 +132,7 @@ def inverse_dynamics(
             else:
                 w, dw = w + along, dw + bent + np.cross(w, along)
         turning[joint.child] = w, dw, pull
-    carried = _carried(problem)
+    carried = _masses(problem)
     force, moment = ({link: still for link in linkage.links} for _ in range(2))
     torques = np.empty_like(q)
     for joint in reversed(robot.joints):
@@ -155,7 +155,7 @@ def inverse_dynamics(
     return torques
 
 
-def _bends(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
+def _second_derivative_bounds(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
     """Second derivatives of torques at most, from each look to the next: the same equations in bounds."""
     robot, linkage = problem.robot, Linkage(problem.robot)
     number = {joint.name: j for j, joint in enumerate(robot.planned_joints)}
@@ -167,7 +167,7 @@ def _bends(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
         seen, w, dw, pull = turning[joint.parent]
         held = joint.motion(robot.locked.get(joint.name, 0.0)) if joint.name not in number else np.eye(4)
         reach = float(np.linalg.norm((joint.T_parent_joint @ held)[:3, 3]))
-        axis, arm = _turned(1.0, seen), _turned(reach, seen)
+        axis, arm = _rotating(1.0, seen), _rotating(reach, seen)
         j = number.get(joint.name)
         if j is None:
             pull = pull + dw * arm + w * (w * arm)
@@ -181,14 +181,14 @@ def _bends(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
                 pull = pull + dw * arm + w * (w * arm)
                 seen, w, dw = seen + rate, w + along, dw + bent * axis + w * along
         turning[joint.child], axes[joint.child], arms[joint.child] = (seen, w, dw, pull), axis, arm
-    carried = _carried(problem)
+    carried = _masses(problem)
     force, moment = ({link: still for link in linkage.links} for _ in range(2))
     bends = np.empty((len(none), robot.dof))
     for joint in reversed(robot.joints):
         link, (seen, w, dw, pull) = joint.child, turning[joint.child]
         for body in carried.get(link, ()):
             arm, most = (
-                _turned(float(np.linalg.norm(body.com)), seen),
+                _rotating(float(np.linalg.norm(body.com)), seen),
                 float(np.linalg.eigvalsh(body.moments)[-1]),
             )
             inertia = Bound(none + most, 2 * most * seen.size, most * (2 * seen.first + 4 * seen.size**2))
@@ -203,16 +203,16 @@ def _bends(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
     return bends
 
 
-def _turned(length: float, seen: Bound) -> Bound:
+def _rotating(length: float, seen: Bound) -> Bound:
     """A vector of a link, which turns with it as it is seen."""
     return Bound(length + 0 * seen.size, length * seen.size, length * (seen.first + seen.size**2))
 
 
-def _carried(problem: Problem) -> dict[str, list[Inertia]]:
+def _masses(problem: Problem) -> dict[str, list[Inertia]]:
     """What each link weighs, and the payload."""
     payload, found = problem.payload, {link: [of] for link, of in problem.robot.inertias.items()}
     assert payload is not None
-    if payload.mass > ALMOST:
+    if payload.mass > MIN_MASS:
         link = payload.link or problem.robot.tip
         found.setdefault(link, []).append(Inertia(payload.mass, payload.com, np.diag(payload.moments)))
     return found

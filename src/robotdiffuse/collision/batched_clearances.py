@@ -8,7 +8,7 @@ from jaxtyping import Float32
 from numba import njit
 from numpy import ndarray
 
-from robotdiffuse.collision.kernel_arrays import BOX_SLACK, NO_BOX, RobotArrays, SceneArrays, compile_scene
+from robotdiffuse.collision.kernel_arrays import BOX_SLACK, EMPTY_BOX, RobotArrays, SceneArrays, compile_scene
 from robotdiffuse.collision.kernels.clearance_gradients import clearances_and_gradients_into
 from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_clearance import clearances_into, make_clearance_workspace
@@ -17,7 +17,7 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box
 
-_ZERO, _ONE, _FAR = np.float32(0.0), np.float32(1.0), np.float32(NO_BOX[0, 0])
+_ZERO, _ONE, _NO_BOX_CORNER = np.float32(0.0), np.float32(1.0), np.float32(EMPTY_BOX[0, 0])
 
 
 @allocation_free()
@@ -61,7 +61,7 @@ class _Rows(NamedTuple):
     spheres: ndarray
     boxes: ndarray
     solids: ndarray
-    around: ndarray
+    solid_boxes: ndarray
 
 
 @njit(cache=True)
@@ -81,7 +81,7 @@ def _join(spheres, boxes, solids, around):
     n, total = len(spheres), len(spheres) + len(boxes)
     solids[:total] = _ZERO
     rows = (total + W - 1) // W
-    around[:rows, : 3 * W], around[:rows, 3 * W :] = _FAR, -_FAR
+    around[:rows, : 3 * W], around[:rows, 3 * W :] = _NO_BOX_CORNER, -_NO_BOX_CORNER
     for k in range(total):
         solid = solids[k]
         if k < n:
@@ -108,14 +108,14 @@ def _scene(empty, floors, floor, kinds, params, rows):
         fixed = 1
     n, m = _unpack(kinds, params, rows.spheres, rows.boxes[fixed:])
     spheres, boxes = rows.spheres[:n], rows.boxes[: fixed + m]
-    sixteens = _join(spheres, boxes, rows.solids, rows.around)
+    sixteens = _join(spheres, boxes, rows.solids, rows.solid_boxes)
     return SceneArrays(
         spheres,
         boxes,
         empty.cylinders,
         empty.capsules,
         rows.solids[: n + fixed + m],
-        rows.around[:sixteens],
+        rows.solid_boxes[:sixteens],
         empty.points,
         empty.point_rows,
         empty.cell_first,

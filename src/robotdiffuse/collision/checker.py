@@ -62,7 +62,7 @@ class CollisionChecker:
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
         """Distance between the links of each checked pair [m], at most 1 m."""
-        return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), distance.CAP)
+        return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), distance.CLEARANCE_CAP)
 
     def cost_gradients(
         self, q: Float[ndarray, "n dof"], margin: float, self_margin: float = 0.01

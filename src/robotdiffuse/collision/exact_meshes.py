@@ -35,11 +35,11 @@ from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
-CHUNK = 8192
+CHUNK_SIZE = 8192
 """Configurations that `collides` treats at once; bounds its memory."""
-BEYOND = 1e-6
+CLEAR_DISTANCE = 1e-6
 """A positive distance [m]: `collides` need not know any that is larger."""
-MOST_CONTACTS = 200
+MAX_CONTACTS = 200
 """Triangles or points of one obstacle that the depth of a link is looked for at; 1,000 take 5 ms."""
 
 
@@ -60,7 +60,7 @@ class _Piece(NamedTuple):
     """None: the geometry is in frame coordinates already."""
 
 
-TREE_SECONDS = 4e-6
+TREE_SECONDS_PER_ELEMENT = 4e-6
 """That a point or a triangle takes in Coal's tree, about [s]."""
 
 
@@ -135,7 +135,8 @@ def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
         count, what = _surfaces(solid.shape)
         if count:
             check_time(
-                f"the validator's tree over the {count:,} {what} of {solid.shape.name}", TREE_SECONDS * count
+                f"the validator's tree over the {count:,} {what} of {solid.shape.name}",
+                TREE_SECONDS_PER_ELEMENT * count,
             )
         obstacles.append(_obstacle(solid))
     return tuple(obstacles)
@@ -181,7 +182,7 @@ class ExactCollision:
         self._request.enable_signed_distance = True
         self._first_contact, self._contacts = coal.CollisionRequest(), coal.CollisionRequest()
         self._first_contact.enable_contact = self._contacts.enable_contact = True
-        self._contacts.num_max_contacts = MOST_CONTACTS
+        self._contacts.num_max_contacts = MAX_CONTACTS
         self._collide = coal.CollisionRequest()
 
     @cached_property
@@ -281,7 +282,9 @@ class ExactCollision:
         """Signed distance of every checked pair of links."""
         return self._all(q, range(len(self.links), len(self.checks)))
 
-    def distance_seen_from(self, link: str, q: Float[ndarray, "dof"], T: Float[ndarray, "4 4"]) -> float:
+    def distance_from_moved_base(
+        self, link: str, q: Float[ndarray, "dof"], T: Float[ndarray, "4 4"]
+    ) -> float:
         """Signed distance of a link to the nearest obstacle after the arm was moved by T, base and all [m]:
         that to obstacles which moved the other way."""
         frames = T @ forward_frames(self.robot, q[None])[0]
@@ -303,7 +306,7 @@ class ExactCollision:
     def collides(self, q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
         """Whether each configuration touches the scene or itself."""
         return np.concatenate(
-            [np.zeros(0, bool), *(self._chunk(q[i : i + CHUNK]) for i in range(0, len(q), CHUNK))]
+            [np.zeros(0, bool), *(self._chunk(q[i : i + CHUNK_SIZE]) for i in range(0, len(q), CHUNK_SIZE))]
         )
 
     def _chunk(self, q: ndarray) -> ndarray:
@@ -318,7 +321,7 @@ class ExactCollision:
                     continue
                 piece, other = candidates.pair(column)
                 if isinstance(other, _Obstacle) and other.inflation > 0:
-                    hit[row] = self._signed(piece, other, frames[row], BEYOND, depth=False) <= 0
+                    hit[row] = self._signed(piece, other, frames[row], CLEAR_DISTANCE, depth=False) <= 0
                     continue
                 T_other = self._place(other, frames[row]) if isinstance(other, _Piece) else other.T
                 T_piece = self._place(piece, frames[row])
@@ -329,7 +332,7 @@ class ExactCollision:
 
 
 @once_per_robot
-def make_ready(robot: Robot) -> None:
+def warm_up(robot: Robot) -> None:
     """Make what Coal needs of a robot, and load it, so that no call with a short limit has to."""
     explain_collision(robot, Scene([Sphere([0.0, 0.0, 100.0], 1.0)]), (robot.lower + robot.upper) / 2)
 

@@ -12,8 +12,14 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.simd import W, by_sixteen
-from robotdiffuse.collision.point_cloud_grid import EMPTY, PointGrid, build_grid, cover, thin
-from robotdiffuse.collision.sphere_pair_tables import no_tables, tabulate
+from robotdiffuse.collision.point_cloud_grid import (
+    NO_SPHERES,
+    PointGrid,
+    build_grid,
+    cover_triangles,
+    thin_points,
+)
+from robotdiffuse.collision.sphere_pair_tables import build_pair_tables, no_tables
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.robots.joint_tables import JointTable
 from robotdiffuse.robots.motion_bounds import motion_radii
@@ -21,13 +27,13 @@ from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated
 
-ROUNDING = 4e-7
+FLOAT32_ROUNDING = 4e-7
 """Obstacles grow by this share of their coordinates: more than float32 rounds off."""
 
 BOX_SLACK = 1e-6
 """Boxes around obstacles grow by this, absolutely and relatively: more than rounding does."""
 
-NO_BOX = np.repeat([[1e18, -1e18]], 3, axis=1)
+EMPTY_BOX = np.repeat([[1e18, -1e18]], 3, axis=1)
 """Lower and upper corner of a box that is far from everything [m]."""
 
 
@@ -55,7 +61,7 @@ class RobotArrays(NamedTuple):
     """[groups, 4] a sphere around all spheres of the group."""
     pairs: ndarray
     """[pairs, 4] groups that are checked against each other, a row of `near` or -1, and a bit there."""
-    near: ndarray
+    pair_tables: ndarray
     """[tables, ...] where pairs close to each other along the arm may touch: see `near_pairs.py`."""
     parents: ndarray | None
     """[dof] `Robot.parents`; None of a chain, for which code is compiled apart."""
@@ -75,7 +81,7 @@ class SceneArrays(NamedTuple):
     solids: ndarray
     """[n, 17] all of these in one form: centre, rotation, half edges, a radius around, 1 if it is round about
     its z axis between flat ends. The row of a cylinder has its radius for the first two half edges."""
-    around: ndarray
+    solid_boxes: ndarray
     """[rows, 6 * 16] boxes around the solids by sixteen: low x of all, y, z, high x, y, z."""
     points: ndarray
     """[n, 4] centre, radius; sorted by cell."""
@@ -115,22 +121,24 @@ def compile_robot(robot: Robot) -> RobotArrays:
         offsets=np.ascontiguousarray(offsets, np.float32),
         spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
-        rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [EMPTY, *rows]]),
+        rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [NO_SPHERES, *rows]]),
         row_bounds=np.array([row for group in placed for row in group.row_bounds], np.float32).reshape(-1, 4),
         row_sizes=np.array([len(row) for row in rows], np.int64),
         first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),
         bounds=np.array([group.bounds for group in placed], np.float32).reshape(-1, 4),
         pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
-        near=no_tables(),
+        pair_tables=no_tables(),
         parents=robot.branching,
     )
     if not pairs:
         return arrays
     rows = [link for link in robot.link_names if link in robot.spheres]
-    levers = motion_radii(robot)[[rows.index(link) for link in groups]]
-    found, near = tabulate(arrays, robot.lower, robot.upper, levers, _known_tables(robot, pairs, groups))
-    return arrays._replace(pairs=found, near=near)
+    group_radii = motion_radii(robot)[[rows.index(link) for link in groups]]
+    found, tables = build_pair_tables(
+        arrays, robot.lower, robot.upper, group_radii, _known_tables(robot, pairs, groups)
+    )
+    return arrays._replace(pairs=found, pair_tables=tables)
 
 
 def _known_tables(
@@ -211,7 +219,7 @@ def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
     return list(np.column_stack([centres, reach.max(axis=1) + 1e-6]))
 
 
-GRID_SECONDS = 7e-7
+GRID_SECONDS_PER_POINT = 7e-7
 """That a point of meshes and clouds takes, about [s]."""
 
 
@@ -270,7 +278,7 @@ def _solids(
     middle, rotation, half = rows[:, :3], np.abs(rows[:, 3:12].reshape(-1, 3, 3)), rows[:, 12:15]
     extent = np.einsum("nij,ni->nj", rotation, half) + rows[:, 15:16]
     extent += BOX_SLACK * (1 + np.abs(middle) + extent)
-    return rows, by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), NO_BOX)
+    return rows, by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), EMPTY_BOX)
 
 
 @lru_cache(maxsize=8)
@@ -281,11 +289,11 @@ def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, ra
         points = sum(map(len, clouds))
         check_time(f"{len(shapes) - i} of {len(shapes)} meshes and clouds after {points:,} points")
         if isinstance(shape, PointCloud):
-            clouds.append(thin(shape.points, shape.point_radius, reach))
+            clouds.append(thin_points(shape.points, shape.point_radius, reach))
         else:
-            clouds.append(cover(shape.mesh.world_vertices[shape.mesh.faces], reach))
-    cloud = np.concatenate(clouds) if clouds else EMPTY
-    check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS * len(cloud))
+            clouds.append(cover_triangles(shape.mesh.world_vertices[shape.mesh.faces], reach))
+    cloud = np.concatenate(clouds) if clouds else NO_SPHERES
+    check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS_PER_POINT * len(cloud))
     return build_grid(cloud, radius)
 
 
@@ -326,6 +334,6 @@ def _oriented(
 def _grown(rows: ndarray, sizes: slice) -> ndarray:
     """The rows with their sizes larger by what rounding to float32 may take away."""
     rows[:, sizes] += (
-        ROUNDING * (np.abs(rows[:, :3]).max(axis=1) + np.abs(rows[:, sizes]).max(axis=1))[:, None]
+        FLOAT32_ROUNDING * (np.abs(rows[:, :3]).max(axis=1) + np.abs(rows[:, sizes]).max(axis=1))[:, None]
     )
     return rows

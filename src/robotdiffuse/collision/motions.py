@@ -23,7 +23,7 @@ from robotdiffuse.collision.convex_geometry import Check, checks_of, hulls_of, s
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import motion_certificate as kernel
 from robotdiffuse.collision.kernels.motion_certificate import (
-    CAP,
+    CLEARANCE_CAP,
     PAIR,
     SCENE,
     Arm,
@@ -41,13 +41,13 @@ from robotdiffuse.scenes.scene import Scene
 if TYPE_CHECKING:
     from robotdiffuse.collision.exact_meshes import ExactCollision
 
-FINEST = 0.002
+FINEST_RESOLUTION = 0.002
 """Least distance between two checks of a motion that is searched with [m]."""
-FIRST_TRAVEL = 0.16
+INITIAL_TRAVEL = 0.16
 """Motion bound of the pieces that a motion is cut into at first [m]; half and twice are about as fast."""
-FIRST_CONTACT_TRAVEL = 1e-3
+CONTACT_TRAVEL_TOLERANCE = 1e-3
 """The first contact is located to within this motion bound [m]."""
-EPISODE_TRAVEL, EPISODE_SAMPLES = 0.01, 64
+DEPTH_SAMPLE_TRAVEL, DEPTH_SAMPLES = 0.01, 64
 """Step [m] and number of the configurations at which the depth of a contact is looked for."""
 
 
@@ -66,20 +66,20 @@ def search_space(
         checker.scene_arrays,
         robot.lower.astype(np.float32),
         robot.upper.astype(np.float32),
-        levers(robot),
+        largest_motion_radii(robot),
         np.float32(resolution),
         checker.padding + np.float32(padding),
         ends.astype(np.float32),
     )
 
 
-def finer(resolution: float) -> float:
-    """For after a path that the validator refused: it found contact between two checks, so look twice as closely
-    [m]."""
-    return max(resolution / 2, FINEST)
+def finer_resolution(resolution: float) -> float:
+    """For after a path that the validator refused: it found contact between two checks, so look twice as
+    closely [m]."""
+    return max(resolution / 2, FINEST_RESOLUTION)
 
 
-def levers(robot: Robot) -> Float[ndarray, "dof"]:
+def largest_motion_radii(robot: Robot) -> Float[ndarray, "dof"]:
     """Largest distance of any point of the arm from each joint's axis [m]."""
     return motion_radii(robot).max(axis=0, initial=0.0).astype(np.float32)
 
@@ -121,9 +121,9 @@ class ContinuousCollision:
     def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
         """Validate the motion along straight joint-space lines through the waypoints (at least one)."""
         q = for_kernels(q)
-        motion = Motion(q, kernel.way_along(q, self.checks.levers))
-        todo = kernel.first_pieces(motion, self.checks, FIRST_TRAVEL)
-        best, certified = np.full(2, CAP), np.full(2, CAP)
+        motion = Motion(q, kernel.travel_along(q, self.checks.motion_radii))
+        todo = kernel.first_pieces(motion, self.checks, INITIAL_TRAVEL)
+        best, certified = np.full(2, CLEARANCE_CAP), np.full(2, CLEARANCE_CAP)
         hit: tuple[float, int] | None = None
         while len(todo.start):
             found, rows, columns = kernel.rounds(
@@ -158,7 +158,7 @@ class ContinuousCollision:
         travel = found.travel[rows, columns]
         middle = (todo.start + todo.stop) / 2
         at = kernel.configurations(motion, middle[rows])
-        cutoffs = np.clip(travel + best[kinds], 2 * self.contact, CAP)
+        cutoffs = np.clip(travel + best[kinds], 2 * self.contact, CLEARANCE_CAP)
         distances, _ = self._exact.nearest(at, columns, cutoffs, stop=self.contact)
         asked = int(np.isfinite(distances).sum())
         touched = distances[asked - 1] <= self.contact
@@ -170,7 +170,7 @@ class ContinuousCollision:
         if not touched:
             return None
         row = int(rows[asked])
-        keep = row + int(todo.stop[row] - todo.start[row] > 2 * FIRST_CONTACT_TRAVEL)
+        keep = row + int(todo.stop[row] - todo.start[row] > 2 * CONTACT_TRAVEL_TOLERANCE)
         todo.stop[row] = middle[row]
         clearance[row:] = lower[row:] = -np.inf
         parts = (todo.start, todo.stop, todo.undecided)
@@ -187,17 +187,17 @@ class ContinuousCollision:
 
     def _contact(self, motion: Motion, at: float, check: int) -> Contact:
         """The contact of a check at a place, with its depth until the check comes free of that obstacle."""
-        steps = at + EPISODE_TRAVEL * np.arange(EPISODE_SAMPLES)
-        steps = steps[steps <= max(motion.way[-1], at)]
+        steps = at + DEPTH_SAMPLE_TRAVEL * np.arange(DEPTH_SAMPLES)
+        steps = steps[steps <= max(motion.travel[-1], at)]
         checks, cutoffs = np.full(len(steps), check), np.full(len(steps), 2 * self.contact)
         distances, names = self._exact.nearest(kernel.configurations(motion, steps), checks, cutoffs)
         other = names[0]
         left = [i for i, name in enumerate(names) if name != other or distances[i] > self.contact]
         episode = distances[: left[0] if left else len(steps)]
         depth = max(0.0, -float(episode.min(initial=0)))
-        low, share = kernel.segment_at(motion.way, at)
+        low, share = kernel.segment_at(motion.travel, at)
         if share == 0.0:  # the first of waypoints that are the same
-            low = int(np.searchsorted(motion.way, at))
+            low = int(np.searchsorted(motion.travel, at))
         return Contact(checks_of(self.robot)[check], str(other), low + share, depth)
 
 
@@ -224,11 +224,11 @@ def _checks(robot: Robot) -> Checks:
     """What compiled code reads of the checks. Levers are seen from where the chains of the links part: from
     the nearer link, if both are on one."""
     groups, pairs = _groups(robot)
-    whole, parts = covered(robot), hulls_of(robot)[1]
+    whole, parts = with_covering_spheres(robot), hulls_of(robot)[1]
     links = [link for link in whole.link_names if link in whole.spheres]
     radii, checks = motion_radii(whole), checks_of(robot)
     kind, where, of_parts, base, common, second = [], [], [], [], [], []
-    levers = np.zeros((len(checks), robot.dof))
+    of_checks = np.zeros((len(checks), robot.dof))
     for k, (link, other) in enumerate(checks):
         kind.append(SCENE if other is None else PAIR)
         known = groups.get(link, -1) if other is None else pairs.get(frozenset((link, other)), -1)
@@ -241,7 +241,7 @@ def _checks(robot: Robot) -> Checks:
             (further, robot.moved_by[high] & ~shared),
         ):
             if joints.any():
-                levers[k, joints] = radii[links.index(one), joints]
+                of_checks[k, joints] = radii[links.index(one), joints]
         base.append(low)
         common.append(int(np.flatnonzero(shared).max(initial=-1)) + 1)
         second.append(int(np.flatnonzero(robot.moved_by[high] & ~shared)[0]) if common[-1] != low else 0)
@@ -254,12 +254,12 @@ def _checks(robot: Robot) -> Checks:
         np.array(base, np.int64),
         np.array(common, np.int64),
         np.array(second, np.int64),
-        levers,
+        of_checks,
     )
 
 
 @once_per_robot
-def covered(robot: Robot) -> Robot:
+def with_covering_spheres(robot: Robot) -> Robot:
     """The robot, with one sphere about the meshes of each link that has meshes but no spheres."""
     added = {}
     for link, meshes in robot.meshes.items():

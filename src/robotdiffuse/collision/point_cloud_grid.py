@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.point_grid import KEEP, make_grid
+from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, make_grid
 from robotdiffuse.collision.kernels.simd import by_sixteen
 
 MESH_SPACING = 0.02
@@ -15,12 +15,12 @@ THINNING = 0.5
 """Edge of the thinning voxels of a point cloud, as a multiple of its point radius."""
 MAX_POINTS = 400_000
 """Mesh obstacles are divided more coarsely, or their pieces joined, rather than into more points."""
-EXACT = 0.1
+EXACT_RANGE = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
-KNOWN_VOXELS = 10
+VOXELS_PER_RANGE = 10
 MAX_VOXELS = 2e6
 """A grid of 8 MB still fits a processor's cache."""
-EMPTY = np.zeros((0, 4))
+NO_SPHERES = np.zeros((0, 4))
 
 
 class PointGrid(NamedTuple):
@@ -34,20 +34,20 @@ class PointGrid(NamedTuple):
     grid_frame: Float32[ndarray, "14"]
 
 
-def thin(points: Float[ndarray, "n 3"], radius: float, reach: float) -> Float[ndarray, "m 4"]:
+def thin_points(points: Float[ndarray, "n 3"], radius: float, reach: float) -> Float[ndarray, "m 4"]:
     """One sphere per occupied voxel, large enough to hold the spheres of all points of the voxel [m].
 
     Points farther than `reach` and what is kept beyond it are left out.
     """
     with np.errstate(over="ignore"):
-        points = points[np.einsum("ij,ij->i", points, points) <= (reach + KEEP + radius) ** 2]
+        points = points[np.einsum("ij,ij->i", points, points) <= (reach + POINT_RANGE + radius) ** 2]
     return _join(np.column_stack([points, np.full(len(points), radius)]), THINNING * radius)
 
 
 def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]:
     """One sphere around all spheres with centres in a voxel."""
     if not len(spheres):
-        return EMPTY
+        return NO_SPHERES
     offsets = spheres[:, :3] - spheres[:, :3].min(axis=0)
     # three indices and a sphere's number fit an integer: one sort of them is faster than a sort of numbers
     bits = len(spheres).bit_length()
@@ -66,7 +66,7 @@ def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]
     return np.column_stack([centres, radii])
 
 
-def cover(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:
+def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:
     """Spheres around pieces of the triangles that together hold the surface within `reach` [m]."""
     near = _divide(triangles, reach / 4 if np.isfinite(reach) else np.inf, reach)
     # bisection ends with pieces of about a quarter of the squared spacing
@@ -83,7 +83,7 @@ def _divide(triangles: Float[ndarray, "n 3 3"], spacing: float, reach: float) ->
     done = [np.zeros((0, 3, 3))]
     while len(triangles):
         edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
-        near = np.linalg.norm(triangles.mean(axis=1), axis=1) <= reach + KEEP + edges.max(axis=1)
+        near = np.linalg.norm(triangles.mean(axis=1), axis=1) <= reach + POINT_RANGE + edges.max(axis=1)
         triangles, edges = triangles[near], edges[near]
         small = edges.max(axis=1) <= spacing
         done.append(triangles[small])
@@ -107,8 +107,8 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     """The grid over covering spheres for a robot with spheres of up to this radius [m]."""
     if not len(cloud):
         return PointGrid(
-            EMPTY.astype(np.float32),
-            by_sixteen(EMPTY, EMPTY),
+            NO_SPHERES.astype(np.float32),
+            by_sixteen(NO_SPHERES, NO_SPHERES),
             np.zeros(2, np.int32),
             np.zeros(0, np.float32),
             np.zeros(0, np.int32),
@@ -116,10 +116,10 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
         )
     cloud = cloud.astype(np.float32)
     radii = cloud[:, 3]
-    known = EXACT + radius + float(radii.max())
+    known = EXACT_RANGE + radius + float(radii.max())
     low = cloud[:, :3].min(axis=0) - np.float32(known)
     extent = (cloud[:, :3].max(axis=0) - low).astype(np.float64) + known
-    voxel = np.float32(max(known / KNOWN_VOXELS, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
+    voxel = np.float32(max(known / VOXELS_PER_RANGE, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
     shape = np.ceil(extent / voxel).astype(np.int32) + 1
     cells = (shape + 1) // 2
     index = ((cloud[:, :3] - low) / voxel).astype(np.int64)

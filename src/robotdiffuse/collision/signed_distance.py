@@ -7,7 +7,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from robotdiffuse.collision.kernel_arrays import SceneArrays, compile_robot, compile_scene_for, robot_groups
-from robotdiffuse.collision.kernels.point_grid import KEEP
+from robotdiffuse.collision.kernels.point_grid import POINT_RANGE
 from robotdiffuse.robots.forward_kinematics import ForwardKinematics
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
@@ -64,7 +64,7 @@ class SignedDistance:
         self._grid: Tensor | None = None
         if len(obstacles.points):
             field = _to_points(obstacles) - obstacles.grid_frame[5]
-            self._grid = tensor(np.minimum(field, KEEP + arrays.spheres[:, 3].min()))[None, None]
+            self._grid = tensor(np.minimum(field, POINT_RANGE + arrays.spheres[:, 3].min()))[None, None]
         self._grid_low, self._voxel = tensor(obstacles.grid_frame[:3]), float(obstacles.grid_frame[3])
 
     def __call__(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch links"]:

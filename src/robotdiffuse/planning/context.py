@@ -21,10 +21,10 @@ from robotdiffuse.core.types import SHORT, UNTIL, Path, Status, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
-    NOTHING,
-    Beside,
+    NO_EXTRA_LIMITS,
+    ExtraLimits,
+    FrameSpeedLimits,
     Jerk,
-    Pace,
     Scaling,
     TimingSettings,
 )
@@ -268,14 +268,14 @@ class PlanningContext:
         )
 
     @property
-    def beside(self) -> Beside:
+    def beside(self) -> ExtraLimits:
         """The speeds that constraints bound, and the torques of a payload."""
         constraints, pace = self.validator.constraints, None
         if constraints is not None and len(constraints.paced):
-            pace = Pace(constraints.speeds, constraints.most_speeds)
+            pace = FrameSpeedLimits(constraints.speeds, constraints.most_speeds)
         if pace is None and self.validator.dynamics is None:
-            return NOTHING
-        return Beside(pace, self.validator.dynamics)
+            return NO_EXTRA_LIMITS
+        return ExtraLimits(pace, self.validator.dynamics)
 
     def _refuse(self, violation: Violation) -> None:
         self._refused = violation.kind

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import ClassVar, Generic, TypeVar
 
-from robotdiffuse.collision.motions import finer
+from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.deadline import OutOfTimeError
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
@@ -153,9 +153,9 @@ class Planner(ABC, Generic[Own]):
     def load_wanted(self, robot: Robot) -> None:
         """What calls would have used and had no time to load, and Coal: for programs that make many calls, to
         make between them."""
-        from robotdiffuse.collision.exact_meshes import make_ready  # which imports Coal
+        from robotdiffuse.collision.exact_meshes import warm_up  # which imports Coal
 
-        make_ready(robot)
+        warm_up(robot)
 
     def _load_rarer(self, robot: Robot) -> None:
         """What only some calls need."""
@@ -172,7 +172,7 @@ def ever_finer(context: PlanningContext, settings: Own) -> Iterator[tuple[Own, i
     attempt = 0
     while attempt == 0 or context.remaining > 0:
         yield settings, attempt
-        settings = replace(settings, resolution=finer(settings.resolution))  # type: ignore
+        settings = replace(settings, resolution=finer_resolution(settings.resolution))  # type: ignore
         attempt += 1
 
 

@@ -5,7 +5,7 @@ from html import escape
 from typing import Any
 
 from robotdiffuse.core.types import UNTIL, Status
-from robotdiffuse.trajectories.speed_limits import LEAST_JERK, LEAST_SCALING
+from robotdiffuse.trajectories.speed_limits import MIN_JERK, MIN_SCALING
 
 ABOUT = (
     "Motion planning for redundant robot arms; every motion that is answered passed the validator. Metres, "
@@ -44,9 +44,9 @@ PLAN_REQUEST = _object(
     seed={"type": "integer", "minimum": 0, "default": 0},
     until=TEXT | {"enum": list(UNTIL), "default": "short"},
     clearance=NUMBER | {"description": "to keep where it can be kept [m]", "minimum": 0},
-    velocity_scaling=NUMBER | {"minimum": LEAST_SCALING, "maximum": 1, "default": 1.0},
-    acceleration_scaling=NUMBER | {"minimum": LEAST_SCALING, "maximum": 1, "default": 1.0},
-    jerk=NUMBER | {"description": "most of any joint [rad/s³]", "minimum": LEAST_JERK},
+    velocity_scaling=NUMBER | {"minimum": MIN_SCALING, "maximum": 1, "default": 1.0},
+    acceleration_scaling=NUMBER | {"minimum": MIN_SCALING, "maximum": 1, "default": 1.0},
+    jerk=NUMBER | {"description": "most of any joint [rad/s³]", "minimum": MIN_JERK},
 )
 PATH = _object(("joint_names", "positions"), joint_names=NAMES, positions=ROWS)
 TRAJECTORY = _object(

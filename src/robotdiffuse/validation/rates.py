@@ -23,10 +23,10 @@ from numpy import ndarray
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
 
-WINDOWS = (1e-3, 4e-3, 16e-3)
+AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
 """Where rows are closer than the first of these [s], mean accelerations are asked for over times of at least
 each; over shorter ones, the resolution of positions hides any."""
-SHORTEST = 1e-12
+MIN_TIME = 1e-12
 """Shorter times count as this one [s], so that rates over them are finite."""
 
 
@@ -43,7 +43,7 @@ class RateTolerances:
 
 
 @dataclass(frozen=True)
-class WrongRate:
+class RateViolation:
     """The first of its kind."""
 
     kind: str
@@ -56,18 +56,18 @@ class WrongRate:
     """Beyond what is allowed, in the rate's unit."""
 
 
-def wrong_rates(
+def rate_violations(
     robot: Robot,
     trajectory: Trajectory,
     tolerances: RateTolerances,
     start_velocity: Float[ndarray, "dof"] | None = None,
-) -> list[WrongRate]:
+) -> list[RateViolation]:
     """What is wrong with the rates of finite rows at increasing times; the first of each kind. The motion is
     to begin at rest, or at `start_velocity`.
 
     A limit of 0 stands for one that the robot does not give: there the rates need only agree.
     """
-    found: dict[str, WrongRate] = {}
+    found: dict[str, RateViolation] = {}
     with np.errstate(over="ignore", invalid="ignore"):
         begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
         checks = list(_checks(robot, trajectory, tolerances, begins))
@@ -82,11 +82,13 @@ def wrong_rates(
         if check.kind not in found or time < found[check.kind].time:
             name, rate = robot.joint_names[j], abs(float(check.rates[i, j]))
             message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
-            found[check.kind] = WrongRate(check.kind, time, name, message, float(beyond[i, j]))
+            found[check.kind] = RateViolation(check.kind, time, name, message, float(beyond[i, j]))
     return list(found.values())
 
 
-def between_rows(trajectory: Trajectory, chord: float) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
+def sample_cubics(
+    trajectory: Trajectory, chord: float
+) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
     """Times and positions of a trajectory, with further rows on the cubics through its rows' positions and
     velocities, so that straight lines between rows leave those by no more than `chord` [rad] or [m]."""
     times, q, v = trajectory.times, trajectory.positions, trajectory.velocities
@@ -130,7 +132,7 @@ def _checks(
     blur = 2 * tolerances.resolution / step
     """Of the mean velocities, as positions are not known better."""
     share = 1 + tolerances.slack
-    nothing = tolerances.slack * _known(robot.velocity, v, mean)
+    nothing = tolerances.slack * _limits_or_peaks(robot.velocity, v, mean)
 
     def limited(kind: str, what: str, rates: ndarray, limit: ndarray, allowed: ndarray) -> _Check:
         known = allowed if (limit > 0).all() else np.where(limit > 0, allowed, np.inf)
@@ -158,7 +160,7 @@ def _checks(
     yield limited("acceleration", "acceleration", a, most, share * most)
 
     # Rows may miss the peaks of what accelerates the motion, but not by half.
-    own = np.maximum(_greatest(a, second, change), tolerances.slack * robot.acceleration)
+    own = np.maximum(_peak(a, second, change), tolerances.slack * robot.acceleration)
     strongest = np.where(most > 0, np.minimum(share * most, 2 * own), 2 * own)
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
@@ -185,40 +187,40 @@ def _checks(
         lambda i, j: f"by its velocities between {low[i, j]:.6g} and {high[i, j]:.6g}",
     )
 
-    if step.min(initial=np.inf) >= WINDOWS[0]:
+    if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
         return
     times, resolution = trajectory.times, tolerances.resolution
     onwards = "mean velocity from an earlier row to here"
     most = robot.velocity
-    first, span = _since(times, q, (times - times[0])[:, None] * share * most)
-    moved = _changes(q, first) / span
+    first, span = _worst_earlier_row(times, q, (times - times[0])[:, None] * share * most)
+    moved = _change_since(q, first) / span
     yield limited("velocity", onwards, moved, most, share * most + 2 * resolution / span)
 
-    said, room = _summed(step * (v[1:] + v[:-1]) / 2), _summed(step * possible)
-    first, span = _since(times, q - said, room)
-    moved, told = _changes(q, first) / span, _changes(said, first) / span
+    said, room = _cumulative(step * (v[1:] + v[:-1]) / 2), _cumulative(step * possible)
+    first, span = _worst_earlier_row(times, q - said, room)
+    moved, told = _change_since(q, first) / span, _change_since(said, first) / span
     yield _Check(
         "rates",
         onwards,
         moved,
         np.abs(moved - told),
-        (_changes(room, first) + 2 * resolution) / span,
+        (_change_since(room, first) + 2 * resolution) / span,
         lambda i, j: f"the one that its velocities amount to is {told[i, j]:.6g}",
     )
 
     most = robot.acceleration
-    for window in WINDOWS:
+    for window in AVERAGING_WINDOWS:
         second, unsure = _second_differences(trajectory, begins, window, resolution, nothing)
         what = f"mean acceleration by its positions over {1e3 * window:g} ms and more"
         yield limited("acceleration", what, second, most, share * most + unsure)
 
 
-def _summed(steps: Float[ndarray, "m dof"]) -> Float[ndarray, "n dof"]:
+def _cumulative(steps: Float[ndarray, "m dof"]) -> Float[ndarray, "n dof"]:
     """By row."""
     return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
 
 
-def _since(
+def _worst_earlier_row(
     times: Float[ndarray, "n"], way: Float[ndarray, "n dof"], allowed: Float[ndarray, "n dof"]
 ) -> tuple[Int[ndarray, "n dof"], Float[ndarray, "n dof"]]:
     """For each row the earlier one since which a joint's way has changed most beyond what `allowed` has grown
@@ -233,10 +235,10 @@ def _since(
         least, at = np.concatenate([room[:1], least[:-1]]), np.concatenate([first[:1], at[:-1]])
         first = np.where(room - least > beyond, at, first)
         beyond = np.maximum(beyond, room - least)
-    return first, np.maximum(times[:, None] - times[first], SHORTEST)
+    return first, np.maximum(times[:, None] - times[first], MIN_TIME)
 
 
-def _changes(rows: Float[ndarray, "n dof"], first: Int[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+def _change_since(rows: Float[ndarray, "n dof"], first: Int[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
     return rows - np.take_along_axis(rows, first, axis=0)
 
 
@@ -265,10 +267,10 @@ def _padded(before: ndarray, rows: ndarray, after: ndarray) -> ndarray:
     return np.concatenate([before, rows, after])
 
 
-def _known(limit: Float[ndarray, "dof"], *rates: ndarray) -> Float[ndarray, "dof"]:
+def _limits_or_peaks(limit: Float[ndarray, "dof"], *rates: ndarray) -> Float[ndarray, "dof"]:
     """The limits; the greatest of the rates where there is none."""
-    return np.where(limit > 0, limit, _greatest(*rates))
+    return np.where(limit > 0, limit, _peak(*rates))
 
 
-def _greatest(*rates: ndarray) -> Float[ndarray, "dof"]:
+def _peak(*rates: ndarray) -> Float[ndarray, "dof"]:
     return np.abs(np.concatenate(rates)).max(axis=0, initial=0.0)

@@ -60,7 +60,7 @@ class VerifySettings(Settings, name="verify"):
 
 
 DEFAULT = VerifySettings()
-LOOKS = 0.25
+BLEND_SAMPLE_SHARE = 0.25
 """Share of a blend between places at which a motion is looked at [rad, joint-space L2]."""
 
 
@@ -114,7 +114,7 @@ def goal_error(
     return GoalError(message, goal.frame, distance)
 
 
-def passes(
+def first_place_within(
     robot: Robot,
     goal: Goal,
     q: Float[ndarray, "n dof"],
@@ -123,15 +123,16 @@ def passes(
     after: float = 0.0,
 ) -> float | None:
     """Where the way through configurations, from a place on, first comes within `blend` of a goal: a row plus
-    the share of the way to the next. None if it is not seen to at places `LOOKS` of the blend apart."""
-    places, way = looked_at(q, LOOKS * blend, after)
+    the share of the way to the next. None if it is not seen to at places `BLEND_SAMPLE_SHARE` of the blend
+    apart."""
+    places, way = sample_path(q, BLEND_SAMPLE_SHARE * blend, after)
     for i in np.flatnonzero(_near(robot, goal, way, blend, settings)):
         if goal_error(robot, goal, way[i], settings, blend) is None:
             return float(places[i])
     return None
 
 
-def looked_at(
+def sample_path(
     q: Float[ndarray, "n dof"], step: float, after: float = 0.0
 ) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
     """Places at most a step [rad, joint-space L2] apart on the way through configurations, from a place on:

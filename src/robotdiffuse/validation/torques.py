@@ -16,11 +16,11 @@ from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.torque_bounds import Stretches
 
-RESOLUTION = 1e-3
+TORQUE_RESOLUTION = 1e-3
 """Share of a limit to which a torque between two looks is told from one beyond it."""
-MOST_OPEN = 100_000
+MAX_OPEN_PIECES = 100_000
 """Stretches that are halved at a time; of more, as of motions that wind on and on, nothing is shown."""
-FINE = 1 / 64
+PLACE_RESOLUTION = 1 / 64
 """Of a piece, to which the place is found where a torque comes to be beyond."""
 States = tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]
 """Positions, velocities and accelerations."""
@@ -35,7 +35,7 @@ class Pieces(NamedTuple):
     """Derivatives by the share."""
 
 
-class Beyond(NamedTuple):
+class TorqueExcess(NamedTuple):
     """The first torque that is beyond its limit, or not shown to be within."""
 
     place: float
@@ -46,12 +46,12 @@ class Beyond(NamedTuple):
     """Greatest of that joint along the motion; unit of the torque."""
 
 
-def pieces_of(trajectory: Trajectory) -> Pieces:
+def trajectory_pieces(trajectory: Trajectory) -> Pieces:
     """Between the rows of a trajectory at increasing times: cubics through positions and velocities, lines
     between the accelerations that it says."""
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
     if len(q) == 1:
-        return pieces_held(q)
+        return static_pieces(q)
     h = np.diff(trajectory.times)[:, None]
     mean, change = np.diff(q, axis=0) / h, np.diff(a, axis=0)
     first, last = v[:-1] - mean, v[1:] - mean
@@ -71,7 +71,7 @@ def pieces_of(trajectory: Trajectory) -> Pieces:
     return Pieces(states, Stretches(_farthest(q) + h * most / 2, h * speed, speed, pull))
 
 
-def pieces_held(q: Float[ndarray, "n dof"]) -> Pieces:
+def static_pieces(q: Float[ndarray, "n dof"]) -> Pieces:
     """Between configurations that are held, on straight lines."""
     q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
     step = np.diff(q, axis=0)
@@ -90,7 +90,7 @@ def _farthest(q: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
     return np.maximum(np.abs(q[:-1]), np.abs(q[1:]))
 
 
-def first_beyond(dynamics: Dynamics, pieces: Pieces, slack: float) -> Beyond | None:
+def first_excess(dynamics: Dynamics, pieces: Pieces, slack: float) -> TorqueExcess | None:
     """The first torque that exceeds its limit by more than a share; None if it is proved that none does."""
     allowed, bends = dynamics.limits * (1 + slack), dynamics.bends(pieces.along)
     count = len(bends)
@@ -108,13 +108,13 @@ def first_beyond(dynamics: Dynamics, pieces: Pieces, slack: float) -> Beyond | N
         most = np.maximum(at_low, at_high)
         open_ = most + bulge > allowed
         begun, goes_on = (at_low > allowed).any(axis=1), (at_high > allowed).any(axis=1)
-        unsure = np.minimum(bulge, RESOLUTION * dynamics.limits)
-        last = bulge <= unsure if len(piece) <= MOST_OPEN else np.ones_like(open_)
+        unsure = np.minimum(bulge, TORQUE_RESOLUTION * dynamics.limits)
+        last = bulge <= unsure if len(piece) <= MAX_OPEN_PIECES else np.ones_like(open_)
         over, lost = begun | goes_on, (open_ & last).any(axis=1)
         wrong = np.flatnonzero(over | lost)
         places.append(piece[wrong] + np.where(over & ~begun, high, low)[wrong])
         torques.append(np.where(most > allowed, most, most + unsure)[wrong])
-        coarse = over & (begun != goes_on) & (high - low > FINE)
+        coarse = over & (begun != goes_on) & (high - low > PLACE_RESOLUTION)
         halved = open_.any(axis=1) & (coarse | ~(over | lost))
         piece, low, high = piece[halved], low[halved], high[halved]
         middle = (low + high) / 2
@@ -127,4 +127,4 @@ def first_beyond(dynamics: Dynamics, pieces: Pieces, slack: float) -> Beyond | N
         return None
     i = int(place.argmin())
     j = int(beyond[i].argmax())
-    return Beyond(float(place[i]), j, float(beyond[i, j] + allowed[j]), float(beyond[:, j].max()))
+    return TorqueExcess(float(place[i]), j, float(beyond[i, j] + allowed[j]), float(beyond[:, j].max()))

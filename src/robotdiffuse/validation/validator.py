@@ -1,8 +1,8 @@
 """The validator: is a motion free of collision, within limits, and from the start to the goal?
 
 Collision between waypoints is settled by a certificate, not by sampling: see collision/motions.py. The rates
-of a trajectory are those of its positions over its times, whatever it says of itself: see rates.py. The validator
-knows nothing of planners.
+of a trajectory are those of its positions over its times, whatever it says of itself: see rates.py. The
+validator knows nothing of planners.
 """
 
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from robotdiffuse.core.errors import InputError, joined
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
-from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, goal_error, passes
-from robotdiffuse.validation.torques import Pieces, first_beyond, pieces_held, pieces_of
+from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
+from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, first_place_within, goal_error
+from robotdiffuse.validation.torques import Pieces, first_excess, static_pieces, trajectory_pieces
 
 if TYPE_CHECKING:  # what most problems do not need is imported where one does
     from robotdiffuse.collision.moving_obstacles import MovingCollision, TimedContact
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
-LONGEST = 1e5
+MAX_DURATION = 1e5
 """Motion that is validated [s], about a day."""
 
 
@@ -100,7 +100,7 @@ class Verifier:
         found = []
         if self.dynamics is not None and within(path.positions):
             clock = np.arange(len(path.positions), dtype=float)
-            found = self._torques(clock, pieces_held(path.positions), " to hold the payload")
+            found = self._torques(clock, static_pieces(path.positions), " to hold the payload")
         return self._report(path.positions, None, found)
 
     def trajectory(self, trajectory: Trajectory) -> Report:
@@ -120,26 +120,28 @@ class Verifier:
             at = float(trajectory.times[backwards[0] + 1])
             message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
             return Report(False, Violation("time", at, message), None, None)
-        if trajectory.duration - trajectory.times[0] > LONGEST:
-            message = f"the motion takes {trajectory.duration:.6g} s; at most {LONGEST:g} s can be validated"
+        if trajectory.duration - trajectory.times[0] > MAX_DURATION:
+            message = (
+                f"the motion takes {trajectory.duration:.6g} s; at most {MAX_DURATION:g} s can be validated"
+            )
             return Report(False, Violation("time", float(trajectory.times[0]), message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
         found = [
             Violation(wrong.kind, wrong.time, wrong.message, wrong.joint, None, wrong.excess)
-            for wrong in wrong_rates(
+            for wrong in rate_violations(
                 self.robot, trajectory, self._rate_tolerances, self.problem.start_velocity
             )
         ]
         rows = trajectory.times, trajectory.positions
-        times, positions = rows if found else between_rows(trajectory, self.settings.chord)
+        times, positions = rows if found else sample_cubics(trajectory, self.settings.chord)
         still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
         along = None
         if not found and self.dynamics is not None:
-            found += self._torques(trajectory.times, pieces_of(trajectory), ", with the payload")
+            found += self._torques(trajectory.times, trajectory_pieces(trajectory), ", with the payload")
         if self.constraints is not None:
             found += self._too_fast(trajectory)
-            along = between_rows(trajectory, self.settings.constraint_chord) if not found else None
+            along = sample_cubics(trajectory, self.settings.constraint_chord) if not found else None
         return self._report(positions, times, found, np.isin(times, trajectory.times[still]), along)
 
     def collision_free(self, path: Path) -> bool:
@@ -193,7 +195,7 @@ class Verifier:
                 sweep.contact, float(np.interp(sweep.contact.at, np.arange(len(clock)), clock))
             )
         ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
-        hit = None if moving is None or moving.contact is None else _hit(moving.contact)
+        hit = None if moving is None or moving.contact is None else _moving_contact_violation(moving.contact)
         every = [v for v in (first, collision, hit, *ends) if v is not None]
         violation = min(every, key=lambda v: v.time, default=None)
         valid = violation is None
@@ -257,7 +259,7 @@ class Verifier:
     def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> list[Violation]:
         """Where a joint's torque is first not proved to be within its effort limit, with the payload."""
         assert self.dynamics is not None
-        beyond = first_beyond(self.dynamics, pieces, self.settings.rate_slack)
+        beyond = first_excess(self.dynamics, pieces, self.settings.rate_slack)
         if beyond is None:
             return []
         at, name = (
@@ -272,7 +274,7 @@ class Verifier:
         settings = self.settings
         if not len(q) > settings.reversals + 2:
             return None
-        kept = _apart(for_kernels(q), settings.reversal_step)
+        kept = _spaced_rows(for_kernels(q), settings.reversal_step)
         steps = np.diff(q[kept], axis=0)
         steps /= np.linalg.norm(steps, axis=1, keepdims=True)
         cosines = (steps[1:] * steps[:-1]).sum(axis=1)
@@ -297,7 +299,7 @@ class Verifier:
         problem, after = self.problem, 0.0
         for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
             if blend:
-                place = passes(self.robot, goal, q, blend, self.settings, after)
+                place = first_place_within(self.robot, goal, q, blend, self.settings, after)
             else:
                 stops = np.arange(len(q)) if at_rest is None else np.flatnonzero(at_rest)
                 late = stops[stops >= after]
@@ -346,7 +348,7 @@ class Verifier:
 
 
 @njit(cache=True)
-def _apart(q, step):
+def _spaced_rows(q, step):
     """Indices of rows of q[n, dof] that are each at least `step` from the one before, with the first."""
     kept, count = np.zeros(len(q), np.int64), 1
     for i in range(1, len(q)):
@@ -361,11 +363,12 @@ def _apart(q, step):
 
 @lru_cache(maxsize=8)
 def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
-    """The Verifier of a problem; the last few are kept, so that many paths of one problem are validated fast."""
+    """The Verifier of a problem; the last few are kept, so that many paths of one problem are validated
+    fast."""
     return Verifier(problem, settings)
 
 
-def _hit(contact: "TimedContact") -> Violation:
+def _moving_contact_violation(contact: "TimedContact") -> Violation:
     link, other, time = contact.link, contact.obstacle, contact.time
     message = f"{describe_contact(link, other, contact.depth, False)} at {time:.3f} s"
     return Violation("scene_collision", time, message, link, other, contact.depth)

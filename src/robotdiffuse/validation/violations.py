@@ -5,7 +5,7 @@ import numpy as np
 from robotdiffuse.collision.contacts import contacts
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.validation.rates import between_rows
+from robotdiffuse.validation.rates import sample_cubics
 from robotdiffuse.validation.validator import (
     DEFAULT,
     Report,
@@ -15,8 +15,8 @@ from robotdiffuse.validation.validator import (
     verifier,
 )
 
-RATES = ("rest", "rates", "velocity", "acceleration", "jump")
-CONTACTS = ("scene_collision", "self_collision")
+RATE_KINDS = ("rest", "rates", "velocity", "acceleration", "jump")
+CONTACT_KINDS = ("scene_collision", "self_collision")
 
 
 def violations(
@@ -32,11 +32,13 @@ def violations(
     if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
         return () if report.violation is None else (report.violation,)
     still = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
-    found = [w for w in report.found if w.kind != "limits" and not (w.kind in CONTACTS and w.other in still)]
+    found = [
+        w for w in report.found if w.kind != "limits" and not (w.kind in CONTACT_KINDS and w.other in still)
+    ]
     q, clock = motion.positions, np.arange(len(motion.positions), dtype=float)
     if timed:
-        rates = any(wrong.kind in RATES for wrong in found)
-        clock, q = (motion.times, q) if rates else between_rows(motion, settings.chord)
+        rates = any(wrong.kind in RATE_KINDS for wrong in found)
+        clock, q = (motion.times, q) if rates else sample_cubics(motion, settings.chord)
     for contact in contacts(problem.robot, problem.scene, q, settings.contact):
         found.append(collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock))))
     found += _limits(problem, q, clock, settings)

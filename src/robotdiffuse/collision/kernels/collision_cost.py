@@ -13,7 +13,7 @@ from numba import njit
 from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.distance import frames_of, placed, solid_distance
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
-from robotdiffuse.collision.kernels.simd import W, first_lane, greatest, lane, least, load, magnitude, root
+from robotdiffuse.collision.kernels.simd import W, absolute, first_lane, lane, load, maximum, minimum, sqrt
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _TINY = np.float32(1e-9)
@@ -25,16 +25,16 @@ def _signed_distances(x, y, z, solid):
     dx, dy, dz = x - solid[0], y - solid[1], z - solid[2]
     u = dx * solid[3] + dy * solid[4] + dz * solid[5]
     v = dx * solid[6] + dy * solid[7] + dz * solid[8]
-    w = magnitude(dx * solid[9] + dy * solid[10] + dz * solid[11]) - solid[14]
+    w = absolute(dx * solid[9] + dy * solid[10] + dz * solid[11]) - solid[14]
     if solid[16] > _ZERO:
-        u = root(u * u + v * v) - solid[12]
-        inside = least(greatest(u, w), _ZERO)
+        u = sqrt(u * u + v * v) - solid[12]
+        inside = minimum(maximum(u, w), _ZERO)
         v = u * _ZERO
     else:
-        u, v = magnitude(u) - solid[12], magnitude(v) - solid[13]
-        inside = least(greatest(greatest(u, v), w), _ZERO)
-    u, v, w = greatest(u, _ZERO), greatest(v, _ZERO), greatest(w, _ZERO)
-    return root(u * u + v * v + w * w) + inside - solid[15]
+        u, v = absolute(u) - solid[12], absolute(v) - solid[13]
+        inside = minimum(maximum(maximum(u, v), w), _ZERO)
+    u, v, w = maximum(u, _ZERO), maximum(v, _ZERO), maximum(w, _ZERO)
+    return sqrt(u * u + v * v + w * w) + inside - solid[15]
 
 
 @allocation_free(forceinline=True)
@@ -71,16 +71,16 @@ def _pull(robot, frames, frame, wrench, grad):
 @allocation_free(forceinline=True)
 def _close(around, part, x, y, z, reach):
     """Which of 16 obstacles have boxes around them within reach of a point."""
-    dx = greatest(greatest(load(around, part, 0) - x, x - load(around, part, 3)), _ZERO)
-    dy = greatest(greatest(load(around, part, 1) - y, y - load(around, part, 4)), _ZERO)
-    dz = greatest(greatest(load(around, part, 2) - z, z - load(around, part, 5)), _ZERO)
+    dx = maximum(maximum(load(around, part, 0) - x, x - load(around, part, 3)), _ZERO)
+    dy = maximum(maximum(load(around, part, 1) - y, y - load(around, part, 4)), _ZERO)
+    dz = maximum(maximum(load(around, part, 2) - z, z - load(around, part, 5)), _ZERO)
     return dx * dx + dy * dy + dz * dz < reach * reach
 
 
 @allocation_free(forceinline=True)
 def _row_cost(robot, scene, row, frame, margin, nearest, wrench):
     """Cost of a row of spheres towards the scene, whose pushes are added to the wrench."""
-    cost, around, bound = _ZERO, scene.around, robot.row_bounds[row]
+    cost, around, bound = _ZERO, scene.solid_boxes, robot.row_bounds[row]
     u, v, w = placed(frame, bound[0], bound[1], bound[2])
     reach, any_close = bound[3] + margin, 0
     if reach <= _ZERO:  # the cost is off
@@ -103,7 +103,7 @@ def _row_cost(robot, scene, row, frame, margin, nearest, wrench):
             close &= close - 1
             d = _signed_distances(x, y, z, scene.solids[k])
             nearer = d < best
-            best = least(best, d)
+            best = minimum(best, d)
             pushed |= nearer
             while nearer:
                 nearest[first_lane(nearer)] = k

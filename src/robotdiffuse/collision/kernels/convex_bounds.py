@@ -14,11 +14,11 @@ from numba import njit
 from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
 
-MOST_STEPS = 32
+MAX_GJK_STEPS = 32
 """Of GJK; mostly it takes three to eight."""
-CLOSE_ENOUGH = 0.02
+GJK_RELATIVE_TOLERANCE = 0.02
 """GJK ends when the distance is known up to this share ..."""
-CLOSER = 1e-7
+GJK_ABSOLUTE_TOLERANCE = 1e-7
 """... or up to this [m]."""
 
 
@@ -326,7 +326,7 @@ def find_plane(hulls, p, solids, other, posture):
     rounding = hulls.rounding[p] + (solids.rounding[other] if other >= 0 else hulls.rounding[-1 - other])
     best, gap, count = -np.inf, np.inf, 0
     n0, n1, n2 = points[0, 0], points[0, 1], points[0, 2]
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_GJK_STEPS):
         _support_of_part(hulls, p, posture, -1.0, 1)
         if other >= 0:
             _support_of_solid(solids, other, posture, 2)
@@ -340,11 +340,14 @@ def find_plane(hulls, p, solids, other, posture):
             n0, n1, n2 = points[0, 0], points[0, 1], points[0, 2]
         count = _nearest(simplex, count + 1, posture.edges, points[0])
         before, gap = gap, np.sqrt(_dot(points[0], points[0]))
-        if count == 0 or gap - rounding < CLOSER:
+        if count == 0 or gap - rounding < GJK_ABSOLUTE_TOLERANCE:
             return False
         for r in range(3):
             points[0, r] /= gap
-        if gap - best <= max(CLOSE_ENOUGH * (gap - rounding), CLOSER) or gap >= before:
+        if (
+            gap - best <= max(GJK_RELATIVE_TOLERANCE * (gap - rounding), GJK_ABSOLUTE_TOLERANCE)
+            or gap >= before
+        ):
             break
     points[0, 0], points[0, 1], points[0, 2] = n0, n1, n2
     return best > rounding

@@ -1,7 +1,7 @@
 """Compiled signed distances of the covering spheres, and gradients: one configuration after the other.
 
-The yes-or-no check is in `lanes.py`; these serve where the amount of clearance matters: the validator, guidance,
-refinement, and the clearances that the denoiser sees.
+The yes-or-no check is in `lanes.py`; these serve where the amount of clearance matters: the validator,
+guidance, refinement, and the clearances that the denoiser sees.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.point_grid import near_point
 
-CAP = np.float32(1.0)
+CLEARANCE_CAP = np.float32(1.0)
 """Clearances beyond this [m] are reported as this."""
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)

@@ -7,9 +7,9 @@ from numba import njit
 
 from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.lane_collision import W, open_lanes, place, place_frames
-from robotdiffuse.collision.kernels.point_grid import KEEP, points_distance, points_lower_bound
-from robotdiffuse.collision.kernels.simd import load, lowest
+from robotdiffuse.collision.kernels.lane_collision import W, lanes_that_may_touch, place, place_frames
+from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, points_distance, points_lower_bound
+from robotdiffuse.collision.kernels.simd import load, reduce_min
 
 _ZERO = np.float32(0.0)
 
@@ -87,13 +87,13 @@ def _bound_points(at, s, scene, radius, row, out):
     """Lower bounds for a sphere's centre, to a row of `out`."""
     for i in range(W):
         d = points_lower_bound(scene, at[s, i], at[s, W + i], at[s, 2 * W + i])
-        out[row, i] = min(d, KEEP + radius)
+        out[row, i] = min(d, POINT_RANGE + radius)
 
 
 @allocation_free()
 def _to_points(at, s, scene, radius, out):
     for i in range(W):
-        limit = min(out[0, i], KEEP + radius)
+        limit = min(out[0, i], POINT_RANGE + radius)
         out[0, i] = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit)
 
 
@@ -283,8 +283,8 @@ def block_pair_clearances(robot, q, limit, work, out):
     for p in range(len(robot.pairs)):
         pair_clearance(robot, p, limit, work, work.least)
         table, bit, known = robot.pairs[p, 2], robot.pairs[p, 3], 0
-        if table >= 0 and lowest(load(work.least, 0, 0)) <= _ZERO:
-            known = ~open_lanes(robot, table, bit, q)
+        if table >= 0 and reduce_min(load(work.least, 0, 0)) <= _ZERO:
+            known = ~lanes_that_may_touch(robot, table, bit, q)
         for i in range(W):
             apart = work.least[0, i] <= _ZERO and known >> i & 1
             out[p, i] = limit if apart else work.least[0, i]

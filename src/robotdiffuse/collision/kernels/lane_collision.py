@@ -15,28 +15,28 @@ from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.point_grid import far_from_points, near_points, touch_points
 from robotdiffuse.collision.kernels.simd import (
     W,
+    absolute,
+    copysign,
     first_lane,
+    floor,
     gather,
-    greatest,
-    highest,
     lanes_array,
-    lanes_with,
-    least,
+    lanes_with_bit,
     load,
-    lowest,
-    magnitude,
-    root,
+    maximum,
+    minimum,
+    reduce_max,
+    reduce_min,
+    sqrt,
     store,
-    whole,
-    with_sign,
 )
 
 _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
 _HALF = np.float32(0.5)
-HEAD, SIDE = 6, 130
+TABLE_HEADER, TABLE_SIDE = 6, 130
 """Numbers before the cells, and cells along each side, of a table of `near_pairs.py`."""
-ALL = (1 << W) - 1
+ALL_LANES = (1 << W) - 1
 """The mask of all lanes."""
 _ZERO = np.float32(0.0)
 # sin(2 pi u) for |u| <= 1/4: Taylor coefficients, error below 6e-8
@@ -58,10 +58,10 @@ def _sine_of_turn(u):
 def _turn(frames, parent, j, offset, q):
     """Frame behind a revolute joint, in 16 lanes: frames[j + 1] = frames[parent] @ offset @ Rz(q)."""
     turns = load(q, j, 0) * _INV_TAU
-    turns = turns - whole(turns + _HALF)
-    far = magnitude(turns)
+    turns = turns - floor(turns + _HALF)
+    far = absolute(turns)
     c = _sine_of_turn(_QUARTER - far)
-    s = with_sign(_sine_of_turn(_QUARTER - magnitude(far - _QUARTER)), turns)
+    s = copysign(_sine_of_turn(_QUARTER - absolute(far - _QUARTER)), turns)
     for k in range(3):
         r0, r1 = load(frames, parent, 3 * k), load(frames, parent, 3 * k + 1)
         r2 = load(frames, parent, 3 * k + 2)
@@ -148,13 +148,13 @@ def _touching(x, y, z, radius, solids, k):
     u = dx * solids[k, 3] + dy * solids[k, 4] + dz * solids[k, 5]
     v = dx * solids[k, 6] + dy * solids[k, 7] + dz * solids[k, 8]
     w = dx * solids[k, 9] + dy * solids[k, 10] + dz * solids[k, 11]
-    w = greatest(magnitude(w) - solids[k, 14], _ZERO)
+    w = maximum(absolute(w) - solids[k, 14], _ZERO)
     reach = radius + solids[k, 15]
     if solids[k, 16] > _ZERO:
-        r = greatest(root(u * u + v * v) - solids[k, 12], _ZERO)
+        r = maximum(sqrt(u * u + v * v) - solids[k, 12], _ZERO)
         return r * r + w * w < reach * reach
-    u = greatest(magnitude(u) - solids[k, 12], _ZERO)
-    v = greatest(magnitude(v) - solids[k, 13], _ZERO)
+    u = maximum(absolute(u) - solids[k, 12], _ZERO)
+    v = maximum(absolute(v) - solids[k, 13], _ZERO)
     return u * u + v * v + w * w < reach * reach
 
 
@@ -186,13 +186,13 @@ def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
     hits, f = 0, robot.frame[g]
     first, last = robot.first_row[g], robot.first_row[g + 1]
     for row in range(first, last):
-        open_lanes = near & ~hits
+        lanes_that_may_touch = near & ~hits
         if last - first > 1:
             x, y, z = _centres_of(frames, f, robot.row_bounds, row)
-            open_lanes &= _touching(x, y, z, robot.row_bounds[row, 3] + padding, solids, k)
-        while open_lanes:
-            i = first_lane(open_lanes)
-            open_lanes &= open_lanes - 1
+            lanes_that_may_touch &= _touching(x, y, z, robot.row_bounds[row, 3] + padding, solids, k)
+        while lanes_that_may_touch:
+            i = first_lane(lanes_that_may_touch)
+            lanes_that_may_touch &= lanes_that_may_touch - 1
             x, y, z = _place_row(robot, row, frames, f, i)
             if _touching(x, y, z, load(robot.rows, row, 3) + padding, solids, k) != 0:
                 hits |= 1 << i
@@ -207,13 +207,13 @@ def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
     hits, f = 0, robot.frame[g]
     first, last = robot.first_row[g], robot.first_row[g + 1]
     for row in range(first, last):
-        open_lanes = near & ~hits
+        lanes_that_may_touch = near & ~hits
         if last - first > 1:
             x, y, z = _centres_of(frames, f, robot.row_bounds, row)
-            open_lanes &= near_points(x, y, z, robot.row_bounds[row, 3] + padding, scene)
-        while open_lanes:
-            i = first_lane(open_lanes)
-            open_lanes &= open_lanes - 1
+            lanes_that_may_touch &= near_points(x, y, z, robot.row_bounds[row, 3] + padding, scene)
+        while lanes_that_may_touch:
+            i = first_lane(lanes_that_may_touch)
+            lanes_that_may_touch &= lanes_that_may_touch - 1
             x, y, z = _place_row(robot, row, frames, f, i)
             if touch_points(x, y, z, load(robot.rows, row, 3) + padding, scene):
                 hits |= 1 << i
@@ -241,11 +241,11 @@ def _touching_each_other(robot, a, b, near, stop_at_first, work):
             continue
         for other in range(robot.first_row[b], robot.first_row[b + 1]):
             u, v, w = _centres_of(frames, robot.frame[b], bounds, other)
-            open_lanes = near_row & ~hits
-            open_lanes &= _touching_balls(x, y, z, bounds[row, 3], u, v, w, bounds[other, 3])
-            while open_lanes:
-                i = first_lane(open_lanes)
-                open_lanes &= open_lanes - 1
+            lanes_that_may_touch = near_row & ~hits
+            lanes_that_may_touch &= _touching_balls(x, y, z, bounds[row, 3], u, v, w, bounds[other, 3])
+            while lanes_that_may_touch:
+                i = first_lane(lanes_that_may_touch)
+                lanes_that_may_touch &= lanes_that_may_touch - 1
                 if _rows_touch(robot, row, robot.frame[a], other, robot.frame[b], i, work):
                     hits |= 1 << i
                     if stop_at_first:
@@ -272,17 +272,24 @@ def _rows_touch(robot, row, f, other, g, i, work):
 @allocation_free(forceinline=True)
 def _hits_scene(robot, scene, padding, stop_at_first, work):
     hits = 0
-    frames, around, solids = work.frames, scene.around, scene.solids
+    frames, around, solids = work.frames, scene.solid_boxes, scene.solids
     for g in range(len(robot.frame)):
         if robot.frame[g] == 0:
             continue
         x, y, z = load(work.centres, g, 0), load(work.centres, g, 1), load(work.centres, g, 2)
-        x0, x1, y0, y1, z0, z1 = lowest(x), highest(x), lowest(y), highest(y), lowest(z), highest(z)
+        x0, x1, y0, y1, z0, z1 = (
+            reduce_min(x),
+            reduce_max(x),
+            reduce_min(y),
+            reduce_max(y),
+            reduce_min(z),
+            reduce_max(z),
+        )
         reach = robot.bounds[g, 3] + padding
         for row in range(len(around)):
-            dx = greatest(greatest(load(around, row, 0) - x1, x0 - load(around, row, 3)), _ZERO)
-            dy = greatest(greatest(load(around, row, 1) - y1, y0 - load(around, row, 4)), _ZERO)
-            dz = greatest(greatest(load(around, row, 2) - z1, z0 - load(around, row, 5)), _ZERO)
+            dx = maximum(maximum(load(around, row, 0) - x1, x0 - load(around, row, 3)), _ZERO)
+            dy = maximum(maximum(load(around, row, 1) - y1, y0 - load(around, row, 4)), _ZERO)
+            dz = maximum(maximum(load(around, row, 2) - z1, z0 - load(around, row, 5)), _ZERO)
             close = dx * dx + dy * dy + dz * dz < reach * reach
             while close:
                 k = row * W + first_lane(close)
@@ -298,20 +305,20 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
                 hits |= _touching_points(robot, g, frames, near, padding, scene, stop_at_first)
                 if stop_at_first and hits:
                     return hits
-        if hits == ALL:
+        if hits == ALL_LANES:
             return hits
     return hits
 
 
 @allocation_free(forceinline=True)
-def open_lanes(robot, table, bit, q):
+def lanes_that_may_touch(robot, table, bit, q):
     """The lanes in which a pair may touch by its table; see `near_pairs.py`."""
-    row = robot.near[table]
+    row = robot.pair_tables[table]
     first, second = load(q, np.int32(row[0]), 0), load(q, np.int32(row[3]), 0)
-    i = least(greatest((first - row[1]) * row[2], _ZERO), np.float32(SIDE - 1))
-    j = least(greatest((second - row[4]) * row[5], _ZERO), np.float32(SIDE - 1))
-    cells = gather(row, whole(i) * np.float32(SIDE) + whole(j) + np.float32(HEAD))
-    return lanes_with(cells, bit)
+    i = minimum(maximum((first - row[1]) * row[2], _ZERO), np.float32(TABLE_SIDE - 1))
+    j = minimum(maximum((second - row[4]) * row[5], _ZERO), np.float32(TABLE_SIDE - 1))
+    cells = gather(row, floor(i) * np.float32(TABLE_SIDE) + floor(j) + np.float32(TABLE_HEADER))
+    return lanes_with_bit(cells, bit)
 
 
 @allocation_free(forceinline=True)
@@ -324,7 +331,7 @@ def _hits_itself(robot, q, hits, stop_at_first, work):
         u, v, w = load(centres, b, 0), load(centres, b, 1), load(centres, b, 2)
         near = _touching_balls(x, y, z, bounds[a, 3], u, v, w, bounds[b, 3]) & ~hits
         if table >= 0:
-            near &= open_lanes(robot, table, bit, q)
+            near &= lanes_that_may_touch(robot, table, bit, q)
         if near:
             hits |= _touching_each_other(robot, a, b, near, stop_at_first, work)
             if stop_at_first and hits:
@@ -340,7 +347,7 @@ def block_hits(robot, scene, q, padding, stop_at_first, work):
     """
     place_frames(robot, q, work.frames, work.centres)
     hits = _hits_scene(robot, scene, padding, stop_at_first, work)
-    if hits == ALL or (stop_at_first and hits):
+    if hits == ALL_LANES or (stop_at_first and hits):
         return hits
     return _hits_itself(robot, q, hits, stop_at_first, work)
 

@@ -28,18 +28,18 @@ from robotdiffuse.collision.kernels.swept_spheres import (
     place_motions,
 )
 
-CAP = 1.0
+CLEARANCE_CAP = 1.0
 """Clearances are not looked for beyond this [m]."""
 FLOAT32_SLACK = 1e-5
 """What rounding may add to the clearances of the compiled kernel [m]."""
-HULLS_BELOW = 0.01
+CONVEX_PARTS_BELOW = 0.01
 """Sphere clearance [m] below which the convex meshes are looked at rather than the piece split further: the
 spheres stick out by about as much."""
-SURFACES_BELOW = 0.002
+COAL_BELOW = 0.002
 """The same for distances that only Coal knows, which take fifty times as long [m]."""
-MOST_PIECES = 4
+MAX_SPLIT = 4
 """A piece is split into at most this many at a time."""
-STRAIGHT = 0.995
+STRAIGHT_COSINE = 0.995
 """First pieces end at waypoints where the cosine of the turn is below this."""
 SCENE, PAIR = 0, 1
 
@@ -74,7 +74,7 @@ class Checks(NamedTuple):
     """[checks] the frame that motion is seen from: `base`, or where the arms of two links part."""
     second: np.ndarray
     """[checks] of links on two arms, the first joint of the second arm; else 0."""
-    levers: np.ndarray
+    motion_radii: np.ndarray
     """[checks, dof] motion bound of the link, or of either of two, seen from there, per unit of joint
     motion."""
 
@@ -113,15 +113,15 @@ class Round(NamedTuple):
 
 
 @njit(cache=True)
-def way_along(q, levers):
+def travel_along(q, motion_radii):
     """[n] motion bounds from the first waypoint of q[n, dof] to each, of the link that moves most."""
     way = np.zeros(len(q))
     for i in range(1, len(q)):
         most = 0.0
-        for c in range(len(levers)):
+        for c in range(len(motion_radii)):
             total = 0.0
             for j in range(q.shape[1]):
-                total += levers[c, j] * abs(q[i, j] - q[i - 1, j])
+                total += motion_radii[c, j] * abs(q[i, j] - q[i - 1, j])
             most = max(most, total)
         way[i] = way[i - 1] + most
     return way
@@ -139,8 +139,8 @@ def segment_at(way, at):
 @njit(cache=True)
 def configuration(motion, at, out):
     """The configuration at a place, to out[dof]."""
-    low, share = segment_at(motion.way, at)
-    high = min(low + 1, len(motion.way) - 1)
+    low, share = segment_at(motion.travel, at)
+    high = min(low + 1, len(motion.travel) - 1)
     for j in range(len(out)):
         out[j] = motion.q[low, j] + share * (motion.q[high, j] - motion.q[low, j])
 
@@ -171,7 +171,7 @@ def first_pieces(motion, checks, travel):
             for j in range(dof):
                 u, v = q[before + 1, j] - q[before, j], q[i, j] - q[i - 1, j]
                 dot, a, b = dot + u * v, a + u * u, b + v * v
-        if dot < STRAIGHT * np.sqrt(a * b):
+        if dot < STRAIGHT_COSINE * np.sqrt(a * b):
             _cut(ends, last, way[i - 1], travel)
             last = way[i - 1]
         before = i - 1
@@ -197,9 +197,9 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
         e[j] = 0.5 * abs(after + before)
         most[j] = max(abs(before), abs(after))
         square += dq[j] * dq[j]
-    first = np.searchsorted(motion.way, start, side="right")
-    for i in range(first, len(motion.way)):
-        if motion.way[i] >= stop:
+    first = np.searchsorted(motion.travel, start, side="right")
+    for i in range(first, len(motion.travel)):
+        if motion.travel[i] >= stop:
             break
         t = 0.0
         for j in range(dof):
@@ -224,7 +224,7 @@ def _remainder(lever, second, e, most):
 
 
 @njit(cache=True)
-def by_spheres(arm, scene, motion, checks, pieces, best, work):
+def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
     """What the spheres say of the pieces; lowers best[2]."""
     n, count = pieces.undecided.shape
     dof = motion.q.shape[1]
@@ -240,7 +240,7 @@ def by_spheres(arm, scene, motion, checks, pieces, best, work):
                 _spread(motion, pieces.start[row], pieces.stop[row], q, dq, e, most, scratch)
                 for c in range(count):
                     if pieces.undecided[row, c]:
-                        rest[row, c] = _remainder(checks.levers[c], checks.second[c], e, most)
+                        rest[row, c] = _remainder(checks.motion_radii[c], checks.second[c], e, most)
             for j in range(dof):
                 block[j, i], moves[j, i] = q[j], dq[j]
         place_motions(arm.spheres, block, moves, work)
@@ -267,7 +267,7 @@ def by_spheres(arm, scene, motion, checks, pieces, best, work):
                     continue
                 clearance[row, c] = work.clearance[0, row - first] - FLOAT32_SLACK
                 lower[row, c] = work.lower[0, row - first] - rest[row, c] - FLOAT32_SLACK
-                if clearance[row, c] > HULLS_BELOW:
+                if clearance[row, c] > CONVEX_PARTS_BELOW:
                     best[kind] = min(best[kind], clearance[row, c])
     return Round(pieces, clearance, lower, rest, np.full((n, count), -1.0))
 
@@ -279,7 +279,7 @@ def _is_open(found, checks, best, tightness, row, c):
 
 
 @njit(cache=True)
-def by_hulls(arm, solids, motion, checks, found, best, tightness, contact, posture):
+def bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, contact, posture):
     """Better bounds, from the convex meshes, where those of the spheres are too coarse; lowers best[2].
     Returns how many checks are left to Coal."""
     n, count = found.clearance.shape
@@ -289,7 +289,9 @@ def by_hulls(arm, solids, motion, checks, found, best, tightness, contact, postu
     for row in range(n):
         posed = False
         for c in range(count):
-            if found.clearance[row, c] > HULLS_BELOW or not _is_open(found, checks, best, tightness, row, c):
+            if found.clearance[row, c] > CONVEX_PARTS_BELOW or not _is_open(
+                found, checks, best, tightness, row, c
+            ):
                 continue
             if not posed:
                 _spread(motion, found.pieces.start[row], found.pieces.stop[row], q, dq, e, most, scratch)
@@ -302,7 +304,7 @@ def by_hulls(arm, solids, motion, checks, found, best, tightness, contact, postu
             if not coarse:
                 found.clearance[row, c] = max(clearance, coarser)
                 found.lower[row, c] = max(lower, found.lower[row, c])
-            if coarse and not touching and coarser > SURFACES_BELOW:
+            if coarse and not touching and coarser > COAL_BELOW:
                 best[kind] = min(best[kind], coarser)
             elif touching or coarse:
                 speed = 0.0
@@ -320,7 +322,7 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
     touch or nearly."""
     against_scene = checks.kind[c] == SCENE
     base, common, parts = checks.base[c], checks.common[c], len(hulls.frame)
-    clearance, lower, coarse, touching = CAP, CAP, False, False
+    clearance, lower, coarse, touching = CLEARANCE_CAP, CLEARANCE_CAP, False, False
     others = range(len(solids.disc)) if against_scene else range(checks.parts[c, 2], checks.parts[c, 3])
     for p in range(checks.parts[c, 0], checks.parts[c, 1]):
         speed = meshes.part_speed(hulls, p, base, posture)
@@ -366,7 +368,7 @@ def settle(checks, found, best, certified, tightness):
             # what is lost along a piece falls with its length, the remainder with its square
             rest, spare = found.rest[row, c], found.clearance[row, c] - least
             lost, k = found.clearance[row, c] - lower - rest, 2
-            while k < MOST_PIECES and not lost / k + rest / (k * k) <= spare:
+            while k < MAX_SPLIT and not lost / k + rest / (k * k) <= spare:
                 k += 1
             parts[row] = max(parts[row], k)
         total += parts[row]
@@ -399,8 +401,8 @@ def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightnes
     work = make_swept_spheres(arm.spheres, scene)
     posture = meshes.make_posture(arm.hulls, solids, motion.q.shape[1])
     while True:
-        found = by_spheres(arm, scene, motion, checks, pieces, best, work)
-        asked = by_hulls(arm, solids, motion, checks, found, best, tightness, contact, posture)
+        found = bound_by_spheres(arm, scene, motion, checks, pieces, best, work)
+        asked = bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, contact, posture)
         n, count = found.clearance.shape
         if n == 0 or asked:
             rows, columns, k = np.empty(asked, np.int64), np.empty(asked, np.int64), 0

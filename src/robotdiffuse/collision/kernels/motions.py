@@ -7,7 +7,7 @@ from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_collision import block_hits, make_workspace
-from robotdiffuse.collision.kernels.simd import W, ramp, store
+from robotdiffuse.collision.kernels.simd import W, lane_numbers, store
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 RELAXATION_SLOPE = np.float32(0.1)
@@ -25,7 +25,7 @@ class Space(NamedTuple):
     """SceneArrays"""
     lower: np.ndarray
     upper: np.ndarray
-    levers: np.ndarray
+    motion_radii: np.ndarray
     """[dof] largest distance of any point of the arm from each joint's axis [m], 1 for prismatic joints."""
     resolution: np.float32
     """No point of the arm moves further than this between two checks [m]."""
@@ -101,11 +101,11 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
     dof = len(a)
     travel = np.float32(0.0)
     for j in range(dof):
-        travel += (t - s) * np.float32(abs(b[j] - a[j])) * space.levers[j]
+        travel += (t - s) * np.float32(abs(b[j] - a[j])) * space.motion_radii[j]
     blocks = max(int(np.ceil(travel / space.resolution / np.float32(W))), 1)
     step = (t - s) / np.float32(blocks * W)
     for k in range(blocks):
-        shares = (ramp() * np.float32(blocks) + np.float32(blocks - k)) * step
+        shares = (lane_numbers() * np.float32(blocks) + np.float32(blocks - k)) * step
         for j in range(dof):
             far = np.float32(b[j] - a[j])
             store(block, j, 0, shares * far + (np.float32(a[j]) + s * far))

@@ -14,9 +14,9 @@ from numba import njit
 from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, step
 
-CAP = 1.0
+CLEARANCE_CAP = 1.0
 """Clearances beyond this [m] are reported as this."""
-DEEPEST = 48
+MAX_HALVINGS = 48
 """An interval is halved so often at most."""
 
 
@@ -37,7 +37,7 @@ class Links(NamedTuple):
     """[links + 1] first sphere of each link."""
     spheres: np.ndarray
     """[n, 4] x y z radius in the frame of the link."""
-    levers: np.ndarray
+    motion_radii: np.ndarray
     """[links, dof] motion bounds per unit of joint motion."""
 
 
@@ -126,7 +126,7 @@ def speed_between(tracks, o, start, stop):
 
 
 @njit(cache=True)
-def _gap(tracks, o, rotation, xyz, x, y, z):
+def _obstacle_distance(tracks, o, rotation, xyz, x, y, z):
     """Signed distance of a point to an obstacle that has not grown [m]; within, at most the true one."""
     x, y, z = x - xyz[0], y - xyz[1], z - xyz[2]
     u = abs(rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z - tracks.centre[o, 0])
@@ -150,14 +150,20 @@ def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
     T = frames[links.frame[link]]
     ball = links.bounds[link]
     around = (
-        _gap(tracks, o, rotation, xyz, placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)) - ball[3]
+        _obstacle_distance(
+            tracks, o, rotation, xyz, placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)
+        )
+        - ball[3]
     )
     if around > enough:
         return around
     least = np.inf
     for s in range(links.first[link], links.first[link + 1]):
         p = links.spheres[s]
-        gap = _gap(tracks, o, rotation, xyz, placed(T, p, 0), placed(T, p, 1), placed(T, p, 2)) - p[3]
+        gap = (
+            _obstacle_distance(tracks, o, rotation, xyz, placed(T, p, 0), placed(T, p, 1), placed(T, p, 2))
+            - p[3]
+        )
         least = min(least, gap)
     return least
 
@@ -184,7 +190,7 @@ def _mixed(rows, low, share, j):
 
 
 @njit(cache=True)
-def ways_of(q):
+def cumulative_motion(q):
     """[n, dof] how far each joint has moved by each row, to and fro."""
     ways = np.zeros_like(q)
     for i in range(1, len(q)):
@@ -194,7 +200,7 @@ def ways_of(q):
 
 
 @njit(cache=True, nogil=True)
-def certify(links, tracks, times, q, tasks, least, tightness, best):
+def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
     """Settle the tasks, in their order, as far as the spheres can.
 
     The motion is on straight lines between the rows q[n, dof] at times[n], at rest before and after. A pair
@@ -203,7 +209,7 @@ def certify(links, tracks, times, q, tasks, least, tightness, best):
     to the exact meshes, of one pair each: their middles are where its spheres are within `least`.
     """
     dof, count, obstacles = q.shape[1], len(links.frame), len(tracks.growth)
-    ways = ways_of(q)
+    ways = cumulative_motion(q)
     frames = np.zeros((dof + 1, 4, 4))
     for i in range(dof + 1):
         frames[i, 3, 3] = 1.0
@@ -212,11 +218,11 @@ def certify(links, tracks, times, q, tasks, least, tightness, best):
     middle, moved = np.empty(dof), np.empty(dof)
     rotation, xyz = np.empty((3, 3)), np.empty(3)
     travel = np.empty(count)
-    starts, stops = np.empty(DEEPEST + 2), np.empty(DEEPEST + 2)
-    depths = np.empty(DEEPEST + 2, np.int64)
-    pairs = np.empty((DEEPEST + 2, count, obstacles), np.bool_)
+    starts, stops = np.empty(MAX_HALVINGS + 2), np.empty(MAX_HALVINGS + 2)
+    depths = np.empty(MAX_HALVINGS + 2, np.int64)
+    pairs = np.empty((MAX_HALVINGS + 2, count, obstacles), np.bool_)
     left = [(0.0, 0.0, 0, 0) for _ in range(0)]
-    certified = CAP
+    certified = CLEARANCE_CAP
     for task in range(len(tasks.start)):
         starts[0], stops[0], depths[0], size = tasks.start[task], tasks.stop[task], 0, 1
         pairs[0] = tasks.pairs[task]
@@ -236,7 +242,7 @@ def certify(links, tracks, times, q, tasks, least, tightness, best):
             for link in range(count):
                 travel[link] = 0.0
                 for j in range(dof):
-                    travel[link] += links.levers[link, j] * moved[j]
+                    travel[link] += links.motion_radii[link, j] * moved[j]
             again = False
             for o in range(obstacles):
                 posed, speed = False, 0.0
@@ -251,8 +257,8 @@ def certify(links, tracks, times, q, tasks, least, tightness, best):
                     asked = max(least, tightness * best[0])
                     enough = grown + lost + max(asked, best[0] if tightness > 0 else 0.0)
                     clear = _clearance(links, frames, link, tracks, o, rotation, xyz, enough) - grown
-                    clear = min(clear, CAP + lost)
-                    if clear <= least or depth == DEEPEST:
+                    clear = min(clear, CLEARANCE_CAP + lost)
+                    if clear <= least or depth == MAX_HALVINGS:
                         left.append((start, stop, link, o))
                         pairs[size, link, o] = False
                         continue
@@ -272,7 +278,7 @@ def certify(links, tracks, times, q, tasks, least, tightness, best):
 
 
 @njit(cache=True, nogil=True)
-def free_over(links, tracks, q, times, least):
+def free_at_times(links, tracks, q, times, least):
     """[n, k] whether no link comes within `least` [m] of any obstacle, at each of q[n, dof] and each of the
     increasing times[k]; by the covering spheres."""
     dof, count, obstacles = q.shape[1], len(links.frame), len(tracks.growth)

@@ -5,7 +5,7 @@ from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
 
-_FAR = np.int32(1 << 30)
+_NO_POINTS = np.int32(1 << 30)
 """Squared distance where there are no points at all [voxels²]."""
 _ROUNDED = 1e-6
 """More than what rounding does to a place in a line, less than how far one that is no integer is from one."""
@@ -19,7 +19,7 @@ def nearest_voxels(run):
     J. Roerdink, W. Hesselink, 2000).
     """
     nx, ny, nz = run.shape
-    squares, holders = np.full((nx, ny, nz), _FAR, np.int32), run.copy()
+    squares, holders = np.full((nx, ny, nz), _NO_POINTS, np.int32), run.copy()
     for i in range(nx):
         for j in range(ny):
             for way in (1, -1):
@@ -50,7 +50,7 @@ def _nearest_in_line(squares, holders, kept, since, before, whose):
     n, top = len(squares), -1
     for u in range(n):
         before[u], whose[u] = squares[u], holders[u]
-        if before[u] == _FAR:
+        if before[u] == _NO_POINTS:
             continue
         while (
             top >= 0 and before[kept[top]] + (since[top] - kept[top]) ** 2 > before[u] + (since[top] - u) ** 2

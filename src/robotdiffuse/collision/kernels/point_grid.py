@@ -15,16 +15,16 @@ from robotdiffuse.collision.kernels.nearest_voxels import nearest_voxels
 from robotdiffuse.collision.kernels.simd import (
     W,
     first_lane,
+    floor,
     gather,
-    greatest,
     lane,
-    least,
     load,
-    root,
-    whole,
+    maximum,
+    minimum,
+    sqrt,
 )
 
-KEEP = np.float32(0.3)
+POINT_RANGE = np.float32(0.3)
 """Points are known this far beyond the robot's reach; clearances to points count as at most this [m]."""
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
@@ -162,19 +162,19 @@ def _ask_grid(x, y, z, radius, scene):
     band, voxel = frame[7], frame[3]
     inverse = _ONE / voxel
     fx, fy, fz = (x - frame[0]) * inverse, (y - frame[1]) * inverse, (z - frame[2]) * inverse
-    cx = least(greatest(fx, _ZERO), frame[8] - _HALF)
-    cy = least(greatest(fy, _ZERO), frame[9] - _HALF)
-    cz = least(greatest(fz, _ZERO), frame[10] - _HALF)
-    ix, iy, iz = whole(cx), whole(cy), whole(cz)
+    cx = minimum(maximum(fx, _ZERO), frame[8] - _HALF)
+    cy = minimum(maximum(fy, _ZERO), frame[9] - _HALF)
+    cz = minimum(maximum(fz, _ZERO), frame[10] - _HALF)
+    ix, iy, iz = floor(cx), floor(cy), floor(cz)
     g = gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz)
     ex, ey, ez = cx - ix - _HALF, cy - iy - _HALF, cz - iz - _HALF
-    e = root(ex * ex + ey * ey + ez * ez) * voxel
+    e = sqrt(ex * ex + ey * ey + ez * ez) * voxel
     ox, oy, oz = fx - cx, fy - cy, fz - cz
     out = (ox * ox + oy * oy + oz * oz) * (voxel * voxel)
-    inner = greatest(g - e, _ZERO)
+    inner = maximum(g - e, _ZERO)
     free = radius + (frame[5] + _SLACK)
     near = inner * inner + out < free * free
-    inside = (g + e + root(out) < radius + (frame[6] - _SLACK)) & (g < band)
+    inside = (g + e + sqrt(out) < radius + (frame[6] - _SLACK)) & (g < band)
     return near, near & inside
 
 
@@ -198,12 +198,12 @@ def _near_by_eight(x, y, z, radius, scene):
     their bounds, that of the voxel straight away from the nearest point hardly loses anything."""
     frame = scene.grid_frame
     inverse = _ONE / frame[3]
-    fx = least(greatest((x - frame[0]) * inverse, _ZERO), frame[8] - _HALF)
-    fy = least(greatest((y - frame[1]) * inverse, _ZERO), frame[9] - _HALF)
-    fz = least(greatest((z - frame[2]) * inverse, _ZERO), frame[10] - _HALF)
-    lx = least(whole(greatest(fx - _HALF, _ZERO)), frame[8] - np.float32(2.0))
-    ly = least(whole(greatest(fy - _HALF, _ZERO)), frame[9] - np.float32(2.0))
-    lz = least(whole(greatest(fz - _HALF, _ZERO)), frame[10] - np.float32(2.0))
+    fx = minimum(maximum((x - frame[0]) * inverse, _ZERO), frame[8] - _HALF)
+    fy = minimum(maximum((y - frame[1]) * inverse, _ZERO), frame[9] - _HALF)
+    fz = minimum(maximum((z - frame[2]) * inverse, _ZERO), frame[10] - _HALF)
+    lx = minimum(floor(maximum(fx - _HALF, _ZERO)), frame[8] - np.float32(2.0))
+    ly = minimum(floor(maximum(fy - _HALF, _ZERO)), frame[9] - np.float32(2.0))
+    lz = minimum(floor(maximum(fz - _HALF, _ZERO)), frame[10] - np.float32(2.0))
     bound = fx * _ZERO
     for corner in range(8):
         ix, iy, iz = (
@@ -212,8 +212,8 @@ def _near_by_eight(x, y, z, radius, scene):
             lz + np.float32(corner & 1),
         )
         ex, ey, ez = fx - ix - _HALF, fy - iy - _HALF, fz - iz - _HALF
-        e = root(ex * ex + ey * ey + ez * ez) * frame[3]
-        bound = greatest(bound, gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz) - e)
+        e = sqrt(ex * ex + ey * ey + ez * ez) * frame[3]
+        bound = maximum(bound, gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz) - e)
     return bound < radius + (frame[5] + _SLACK)
 
 

@@ -117,12 +117,12 @@ def _elementwise(name: str, count: int) -> Any:
     return _operation(lambda context, a, b: generated(context, a, b))
 
 
-least = _elementwise("minnum", 2)
-greatest = _elementwise("maxnum", 2)
-magnitude = _elementwise("fabs", 1)
-with_sign = _elementwise("copysign", 2)
-root = _elementwise("sqrt", 1)
-whole = _elementwise("floor", 1)
+minimum = _elementwise("minnum", 2)
+maximum = _elementwise("maxnum", 2)
+absolute = _elementwise("fabs", 1)
+copysign = _elementwise("copysign", 2)
+sqrt = _elementwise("sqrt", 1)
+floor = _elementwise("floor", 1)
 
 
 def _reduction(name: str) -> Any:
@@ -135,8 +135,8 @@ def _reduction(name: str) -> Any:
     return _operation(generated)
 
 
-lowest = _reduction("fmin")
-highest = _reduction("fmax")
+reduce_min = _reduction("fmin")
+reduce_max = _reduction("fmax")
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, row: Any, part: Any) -> Any:
@@ -160,7 +160,7 @@ def _holds_floats(array: Any, dimensions: int) -> bool:
 
 
 @_operation
-def ramp(_context: Any) -> Any:
+def lane_numbers(_context: Any) -> Any:
     """The number of each lane."""
     return LANES(), lambda *_: ir.Constant(_VECTOR, [float(i) for i in range(W)])
 
@@ -218,7 +218,7 @@ def lane(_context: Any, a: Any, i: Any) -> Any:
 
 
 @_operation
-def lanes_with(_context: Any, a: Any, bit: Any) -> Any:
+def lanes_with_bit(_context: Any, a: Any, bit: Any) -> Any:
     """The lanes whose whole number has a bit of `bit`."""
 
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:

@@ -20,7 +20,7 @@ from robotdiffuse.collision.kernels.lane_clearance import (
     to_scene,
 )
 from robotdiffuse.collision.kernels.lane_collision import W, place, place_frames
-from robotdiffuse.collision.kernels.point_grid import KEEP, points_distance
+from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, points_distance
 
 _ZERO, _TINY = np.float32(0.0), np.float32(1e-9)
 
@@ -203,7 +203,7 @@ def _past_points(at, v, s, radius, scene, need, clearance, lower):
     for i in range(W):
         x, y, z = v[s, i], v[s, W + i], v[s, 2 * W + i]
         speed = np.sqrt(x * x + y * y + z * z)
-        limit = min(need[i] + speed, KEEP) + radius
+        limit = min(need[i] + speed, POINT_RANGE) + radius
         d = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit) - radius
         clearance[0, i] = min(clearance[0, i], d)
         lower[0, i] = min(lower[0, i], d - speed)

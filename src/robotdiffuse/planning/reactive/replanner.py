@@ -356,7 +356,7 @@ class _Ahead:
         """The same, each obstacle larger by so much [m]."""
         other = copy(self)
         other.berth = self.berth + berth
-        other._collision = self._collision.wider(berth)
+        other._collision = self._collision.inflated(berth)
         return other
 
     def shapes(self, time: float) -> list[Shape]:
@@ -366,13 +366,13 @@ class _Ahead:
     def near(self, motion: Trajectory, begins: float, clearance: float) -> float | None:
         """When they first may come nearer than the clearance, None if they do not."""
         times = motion.times + (begins - self._since)
-        first = self._collision.covered_free(times, motion.positions, clearance)
+        first = self._collision.first_unproved_time(times, motion.positions, clearance)
         return None if first is None else first + self._since
 
     def comes_to(self, q: Float[ndarray, "n dof"], times: Float[ndarray, "n"], hold: float) -> float | None:
         """When something first comes to the arm on its way, or where it rests for some time then."""
         times = np.append(times, times[-1] + hold) - self._since
-        first = self._collision.covered_free(times, np.concatenate([q, q[-1:]]), 0.0)
+        first = self._collision.first_unproved_time(times, np.concatenate([q, q[-1:]]), 0.0)
         return None if first is None else first + self._since
 
     def comes(self, q: Float[ndarray, "dof"], time: float, hold: float) -> float | None:
