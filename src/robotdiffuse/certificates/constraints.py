@@ -1,10 +1,10 @@
-"""Path constraints along a motion: the checker's own proof, from one configuration to the next.
+"""Bounds of path constraints from one configuration to the next: the checker's own proof.
 
-Between two configurations joints move by dq at constant rates. A frame's origin p then leaves the chord by
-at most an eighth of its second derivative, which is at most sum_jk |dq_j dq_k| L_max(j,k), L_k being the
-distance of p from axis k all along. The distance to a convex body is convex, so the greater of both ends and
-that bound it; an axis of the frame leaves its chord by at most (sum_j |dq_j|)² / 8; and an angle between
-orientations grows no faster than both turn.
+Between two configurations joints move by dq at constant rates. A frame's origin p then leaves the chord by at
+most an eighth of its second derivative, which is at most sum_jk |dq_j dq_k| L_max(j,k), where L_k bounds the
+distance of p from axis k all along. The distance to a convex body is a convex function, so it is bounded by
+its greater value at the two ends plus that deviation. An axis of the frame leaves its chord by at most (sum_j
+|dq_j|)² / 8, and the angle between two orientations grows no faster than the sum of their rotations.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from robotdiffuse.problems.problem import Problem
 
 
 class ConstraintBound(NamedTuple):
-    """What is said of one quantity of a constraint."""
+    """Upper bounds of one quantity of a constraint."""
 
     name: str
     limit: float
@@ -32,37 +32,38 @@ class ConstraintBound(NamedTuple):
 
 
 class _Body(NamedTuple):
-    """A box, without extent or without end along some of its axes."""
+    """A box whose half sizes may be 0 or infinite along some of its axes."""
 
     center: ndarray
     R: ndarray
     half: ndarray
 
     def distances(self, points: ndarray) -> ndarray:
-        """Negative within."""
+        """Signed distances of points [m], negative inside."""
         beyond = np.abs((points - self.center) @ self.R) - self.half
         return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
 
 
 class _FrameMotion(NamedTuple):
-    """A frame from each of n + 1 configurations to the next."""
+    """Motion of a frame from each of n + 1 configurations to the next."""
 
     p: Float[ndarray, "n1 3"]
     R: Float[ndarray, "n1 3 3"]
     turn: Float[ndarray, "n"]
-    """At most [rad], ..."""
+    """Upper bound of its rotation [rad]."""
     went: Float[ndarray, "n"]
-    """... the way of its origin [m], ..."""
+    """Upper bound of the path length of its origin [m]."""
     sag: Float[ndarray, "n"]
-    """... and how far that leaves the chord [m]."""
+    """Upper bound of the origin's distance from the chord [m]."""
     slack: Float[ndarray, "n"]
-    """What a joint off by 1 rad or m each moves the origin [m]."""
+    """Upper bound of the origin's displacement if every joint is off by 1 rad or 1 m [m]."""
     joints: int
+    """Number of joints that move the frame."""
 
 
 def constraint_bounds(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[ConstraintBound]:
-    """Bounds along the straight lines through configurations, and along motions which those leave by at most
-    `chord`, each joint [rad] or [m]. Raises InputError for a line whose goal does not say one pose."""
+    """Bounds along straight lines through configurations, and along all motions within `chord` of these lines
+    in each joint [rad] or [m]. Raises InputError for a Cartesian line if the goal is not a single pose."""
     linkage = Linkage(problem.robot)
     q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
     frames = {constraint.frame for constraint in problem.constraints}
@@ -93,7 +94,7 @@ def constraint_bounds(problem: Problem, q: Float[ndarray, "n dof"], chord: float
 
 
 def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
-    """A line for each frame that is faster than its constraint allows, by more than a share, at some row."""
+    """A line for each frame that exceeds its constraint's speed by more than a share `slack` at some row."""
     linkage, lines = Linkage(problem.robot), []
     for one in problem.constraints:
         if not isinstance(one, CartesianLine) or one.speed is None:
@@ -102,7 +103,7 @@ def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> li
         joints, rates = linkage.rates(postures, one.frame)
         speeds = np.linalg.norm((rates * motion.velocities[:, joints, None]).sum(axis=1), axis=1)
         if speeds.max() > one.speed * (1 + slack):
-            lines.append(f"motion: {one.frame} moves at {speeds.max():.4g} m/s, of {one.speed:g} allowed")
+            lines.append(f"motion: {one.frame} moves at {speeds.max():.4g} m/s; {one.speed:g} m/s is allowed")
     return lines
 
 
@@ -113,7 +114,7 @@ def _frame_motion(linkage: Linkage, postures: Postures, q: ndarray, frame: str) 
     went, sag = np.zeros(len(step)), np.zeros(len(step))
     for j in reversed(range(len(joints))):
         if not linkage.slides[joints[j]]:
-            lengths[:, j] += went  # what later joints have moved it
+            lengths[:, j] += went  # later joints may have moved it away by so much
         went = went + step[:, j] * lengths[:, j]
         before = step[:, :j].sum(axis=1)
         sag += lengths[:, j] * step[:, j] * (step[:, j] + 2 * before) / 8
@@ -140,7 +141,7 @@ def _segment(start: ndarray, goal: ndarray) -> _Body:
 
 
 def _with_z(z: ndarray) -> Float[ndarray, "3 3"]:
-    """A rotation whose third column is a unit vector."""
+    """A rotation matrix with a given unit vector as its third column."""
     x = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z], axis=1)
@@ -156,11 +157,12 @@ def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tupl
         other = linkage.links.index(pose.frame)
         if (linkage.moved[k] == linkage.moved[other]).all():
             return start[k], pose.T_base_frame @ np.linalg.inv(start[other]) @ start[k]
-    raise InputError(f"cartesian_line of {line.frame}: the goal does not say one pose of it")
+    raise InputError(f"cartesian_line of {line.frame}: the goal does not determine one pose of it")
 
 
 def _angle_bounds(along: _FrameMotion, T_start: ndarray, T_goal: ndarray, chord: float) -> ndarray:
-    """The angle from the orientation that belongs to the frame's share of the segment."""
+    """Bounds of the angle between the frame's orientation and the one interpolated at its place on the
+    line."""
     way = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(way))
     turn = _rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
@@ -170,7 +172,7 @@ def _angle_bounds(along: _FrameMotion, T_start: ndarray, T_goal: ndarray, chord:
     K = cross_matrix(axis)
     angles = (share * whole)[:, None, None]
     wanted = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
-    # by the chord between rotations, which is exact near 0 too
+    # from the norm of the difference of rotations, which is accurate near 0 too
     chords = np.linalg.norm(along.R - wanted, axis=(1, 2))
     off = 2 * np.arcsin(np.clip(chords / np.sqrt(8), 0.0, 1.0))
     reach = whole / length

@@ -13,11 +13,11 @@ import pytest
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import Stretches
+from robotdiffuse.certificates.certificate import Certificate, load_certificate
 from robotdiffuse.certificates.checker import hash_of
 from robotdiffuse.certificates.constraints import constraint_bounds
-from robotdiffuse.certificates.content import request_parts
+from robotdiffuse.certificates.content_hashes import request_parts
 from robotdiffuse.certificates.moving_obstacles import MovingProver
-from robotdiffuse.certificates.proof import Certificate, load_certificate
 from robotdiffuse.certificates.search import certify
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Trajectory
@@ -97,11 +97,11 @@ def coarser(certificate: Certificate) -> Certificate:
 
 
 TAMPERED: dict[str, tuple[str, Callable[[Certificate], Certificate], str]] = {
-    "no proof": ("moving", without_moving, "proof: nothing is said of obstacles that move"),
+    "no proof": ("moving", without_moving, "proof: there is none among moving obstacles"),
     "displacement": ("moving", nearer, "proof: displacement of .* against post from row .* is "),
-    "a gap": ("moving", shorter, "proof: (clearance|displacement|nothing is said) .*post from row"),
-    "bounds": ("cone", tighter, "constraints: axis_cone of panda_hand is at most "),
-    "no bounds": ("line", unconstrained, "constraints: the certificate is not about those of the problem"),
+    "a gap": ("moving", shorter, "proof: (clearance of |displacement of )?.*post (is missing )?from row"),
+    "bounds": ("cone", tighter, "constraints: the bound of axis_cone of panda_hand is "),
+    "no bounds": ("line", unconstrained, "constraints: they are not those of the problem"),
     "chords": ("cone", coarser, "motion: its cubics leave the straight lines that were certified"),
     "beginning": ("start velocity", slower, "motion: it does not begin at the problem's start_velocity"),
 }
@@ -207,5 +207,5 @@ def test_paths_with_constraints_are_certified_and_with_moving_obstacles_refused(
     certificate = certify(problem, path)
     assert certificate.check(problem).valid and len(certificate.between)
     problem, _ = certified("moving")
-    with pytest.raises(InputError, match="the problem has moving, without times, which certificates do not"):
+    with pytest.raises(InputError, match="certificates prove nothing about moving, without times"):
         certify(problem, path)

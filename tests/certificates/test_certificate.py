@@ -13,9 +13,10 @@ import trimesh
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import Prover, Stretches
+from robotdiffuse.certificates.certificate import Certificate, load_certificate
 from robotdiffuse.certificates.checker import describe_claim, hash_of
-from robotdiffuse.certificates.content import robot_parts, scene_parts
-from robotdiffuse.certificates.proof import Certificate, Proof, Tolerances, load_certificate
+from robotdiffuse.certificates.content_hashes import robot_parts, scene_parts
+from robotdiffuse.certificates.proof import StretchProof, Tolerances
 from robotdiffuse.certificates.search import NotValidError, certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
@@ -190,18 +191,18 @@ def looser(record: dict[str, Any]) -> None:
 
 
 TAMPERED = {
-    moved_obstacle: "scene: ball is not as it was",
-    removed_obstacle: "scene: table is not here",
+    moved_obstacle: "scene: ball has changed",
+    removed_obstacle: "scene: table is missing",
     altered_waypoint: "motion: it is not the one that was certified: its hash differs",
     altered_time: "motion: it is not the one that was certified: its hash differs",
     other_start: "motion: it begins 0.01 off the start",
     other_goal: "motion: it does not end at the goal",
     altered_clearance: r"proof: clearance of \w+ against [\w ]+ from row [\d.]+ to row [\d.]+ is",
     altered_displacement: r"proof: displacement of \w+ against [\w ]+ from row [\d.]+ to row [\d.]+ is",
-    removed_stretch: r"proof: nothing is said of \w+ against [\w ]+ from row 0 to row",
-    removed_claim: r"proof: nothing is said of \w+ against",
+    removed_stretch: r"proof: \w+ against [\w ]+ is missing from row 0 to row",
+    removed_claim: r"proof: \w+ against [\w ]+ is missing",
     claimed_more: r"proof: \w+ against the scene from row [\d.]+ to row [\d.]+ is clear by [\d.]+ m, not by",
-    claimed_nothing: "proof: a self clearance of 0 m is none",
+    claimed_nothing: "proof: its self clearance is 0 m, which is not positive",
     looser: "tolerances: goal_tolerance is 0.5, looser than 0.0001",
     tighter: "motion: its cubics leave the straight lines that were certified",
 }
@@ -223,10 +224,10 @@ def test_another_robot_is_caught_and_named(file: FilePath, planned: tuple[Proble
     certificate, problem = load_certificate(file), planned[0]
     opened = replace(problem, robot=problem.robot.with_locked({"panda_finger_joint1": 0.01}))
     found = certificate.check(opened).differences
-    assert "robot: joint panda_finger_joint1 is not as it was" in found
+    assert "robot: joint panda_finger_joint1 has changed" in found
     wider = dict(problem.robot.spheres) | {"panda_link5": problem.robot.spheres["panda_link5"] * 1.1}
     found = certificate.check(replace(problem, robot=replace(problem.robot, spheres=wider))).differences
-    assert "robot: spheres of panda_link5 is not as it was" in found
+    assert "robot: spheres of panda_link5 has changed" in found
     other = Problem(box_arm(), problem.scene, [0, 0, 0], [0, 0, 0])
     assert any(
         line.startswith("motion: its joints are panda_joint1")
@@ -306,11 +307,11 @@ def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
     motion = motion if with_times else Path(robot.joint_names, here)
     none = np.zeros(0)
     claims = Prover(robot, problem.scene, here).claims
-    proof = Proof(claims, Stretches(none.astype(int), none, none), none.astype(bool), none, none, ())
+    proof = StretchProof(claims, Stretches(none.astype(int), none, none), none.astype(bool), none, none, ())
     parts = robot_parts(robot), scene_parts(problem.scene), hash_of(motion)
     certificate = Certificate(robot.name, *parts, Tolerances(), motion, none, 0.5, 0.5, proof)
     assert certificate.check(problem).differences == tuple(
-        f"proof: nothing is said of {describe_claim(claim)} from row 0 to row 0" for claim in claims
+        f"proof: {describe_claim(claim)} is missing from row 0 to row 0" for claim in claims
     )
 
 
