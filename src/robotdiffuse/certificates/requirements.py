@@ -107,7 +107,7 @@ def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
         if abs(torque - said[name]) > BOUND_TOLERANCE:
             yield f"torques: the bound of {name} is {torque:.6f}, not {said[name]:.6f}"
         if not torque <= limit:
-            yield f"torques: {name} is not shown to keep its limit: its bound {torque:.6f} exceeds {limit:.6f}"
+            yield f"torques: {name} is not shown to keep its limit: {torque:.6f} of {limit:.6f}"
 
 
 def _constraint_errors(
@@ -125,9 +125,7 @@ def _constraint_errors(
         if abs(most - said) > BOUND_TOLERANCE:
             yield f"constraints: the bound of {one.name} is {most:.6f}, not {said:.6f}"
         if not most <= one.limit:
-            yield (
-                f"constraints: {one.name} is not shown to be kept: its bound {most:.6f} exceeds {one.limit:.6f}"
-            )
+            yield f"constraints: {one.name} is not shown to be kept: {most:.6f} of {one.limit:.6f}"
 
 
 def _rate_errors(

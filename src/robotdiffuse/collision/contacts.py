@@ -1,4 +1,4 @@
-"""Every contact of a motion, not only the first: for people who ask what all is wrong with it."""
+"""All contacts of a motion, not only the first."""
 
 import numpy as np
 from jaxtyping import Float
@@ -14,15 +14,14 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 MAX_CONFIGURATIONS = 5000
-"""Configurations at which contacts are followed."""
+"""Motion certificates at most in a search for contacts."""
 
 
 def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: float) -> list[Contact]:
-    """All contacts along straight lines through waypoints, in order, each from where two bodies come nearer
-    than `contact` [m] until they part.
+    """All contacts along straight lines through waypoints, in order.
 
-    Where nothing touches the certificate says so; while something does, all else is looked at every 1 cm of
-    motion.
+    A contact begins where two bodies come nearer than `contact` [m] and lasts until they separate. The motion
+    certificate finds the next contact; while there is one, distances are computed every 1 cm of motion.
     """
     validator, exact = ContinuousCollision(robot, scene, contact, 0.5), ExactCollision(robot, scene)
     motion = Motion(for_kernels(q), kernel.travel_along(q, validator.checks.motion_radii))
@@ -34,7 +33,7 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
         first = validator.sweep(rest).contact
         if first is None:
             break
-        # places in the rest, as rows and shares, to places on the way
+        # converts the place in `rest`, a row plus a share, to a place on the whole motion
         row, part = int(first.at), first.at - int(first.at)
         ways = np.concatenate([[at], motion.travel[low + 1 :]])
         at = float(ways[row] + part * (ways[min(row + 1, len(ways) - 1)] - ways[row]))
@@ -47,7 +46,8 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
 def _follow(
     exact: ExactCollision, motion: Motion, at: float, contact: float, first: Contact, found: list[Contact]
 ) -> float:
-    """Adds the contacts from one on until the arm is free; where that is."""
+    """Adds the contacts from the given one until the arm is free to `found`; returns the place where it is
+    free."""
     checks = {(check.link, check.other): check for check in checks_of(exact.robot)}
     open_ones: dict[tuple[str, str | None, str], int] = {}
     begun = _place(motion, at)
@@ -80,5 +80,6 @@ def _key(distance: Distance, checks: dict) -> tuple[str, str | None, str]:
 
 
 def _place(motion: Motion, at: float) -> float:
+    """Waypoint index plus fraction of the segment."""
     low, share = kernel.segment_at(motion.travel, at)
     return low + share

@@ -1,9 +1,9 @@
-"""Tables of the configurations in which links close to each other along the arm can touch.
+"""Tables of the joint values at which two links close to each other along the arm may touch.
 
-How two links stand to each other depends only on the joints between them. For pairs with one or two of those,
-whose bounding spheres overlap almost always (forearm and hand), a table over the two joints says where they
-may touch at all: one look-up in place of hundreds of distances. By spheres, or by the convex parts where the
-robot brings such a table (`robots/fitting/convex_pair_tables.py`).
+The relative pose of two links depends only on the joints between them. For pairs with one or two such joints,
+such as forearm and hand, bounding spheres overlap almost always. A table over the two joints says where the
+links may touch at all: one look-up replaces hundreds of distances. Tables are computed from spheres, or from
+convex parts if the robot has such a table (`robots/fitting/convex_pair_tables.py`).
 """
 
 from collections.abc import Mapping
@@ -18,15 +18,15 @@ from robotdiffuse.collision.kernels.lane_collision import TABLE_HEADER, TABLE_SI
 from robotdiffuse.robots.joint_tables import JointTable
 
 CELLS_PER_JOINT = TABLE_SIDE - 2
-"""Cells along each joint's range; around them is a ring that stands for values beyond it."""
+"""Cells along each joint's range; a ring of cells around them stands for values beyond the range."""
 MAX_PAIRS = 24
-"""Pairs per table: bits of an integer that a float32 can hold."""
+"""Pairs per table at most: each has a bit of an integer that a float32 represents exactly."""
 ROUNDING_SLACK = 1e-5
-"""More than what rounding does to a distance [m]."""
+"""More than the rounding error of a distance [m]."""
 
 
 def no_tables() -> Float32[ndarray, "0 width"]:
-    """Tables for no pair."""
+    """An array of no tables."""
     return np.zeros((0, TABLE_HEADER + TABLE_SIDE**2), np.float32)
 
 
@@ -37,12 +37,13 @@ def build_pair_tables(
     radii: Float[ndarray, "groups dof"],
     known: Mapping[int, JointTable],
 ) -> tuple[Int32[ndarray, "pairs 4"], Float32[ndarray, "tables width"]]:
-    """The robot's pairs with table and bit of those that depend on one or two joints, and the tables.
+    """The rows of `RobotArrays.pairs`, with table and bit of pairs that depend on one or two joints, and the
+    tables.
 
-    A table holds the first joint, its low end and cells per unit, the same of the second joint, and the
-    cells: sums of the bits of the pairs that may touch there. `arrays` are the RobotArrays without tables;
-    `radii` how far a point of each group moves at most per unit of each joint [m]; `known` are tables of
-    convex parts for some of the pairs, by number.
+    A table consists of the first joint, its low end and cells per unit, the same of the second joint, and the
+    cells: sums of the bits of the pairs that may touch there. `arrays`: the RobotArrays without tables.
+    `radii`: upper bounds on how far a point of each group moves per unit of each joint [m]. `known`: tables
+    of convex parts for some of the pairs, by index.
     """
     parents = np.arange(len(lower)) if arrays.parents is None else arrays.parents
     pairs_found, tables = arrays.pairs.copy(), [no_tables()]

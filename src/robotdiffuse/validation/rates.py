@@ -1,15 +1,16 @@
-"""Rates of a trajectory: what its positions over its times amount to, and whether it says so itself.
+"""Rates of a trajectory: those that follow from its positions and times, and whether its own rates agree.
 
-Of a motion from rest to rest whose acceleration never exceeds A, the mean velocity of each step is within its
-velocity limit, and each second difference quotient, the arm standing before the first and after the last
-row, is a mean of its accelerations and thus at most A. Velocities v0 and v1 at both ends of a step of h
-seconds leave its length within h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4, the extremes being full
-acceleration and then full braking. So no limit refuses what an arm can do within it. Whether rates agree is
-asked with twice the greatest acceleration that the motion has or says in place of A, where that is less.
+In a motion from rest to rest whose acceleration never exceeds A, the mean velocity of each step is within its
+velocity limit. Each second difference quotient is a mean of its accelerations and thus at most A, if the arm
+is taken to stand still before the first and after the last row. With velocities v0 and v1 at both ends of a
+step of h seconds, the length of the step is within h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4; the
+extremes are full acceleration followed by full braking and vice versa. So these tests reject nothing that an
+arm can do within its limits. The test of agreement takes for A twice the greatest acceleration in the motion,
+computed or written, if that is less.
 
-Positions are known to a resolution only, which over a step of nanoseconds hides any velocity. So where rows
-are closer than a millisecond, all this is asked from each row to each later one too, with the resolution of
-these two alone.
+Positions are known only to a resolution, which over a step of nanoseconds hides any velocity. Where rows are
+closer than a millisecond, the tests are therefore repeated from each row to later ones, with the resolution
+of these two rows alone.
 """
 
 from collections.abc import Callable, Iterator
@@ -24,27 +25,30 @@ from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
 
 AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
-"""Where rows are closer than the first of these [s], mean accelerations are asked for over times of at least
-each; over shorter ones, the resolution of positions hides any."""
+"""Where rows are closer than the first of these [s], mean accelerations are tested over windows of at least
+each length; over shorter ones, the resolution of positions would hide them."""
 MIN_TIME = 1e-12
-"""Shorter times count as this one [s], so that rates over them are finite."""
+"""Shorter times are taken as this [s], so that rates over them are finite."""
 
 
 @dataclass(frozen=True)
 class RateTolerances:
+    """Tolerances of `rate_violations`."""
+
     slack: float
-    """Share by which limits may be exceeded, and share of a velocity limit that counts as none."""
+    """Share by which limits may be exceeded, and share of a velocity limit that counts as rest."""
     agreement: float
-    """Share of a joint's greatest acceleration by which one may lie outside of the means beside its row."""
+    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the mean
+    accelerations before and after the row."""
     jump: float
-    """Times the velocity limit from which a step is a jump."""
+    """A step faster than this times the velocity limit is a jump."""
     resolution: float
-    """Positions are taken as known to this [rad] or [m]."""
+    """Accuracy of positions [rad] or [m]."""
 
 
 @dataclass(frozen=True)
 class RateViolation:
-    """The first of its kind."""
+    """The first violation of its kind along the trajectory."""
 
     kind: str
     """rest, jump, velocity, acceleration or rates."""
@@ -53,7 +57,7 @@ class RateViolation:
     joint: str
     message: str
     excess: float
-    """Beyond what is allowed, in the rate's unit."""
+    """Amount beyond the allowed value, in the rate's unit."""
 
 
 def rate_violations(
@@ -62,10 +66,11 @@ def rate_violations(
     tolerances: RateTolerances,
     start_velocity: Float[ndarray, "dof"] | None = None,
 ) -> list[RateViolation]:
-    """What is wrong with the rates of finite rows at increasing times; the first of each kind. The motion is
-    to begin at rest, or at `start_velocity`.
+    """The first violation of each kind in the rates of a trajectory, whose rows are finite and times
+    increase.
 
-    A limit of 0 stands for one that the robot does not give: there the rates need only agree.
+    The motion must begin at `start_velocity` [dof], by default at rest, and end at rest. A limit of 0 means
+    that the robot gives none: then the rates must only agree with each other.
     """
     found: dict[str, RateViolation] = {}
     with np.errstate(over="ignore", invalid="ignore"):
@@ -89,8 +94,9 @@ def rate_violations(
 def sample_cubics(
     trajectory: Trajectory, chord: float
 ) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
-    """Times and positions of a trajectory, with further rows on the cubics through its rows' positions and
-    velocities, so that straight lines between rows leave those by no more than `chord` [rad] or [m]."""
+    """Times [m] and positions [m, dof] of a trajectory, with added rows on the cubics through its rows'
+    positions and velocities, such that straight lines between rows leave the cubics by at most `chord` [rad]
+    or [m]."""
     times, q, v = trajectory.times, trajectory.positions, trajectory.velocities
     step = np.diff(times)[:, None]
     mean = (q[1:] - q[:-1]) / step
@@ -110,17 +116,18 @@ def sample_cubics(
 
 
 class _Check(NamedTuple):
-    """Rows are those of the trajectory, from its first."""
+    """One test of the rates; row i belongs to row i of the trajectory."""
 
     kind: str
     what: str
+    """The rate in words."""
     rates: Float[ndarray, "n dof"]
     off: Float[ndarray, "n dof"]
-    """How far the rates are off, ..."""
+    """Deviation of the rates."""
     allowed: Float[ndarray, "#n dof"]
-    """... and how far they may be."""
+    """Allowed deviation."""
     right: Callable[[int, int], str]
-    """What would be right, by row and joint."""
+    """The expected value in words, by row and joint."""
 
 
 def _checks(
@@ -130,7 +137,7 @@ def _checks(
     step = np.diff(trajectory.times)[:, None]
     mean, change = (q[1:] - q[:-1]) / step, (v[1:] - v[:-1]) / step
     blur = 2 * tolerances.resolution / step
-    """Of the mean velocities, as positions are not known better."""
+    """Uncertainty of the mean velocities, from the resolution of positions."""
     share = 1 + tolerances.slack
     nothing = tolerances.slack * _limits_or_peaks(robot.velocity, v, mean)
 
@@ -159,32 +166,32 @@ def _checks(
     yield limited("acceleration", "mean acceleration by its velocities", change, most, share * most)
     yield limited("acceleration", "acceleration", a, most, share * most)
 
-    # Rows may miss the peaks of what accelerates the motion, but not by half.
+    # Rows may miss the peaks of the acceleration, but not by half.
     own = np.maximum(_peak(a, second, change), tolerances.slack * robot.acceleration)
     strongest = np.where(most > 0, np.minimum(share * most, 2 * own), 2 * own)
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
-    """Between mean velocities and those that the rows say."""
+    """Allowed difference between mean velocities and the means of the rows' velocities."""
     yield _Check(
         "rates",
         onwards,
         mean,
         np.abs(mean - (v[1:] + v[:-1]) / 2),
         possible + blur,
-        lambda i, j: f"the velocities that these rows say are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
+        lambda i, j: f"but the velocities of these rows are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
     beside = _padded(change[:1], change, change[-1:])
     low, high = np.minimum(beside[1:], beside[:-1]), np.maximum(beside[1:], beside[:-1])
     outside = np.maximum(low - a, a - high)
     if begins.any():
-        outside[0] = 0.0  # nothing is known of the motion before, which may have ended in any acceleration
+        outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
     yield _Check(
         "rates",
         "acceleration",
         a,
         outside,
         tolerances.agreement * np.where(most > 0, np.minimum(most, own), own),
-        lambda i, j: f"by its velocities between {low[i, j]:.6g} and {high[i, j]:.6g}",
+        lambda i, j: f"but its velocities give {low[i, j]:.6g} to {high[i, j]:.6g}",
     )
 
     if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
@@ -205,7 +212,7 @@ def _checks(
         moved,
         np.abs(moved - told),
         (_change_since(room, first) + 2 * resolution) / span,
-        lambda i, j: f"the one that its velocities amount to is {told[i, j]:.6g}",
+        lambda i, j: f"but its velocities give {told[i, j]:.6g}",
     )
 
     most = robot.acceleration
@@ -216,22 +223,25 @@ def _checks(
 
 
 def _cumulative(steps: Float[ndarray, "m dof"]) -> Float[ndarray, "n dof"]:
-    """By row."""
+    """Sums of all steps before each row."""
     return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
 
 
 def _worst_earlier_row(
     times: Float[ndarray, "n"], way: Float[ndarray, "n dof"], allowed: Float[ndarray, "n dof"]
 ) -> tuple[Int[ndarray, "n dof"], Float[ndarray, "n dof"]]:
-    """For each row the earlier one since which a joint's way has changed most beyond what `allowed` has grown
-    by, in either direction, and the time since then [s]; itself where there is none."""
+    """For each row and joint the earlier row with the largest excess, and the time since then [s].
+
+    The excess is the change of `way` since that row, in either direction, minus the growth of `allowed`. The
+    first row refers to itself.
+    """
     rows, beyond = np.arange(len(way))[:, None], np.full(way.shape, -np.inf)
     first = np.broadcast_to(rows, way.shape)
     for signed in (way, -way):
         room = signed - allowed
         least = np.minimum.accumulate(room, axis=0)
         at = np.maximum.accumulate(np.where(room <= least, rows, 0), axis=0)
-        # not the row itself
+        # shifted by one row to exclude the row itself
         least, at = np.concatenate([room[:1], least[:-1]]), np.concatenate([first[:1], at[:-1]])
         first = np.where(room - least > beyond, at, first)
         beyond = np.maximum(beyond, room - least)
@@ -249,8 +259,9 @@ def _second_differences(
     resolution: float,
     nothing: Float[ndarray, "dof"],
 ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
-    """Mean accelerations by positions, about each row, from and to the first rows at least `window` [s] away,
-    and how unsure they are; before and after the motion the arm moves as it begins, and stands."""
+    """Mean accelerations about each row, from positions at the nearest rows at least `window` [s] away, and
+    their uncertainty. Before the motion the arm moves at its start velocity, and afterwards it stands
+    still."""
     times, q = trajectory.times, trajectory.positions
     clock = np.concatenate([times[:1] - window, times, times[-1:] + window])
     rows = _padded(q[:1] - window * begins, q, q[-1:])
@@ -268,7 +279,7 @@ def _padded(before: ndarray, rows: ndarray, after: ndarray) -> ndarray:
 
 
 def _limits_or_peaks(limit: Float[ndarray, "dof"], *rates: ndarray) -> Float[ndarray, "dof"]:
-    """The limits; the greatest of the rates where there is none."""
+    """The limits, or the greatest rate of a joint without a limit."""
     return np.where(limit > 0, limit, _peak(*rates))
 
 

@@ -1,4 +1,4 @@
-"""All that is wrong with a motion, where the validator names what comes first."""
+"""All violations of a motion, where the validator reports the first one."""
 
 import numpy as np
 
@@ -22,9 +22,10 @@ CONTACT_KINDS = ("scene_collision", "self_collision")
 def violations(
     problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT
 ) -> tuple[Violation, ...]:
-    """Everything that is wrong with a motion, in order; none if it is valid.
+    """All violations of a motion in order; empty if it is valid.
 
-    Of contacts each, from where it begins; joint limits for each joint; of all else the first of its kind.
+    They include every contact, at the place where it begins, joint limits once for each joint, and the first
+    of every other kind.
     """
     validator = verifier(problem, settings)
     timed = isinstance(motion, Trajectory)

@@ -1,9 +1,10 @@
-"""The compiled collision check: 16 configurations at once, yes or no.
+"""The compiled collision check of 16 configurations at once.
 
-From coarse to fine, with lanes over whatever there are many of. Frames and bounding spheres: over the 16
-configurations. Which obstacles a link can meet in any of them: over 16 obstacles, by boxes around them. In
-which configurations the bounding sphere does touch one of those: over the configurations. Whether the link
-does, in those configurations, one after the other: over its spheres.
+It goes from coarse to fine, and SIMD lanes stand for different things at each step:
+frames and bounding spheres are computed with a lane per configuration;
+the obstacles that a link may touch in any configuration, from their bounding boxes, with a lane per obstacle;
+the configurations in which the bounding sphere touches such an obstacle, with a lane per configuration;
+and whether the link itself does, for one configuration after the other, with a lane per sphere.
 """
 
 from typing import NamedTuple
@@ -35,7 +36,7 @@ _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
 _HALF = np.float32(0.5)
 TABLE_HEADER, TABLE_SIDE = 6, 130
-"""Numbers before the cells, and cells along each side, of a table of `near_pairs.py`."""
+"""Numbers before the cells, and cells along each side, in a table of `sphere_pair_tables.py`."""
 ALL_LANES = (1 << W) - 1
 """The mask of all lanes."""
 _ZERO = np.float32(0.0)
@@ -50,13 +51,15 @@ _S11 = np.float32(-15.094642576822984)
 
 @allocation_free(forceinline=True)
 def _sine_of_turn(u):
+    """sin(2 pi u) for |u| <= 1/4."""
     v = u * u
     return u * (_S1 + v * (_S3 + v * (_S5 + v * (_S7 + v * (_S9 + v * _S11)))))
 
 
 @allocation_free(forceinline=True)
 def _turn(frames, parent, j, offset, q):
-    """Frame behind a revolute joint, in 16 lanes: frames[j + 1] = frames[parent] @ offset @ Rz(q)."""
+    """Writes the frame behind a revolute joint in 16 lanes: frames[j + 1] = frames[parent] @ offset @
+    Rz(q)."""
     turns = load(q, j, 0) * _INV_TAU
     turns = turns - floor(turns + _HALF)
     far = absolute(turns)
@@ -77,7 +80,8 @@ def _turn(frames, parent, j, offset, q):
 
 @allocation_free(forceinline=True)
 def _slide(frames, parent, j, offset, q):
-    """Frame behind a prismatic joint, in 16 lanes: frames[j + 1] = frames[parent] @ offset @ Tz(q)."""
+    """Writes the frame behind a prismatic joint in 16 lanes: frames[j + 1] = frames[parent] @ offset @
+    Tz(q)."""
     for k in range(3):
         r0, r1 = load(frames, parent, 3 * k), load(frames, parent, 3 * k + 1)
         r2 = load(frames, parent, 3 * k + 2)
@@ -102,7 +106,7 @@ def _centres_of(frames, f, spheres, s):
 
 @allocation_free(forceinline=True)
 def place(frames, f, spheres, s, positions, p):
-    """Positions of a sphere's centre in 16 lanes, to row p."""
+    """Writes the positions of a sphere's centre in 16 lanes to row p of `positions`."""
     x, y, z = _centres_of(frames, f, spheres, s)
     store(positions, p, 0, x)
     store(positions, p, 1, y)
@@ -111,7 +115,8 @@ def place(frames, f, spheres, s, positions, p):
 
 @allocation_free(forceinline=True)
 def place_frames(robot, q, frames, centres):
-    """Frames of 16 configurations, and the centres of the bounding spheres of all groups."""
+    """Writes the frames of 16 configurations q[dof, 16], and the centres of the bounding spheres of all
+    groups."""
     for j in range(len(robot.offsets)):
         if robot.offsets[j, 12] > _ZERO:
             _slide(frames, parent_of(robot.parents, j), j, robot.offsets[j], q)
@@ -122,7 +127,7 @@ def place_frames(robot, q, frames, centres):
 
 
 class Workspace(NamedTuple):
-    """Scratch memory of `block_hits`, so that it allocates nothing."""
+    """Scratch memory of `block_hits`, which does not allocate."""
 
     frames: np.ndarray
     """[dof + 1, 12 * W]"""
@@ -143,7 +148,7 @@ def make_workspace(robot, scene):
 
 @allocation_free(forceinline=True)
 def _touching(x, y, z, radius, solids, k):
-    """The lanes whose sphere touches an obstacle."""
+    """Mask of the lanes whose sphere touches obstacle k."""
     dx, dy, dz = x - solids[k, 0], y - solids[k, 1], z - solids[k, 2]
     u = dx * solids[k, 3] + dy * solids[k, 4] + dz * solids[k, 5]
     v = dx * solids[k, 6] + dy * solids[k, 7] + dz * solids[k, 8]
@@ -160,7 +165,7 @@ def _touching(x, y, z, radius, solids, k):
 
 @allocation_free(forceinline=True)
 def _coordinate(frames, f, i, k, x, y, z):
-    """Number k of the position of a point, or of points in lanes, of frame f in lane i."""
+    """Coordinate k of a point of frame f, or of points in lanes, in configuration (lane) i."""
     return (
         x * frames[f, 3 * k * W + i]
         + y * frames[f, (3 * k + 1) * W + i]
@@ -171,7 +176,7 @@ def _coordinate(frames, f, i, k, x, y, z):
 
 @allocation_free(forceinline=True)
 def _place_row(robot, row, frames, f, i):
-    """Positions of a row of spheres in lane i of the configurations."""
+    """Positions of a row of spheres in configuration (lane) i."""
     x, y, z = load(robot.rows, row, 0), load(robot.rows, row, 1), load(robot.rows, row, 2)
     return (
         _coordinate(frames, f, i, 0, x, y, z),
@@ -182,7 +187,7 @@ def _place_row(robot, row, frames, f, i):
 
 @allocation_free(forceinline=True)
 def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
-    """Those of the lanes `near` in which a group touches an obstacle."""
+    """Those of the lanes `near` in which a group touches obstacle k."""
     hits, f = 0, robot.frame[g]
     first, last = robot.first_row[g], robot.first_row[g + 1]
     for row in range(first, last):
@@ -203,7 +208,7 @@ def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
 
 @allocation_free(forceinline=True)
 def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
-    """Those of the lanes `near` in which a group touches a point."""
+    """Those of the lanes `near` in which a group touches a point of the scene."""
     hits, f = 0, robot.frame[g]
     first, last = robot.first_row[g], robot.first_row[g + 1]
     for row in range(first, last):
@@ -224,7 +229,7 @@ def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
 
 @allocation_free(forceinline=True)
 def _touching_balls(x, y, z, radius, u, v, w, other):
-    """The lanes in which two spheres touch each other."""
+    """Mask of the lanes in which two spheres touch each other."""
     dx, dy, dz, reach = x - u, y - v, z - w, radius + other
     return dx * dx + dy * dy + dz * dz < reach * reach
 
@@ -255,7 +260,7 @@ def _touching_each_other(robot, a, b, near, stop_at_first, work):
 
 @allocation_free(forceinline=True)
 def _rows_touch(robot, row, f, other, g, i, work):
-    """Whether a row of spheres of frame f touches another of frame g in lane i."""
+    """Whether a row of spheres of frame f touches another one of frame g in lane i."""
     x, y, z = _place_row(robot, row, work.frames, f, i)
     u, v, w = _place_row(robot, other, work.frames, g, i)
     radius, placed = load(robot.rows, row, 3), work.row
@@ -271,6 +276,7 @@ def _rows_touch(robot, row, f, other, g, i, work):
 
 @allocation_free(forceinline=True)
 def _hits_scene(robot, scene, padding, stop_at_first, work):
+    """Mask of the lanes in which the robot touches the scene."""
     hits = 0
     frames, around, solids = work.frames, scene.solid_boxes, scene.solids
     for g in range(len(robot.frame)):
@@ -312,7 +318,7 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
 
 @allocation_free(forceinline=True)
 def lanes_that_may_touch(robot, table, bit, q):
-    """The lanes in which a pair may touch by its table; see `near_pairs.py`."""
+    """Mask of the lanes in which a pair may touch according to its table; see `sphere_pair_tables.py`."""
     row = robot.pair_tables[table]
     first, second = load(q, np.int32(row[0]), 0), load(q, np.int32(row[3]), 0)
     i = minimum(maximum((first - row[1]) * row[2], _ZERO), np.float32(TABLE_SIDE - 1))
@@ -323,7 +329,7 @@ def lanes_that_may_touch(robot, table, bit, q):
 
 @allocation_free(forceinline=True)
 def _hits_itself(robot, q, hits, stop_at_first, work):
-    """`hits` and the lanes in which a checked pair of links touches."""
+    """`hits`, with the lanes added in which a checked pair of links touches."""
     centres, bounds = work.centres, robot.bounds
     for p in range(len(robot.pairs)):
         a, b, table, bit = robot.pairs[p, 0], robot.pairs[p, 1], robot.pairs[p, 2], robot.pairs[p, 3]
@@ -341,9 +347,10 @@ def _hits_itself(robot, q, hits, stop_at_first, work):
 
 @allocation_free()
 def block_hits(robot, scene, q, padding, stop_at_first, work):
-    """The configurations of q[dof, 16] that collide: bit i tells of column i.
+    """Mask of the configurations of q[dof, 16] that collide: bit i belongs to column i.
 
-    `padding` [m] is added to the radii towards the scene. With `stop_at_first` one that collides is enough.
+    `padding` [m] is added to the radii for checks against the scene. With `stop_at_first` the check ends at
+    the first configuration that collides.
     """
     place_frames(robot, q, work.frames, work.centres)
     hits = _hits_scene(robot, scene, padding, stop_at_first, work)
