@@ -1,4 +1,4 @@
-"""The bounds of certificates, before formulas by hand, Coal and the validator's own kinematics."""
+"""The bounds of proofs, against formulas by hand, Coal and the validator's kinematics."""
 
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false

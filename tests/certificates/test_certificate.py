@@ -1,4 +1,4 @@
-"""Certificates: what is valid can be certified, what is certified is free, and nobody can tamper with one."""
+"""Certificates: valid motions can be certified, certified motions are free, and tampering is detected."""
 
 import json
 from collections.abc import Callable
@@ -99,7 +99,7 @@ def test_a_certificate_is_checked_from_its_file_alone(file: FilePath) -> None:
 
 
 def test_the_checker_loads_neither_compiled_code_nor_coal() -> None:
-    """It is another path than the validator's, and starts in a fraction of the time."""
+    """It is independent of the validator's code, and starts in a fraction of the time."""
     import subprocess
     import sys
 
@@ -239,7 +239,7 @@ def test_another_robot_is_caught_and_named(file: FilePath, planned: tuple[Proble
 def test_whoever_forges_the_hashes_too_still_needs_a_proof(
     planned: tuple[Problem, rd.PlanResult], file: FilePath
 ) -> None:
-    """An obstacle in the way, with a certificate that says that it always was there."""
+    """An obstacle in the way, with forged hashes."""
     problem, certificate = planned[0], load_certificate(file)
     blocked = replace(problem, scene=Scene([*problem.scene.shapes, Sphere([0.0, 0.0, 0.6], 0.3, "new")]))
     forged = replace(certificate, scene_parts=scene_parts(blocked.scene))
@@ -261,7 +261,7 @@ def test_rates_are_checked_anew(planned: tuple[Problem, rd.PlanResult]) -> None:
 
 
 def timed(positions: np.ndarray, times: np.ndarray) -> tuple[Problem, Trajectory]:
-    """A motion that says that it stands still all the time."""
+    """A motion whose velocities are all 0."""
     problem, path = problem_of(positions)
     still = np.zeros_like(positions)
     return problem, Trajectory(path.joint_names, times, positions, still, still)
@@ -289,7 +289,7 @@ TOO_QUICK = {
 
 @pytest.mark.parametrize("name", TOO_QUICK)
 def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All else is proved: the validator that refuses them is made to pass them."""
+    """The validator, which would reject these motions, is patched to accept them."""
     made, wanted = TOO_QUICK[name]
     problem, motion = made()
     report = Report(True, None, 1.0, 0.2)
@@ -301,7 +301,7 @@ def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytes
 
 @pytest.mark.parametrize("with_times", [False, True])
 def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
-    """Start and goal within a box: a motion of one row leaves no gap between no stretches."""
+    """Start and goal inside a box: a motion of one row has no gap even without stretches."""
     robot, here = box_arm(), np.zeros((1, 3))
     problem = Problem(robot, Scene([Box([0.3, 0, 0], [2, 2, 2])]), here[0], JointGoal(here))
     motion = Trajectory(robot.joint_names, np.zeros(1), here, here, here)
@@ -340,7 +340,7 @@ def test_files_that_are_none(tmp_path: FilePath, text: str, wanted: str) -> None
 
 
 def test_damaged_files_are_one_line(file: FilePath, tmp_path: FilePath) -> None:
-    """Every field in turn is replaced by what does not belong there."""
+    """Every field in turn is replaced by a wrong value."""
     whole = json.loads(file.read_text())
     for name in whole:
         for value in (None, [], {}, "x", -1, [[1, 2], [3]], {"a": [None]}):

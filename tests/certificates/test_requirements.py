@@ -1,4 +1,4 @@
-"""Certificates of motions with path constraints, among moving obstacles, and that begin moving."""
+"""Certificates of motions with path constraints, among moving obstacles, and with a start velocity."""
 
 import re
 from collections.abc import Callable
@@ -153,7 +153,7 @@ def test_whoever_forges_the_hashes_too_still_needs_a_proof(case: str) -> None:
 
 
 def test_bounds_of_constraints_are_bounds() -> None:
-    """Against the validator's own values, densely, for arms that slide too."""
+    """Against the validator's values at dense samples, also for prismatic joints."""
     rng = np.random.default_rng(0)
     for k in range(40):
         robot = PANDA if k % 2 else box_arm()
@@ -179,7 +179,7 @@ def test_bounds_of_constraints_are_bounds() -> None:
 
 
 def test_bounds_in_time_are_bounds() -> None:
-    """No sphere is nearer to a turning box than clearance less displacement anywhere on a stretch."""
+    """Anywhere on a stretch, all spheres are at least clearance minus displacement from a rotating box."""
     rng, times = np.random.default_rng(1), np.linspace(0.0, 1.0, 6)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3, 3] = [[0.5, 0.5, 0.5], [0.5, 0.0, 0.6], [0.3, -0.4, 0.4]]

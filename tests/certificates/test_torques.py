@@ -86,7 +86,7 @@ def test_paths_are_proved_to_be_held() -> None:
 
 
 def test_a_peak_between_rows_needs_samples() -> None:
-    """Of a robot without bodies, which has nothing else to prove."""
+    """The robot has no geometry, so there is nothing else to prove."""
     problem = Problem(pendulum(9.75), rd.Scene(), [1.0], [2.0], payload=Payload(0.0))
     certificate = certify(problem, Path(("hinge",), np.array([[1.0], [2.0]])))
     assert len(certificate.torque_samples) and certificate.check(problem).valid

@@ -97,7 +97,7 @@ def test_every_shape_at_any_pose(kind: str, seed: int) -> None:
 
 @pytest.mark.parametrize("count", [15, 16, 17, 70])
 def test_any_number_of_obstacles(count: int) -> None:
-    """They are looked at by sixteen."""
+    """Obstacles are processed in groups of sixteen."""
     robot, rng = with_spheres("panda"), np.random.default_rng(count)
     kinds = ("sphere", "box", "cylinder", "capsule")
     shapes = [random_shape(kinds[i % 4], rng) for i in range(count)]
@@ -112,7 +112,7 @@ def test_any_number_of_obstacles(count: int) -> None:
 
 @pytest.mark.parametrize("count", [16, 17, 50])
 def test_links_with_any_number_of_spheres(count: int) -> None:
-    """Those of many are parted, and their parts have bounding spheres of their own."""
+    """Links with many spheres are divided into rows, each with its own bounding sphere."""
     arm, rng = with_spheres("ur5"), np.random.default_rng(count)
     spheres = {
         link: np.column_stack([rng.uniform(-0.06, 0.06, (count, 3)), rng.uniform(0.002, 0.01, count)])
@@ -144,7 +144,7 @@ def test_the_bits_of_a_block_are_its_configurations(stop_at_first: bool) -> None
 
 
 def test_configurations_beyond_the_limits() -> None:
-    """The tables of close links say nothing there, so the spheres must decide."""
+    """The tables of close links do not cover these, so the spheres decide."""
     robot = with_spheres("panda")
     q = np.random.default_rng(0).uniform(2 * robot.lower, 2 * robot.upper, (4000, robot.dof))
     least = pair_distances(robot, q).min(axis=1)
@@ -305,7 +305,7 @@ def test_adding_an_obstacle_compiles_nothing() -> None:
 
 
 def cost(robot: Robot, scene: Scene, q: ndarray, margin: float, self_margin: float) -> ndarray:
-    """The squared hinge over all spheres and pairs of spheres, by the oracles."""
+    """The squared hinge loss over all spheres and pairs of spheres, by the oracles."""
     index = {link: i for i, link in enumerate(robot_groups(robot))}
     centres, radii = sphere_centres(robot, q)
     total = np.zeros(len(q))

@@ -1,4 +1,4 @@
-"""What the denoiser is told of obstacles: the same for training and planning, gradients by differences."""
+"""Clearances as network inputs: training and planning agree, and gradients match finite differences."""
 
 import json
 from dataclasses import replace
@@ -50,7 +50,7 @@ def model_settings(**changes) -> MotionModelSettings:
 
 
 def test_training_is_told_what_planning_is() -> None:
-    """In scenes of different size at once; clearances are those that are told without gradients."""
+    """Scenes of different sizes in one batch; clearances equal those computed without gradients."""
     rng = np.random.default_rng(1)
     scenes = [family.scene(rng) for family in (ROP, ROP_DENSE, ROP_DENSE)]
     scenes.append(Scene(scenes[0].shapes[:1]))
@@ -68,7 +68,7 @@ def test_training_is_told_what_planning_is() -> None:
 
 
 def test_gradients_are_those_of_the_clearances() -> None:
-    """Of a robot with one sphere for each link, whose clearances say all: against automatic differentiation
+    """For a robot with one sphere per link: against automatic differentiation
     of the signed distance, and finite differences of it."""
     robot = replace(PANDA, spheres={link: balls[:1] for link, balls in PANDA.spheres.items()})
     q = configurations(400).astype(np.float64)
@@ -94,7 +94,7 @@ def test_gradients_are_those_of_the_clearances() -> None:
 
 @pytest.mark.parametrize("padding", [0.0, 0.03])
 def test_gradients_are_differences_over_all_spheres(padding: float) -> None:
-    """Of the whole robot: of the root of the cost that guidance descends, links against links left out."""
+    """For the whole robot: the root of guidance's collision cost, without self-collision."""
     checker, q = CollisionChecker(PANDA, SHAPES, padding), configurations(300).astype(np.float64)
     clearances, found = checker.clearances_and_gradients(q, LIMIT, MARGIN)
     np.testing.assert_array_equal(clearances, checker.link_clearances(q, LIMIT))
@@ -131,7 +131,7 @@ def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
 
 
 def test_what_the_denoiser_sees() -> None:
-    """Rows, joints, clearances, and then gradients of order 1, whose sign tells the way into the obstacle."""
+    """Shapes of the results, and gradients of order 1 whose sign points into the obstacle."""
     scene, rng = Scene([Box((0.5, 0.0, 0.5), (0.4, 0.4, 0.4))]), np.random.default_rng(5)
     seen = {}
     q = configurations(2, 16, seed=6).astype(np.float64)

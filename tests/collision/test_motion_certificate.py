@@ -1,4 +1,4 @@
-"""The certificate's bounds along short motions against what dense sampling finds there."""
+"""The motion certificate's bounds along short motions against dense sampling."""
 
 from dataclasses import replace
 from functools import cache
@@ -51,7 +51,7 @@ def clad_arm(name: str) -> Robot:
 
 
 def scene_of(rng: np.random.Generator, cloud: bool) -> Scene:
-    """One shape of each kind at random places, and maybe some points."""
+    """One shape of each kind at random places, and sometimes points."""
 
     def somewhere() -> ndarray:
         return rng.uniform([-0.6, -0.6, -0.2], [0.6, 0.6, 0.9])
@@ -73,7 +73,7 @@ def scene_of(rng: np.random.Generator, cloud: bool) -> Scene:
 
 
 def curve(rng: np.random.Generator, robot: Robot, width: float) -> ndarray:
-    """Waypoints along a bent way about so long, some twice."""
+    """Waypoints along a bent path of about this length, some of them repeated."""
     t = np.linspace(-1, 1, 9)[:, None]
     middle = rng.uniform(robot.lower, robot.upper)
     bend = np.abs(t) if rng.random() < 0.3 else t**2
@@ -130,7 +130,7 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
 
 @given(robots, seeds)
 def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
-    """From any guess; 2 % is where the search for the plane ends."""
+    """From any initial guess, to the 2 % at which the search ends."""
     rng, robot = np.random.default_rng(seed), clad_arm(name)
     scene = scene_of(rng, False)
     q = rng.uniform(robot.lower, robot.upper)

@@ -1,4 +1,5 @@
-"""The certificate in time, against Coal at many moments; and what obstacles that move refuse."""
+"""The motion certificate among moving obstacles against Coal at many times; and what moving obstacles
+reject."""
 
 from pathlib import Path
 
@@ -16,19 +17,19 @@ from robotdiffuse.problems.files import load_problem, problem_from_record, probl
 PANDA = rd.load_robot("panda")
 START, END = np.array([-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]), np.array([0.6, 0.2, 0, -2.0, 0, 2.2, 0.2])
 STEP = 0.01
-"""Between the moments that Coal looks at [s] ..."""
+"""Time between the samples by Coal [s]."""
 MOVED = 0.02
-"""... in which nothing here moves more than that [m]."""
+"""Upper bound on all motion in that time [m]."""
 AXIS = np.array([0.0, 0.6, 0.8])
 
 
 def swing(duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """There and back, evenly."""
+    """A motion there and back at constant speed."""
     return np.linspace(0.0, duration, 3), np.stack([START, END, START])
 
 
 def obstacle(k: int, rng: np.random.Generator) -> rd.MovingObstacle:
-    """Of each shape and each known motion in turn."""
+    """Obstacles of every shape and every kind of motion in turn."""
     at, velocity = rng.uniform([-0.2, -0.8, 0.2], [0.9, 0.8, 1.0]), 0.4 * rng.normal(size=3)
     shape = [
         rd.Sphere(at, 0.08),

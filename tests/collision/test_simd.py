@@ -1,4 +1,4 @@
-"""Lanes in compiled code against numpy."""
+"""SIMD lanes in compiled code, against NumPy."""
 
 import numpy as np
 import pytest

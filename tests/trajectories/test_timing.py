@@ -23,7 +23,7 @@ VALIDATOR = RateTolerances(slack=0.01, agreement=0.5, jump=1.5, resolution=1e-6)
 
 
 def arm(velocity: tuple[float, ...] = VELOCITY, acceleration: tuple[float, ...] = ACCELERATION) -> Robot:
-    """A chain of revolute joints: timing looks at the limits alone."""
+    """A chain of revolute joints; timing uses only its limits."""
     joints = tuple(
         Joint(
             f"j{i}", "revolute", f"l{i}", f"l{i + 1}", np.eye(4), np.array([0.0, 0.0, 1.0]), -3.0, 3.0, v, a
@@ -171,7 +171,7 @@ def test_corner_is_rounded_when_valid_and_stopped_at_when_not() -> None:
 
 @pytest.mark.parametrize("size", [1e-5, 1e-4, 1e-3, 5e-3, 0.02, 0.1])
 def test_rows_of_the_shortest_pieces_agree(size: float) -> None:
-    """Between two stops so near to each other, rows at sample times did not tell the acceleration."""
+    """Regression: between two close stops, rows at sample times did not show the acceleration."""
     robot = arm()
     q = np.zeros((4, 7))
     q[1:, 0], q[2:, 2], q[3, 1] = 1.0, size, 1.0
@@ -258,7 +258,7 @@ def test_a_limit_of_jerk_is_kept_with_the_others(
 
 
 def test_a_limit_of_jerk_costs_what_it_must() -> None:
-    """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs next to nothing."""
+    """One joint over a distance d takes no less than (32 d / j)^(1/3); a high limit costs almost nothing."""
     robot = arm((20.0,), (80.0,))
     p = path(robot, [[0.0], [1.0]])
     free, gentle, slight = (
@@ -271,7 +271,7 @@ def test_a_limit_of_jerk_costs_what_it_must() -> None:
 
 
 def test_fine_rows_keep_the_limits_to_the_letter() -> None:
-    """Accelerations were 0.025 % too great between the places in a curve that were looked at."""
+    """Regression: accelerations were 0.025 % too great between the checked places of a curve."""
     robot = arm()
     for seed in range(20):
         q = np.cumsum(np.random.default_rng(seed).normal(0, 0.5, (6, 7)), axis=0)

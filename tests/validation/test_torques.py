@@ -1,4 +1,4 @@
-"""Torques between two looks: bounds against dense ones, and peaks that no look sees."""
+"""Torques between samples: bounds against dense samples, and peaks between rows."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ LOOKS = 41
 
 
 def farthest_off(dynamics: Dynamics, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """How far torques leave their chords in each piece, at dense looks; and what that is at most."""
+    """Largest distances of torques from their chords in each piece, by dense samples, and their bounds."""
     bulges = dynamics.bends(pieces.along) / 8
     u = np.linspace(0.0, 1.0, LOOKS)
     piece = np.repeat(np.arange(len(bulges)), LOOKS)
@@ -40,7 +40,7 @@ def test_no_torque_leaves_its_chord_by_more_than_its_bound(name: str, step: floa
 
 
 def test_bounds_of_what_bends_most_are_near() -> None:
-    """A pendulum near its level: its torque is a sine, of which the bound knows all but where."""
+    """A pendulum near the horizontal, whose torque is a sine: the bound is almost tight."""
     robot = pendulum(10.0)
     dynamics = Dynamics(robot, Payload(0.0))
     off, bulges = farthest_off(dynamics, static_pieces(np.array([[np.pi / 2 - 0.05], [np.pi / 2 + 0.05]])))
@@ -49,7 +49,7 @@ def test_bounds_of_what_bends_most_are_near() -> None:
 
 @pytest.mark.parametrize(("effort", "valid"), [(9.70, False), (9.73, True)])
 def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
-    """It bears 9.81 N m where it is level, which no row is; the validator allows a hundredth more."""
+    """The torque is 9.81 N m in the horizontal, between two rows; the validator allows 1 % more."""
     robot = pendulum(effort)
     path = JointPath(("hinge",), np.array([[0.3], [2.84], [2.9]]))
     problem = Problem(robot, rd.Scene(), path.positions[0], path.positions[-1], payload=Payload(0.0))
@@ -91,7 +91,7 @@ def test_a_motion_of_one_row_is_held() -> None:
 
 
 def test_a_torque_that_touches_its_limit_is_settled() -> None:
-    """Halving ends where a thousandth of the limit is left."""
+    """Halving ends at a thousandth of the limit."""
     limit = 9.81 / 1.01
     held = static_pieces(np.array([[1.0], [2.0]]))
     assert first_excess(Dynamics(pendulum(limit), Payload(0.0)), held, 0.01) is not None

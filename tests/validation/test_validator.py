@@ -1,4 +1,4 @@
-"""The validator: what it must refuse, what it must accept, and that its certificate holds."""
+"""The validator: motions that it must reject, motions that it must accept, and its certified clearances."""
 
 from dataclasses import replace
 from typing import Any
@@ -39,7 +39,7 @@ def vector(*values: float) -> np.ndarray:
 
 
 def validator(rows: np.ndarray, *shapes: Shape, robot: Robot | None = None, **settings: float) -> Report:
-    """The verdict on a path whose problem asks for its own first and last waypoint."""
+    """The report on a path for the problem from its first to its last waypoint."""
     robot = robot or box_arm()
     problem = Problem(robot, Scene(shapes), rows[0], JointGoal(rows[-1:]))
     return verify(problem, Path(robot.joint_names, rows), VerifySettings(**settings))  # type: ignore[arg-type]
@@ -99,7 +99,7 @@ def test_an_empty_scene_and_a_motion_of_one_waypoint() -> None:
 def test_a_thin_wall_between_two_waypoints_is_found(
     share: float, reach: float, thickness: float, extra: int, spheres: bool
 ) -> None:
-    """A straight arm swings through a wall that no coarse sampling need meet."""
+    """A straight arm swings through a wall that coarse sampling may miss."""
     angle = -1 + 2 * share
     turn = vector(np.cos(angle / 2), 0, 0, np.sin(angle / 2))
     wall = Box(reach * vector(np.cos(angle), np.sin(angle), 0), vector(0.2, thickness, 0.5), turn)
@@ -182,7 +182,7 @@ def test_the_first_of_two_collisions_is_reported() -> None:
 
 
 def test_a_contact_with_two_obstacles_at_once_has_a_depth() -> None:
-    """The nearer of two that the arm starts in, whichever the search met first."""
+    """The arm starts inside two obstacles: the deeper contact is reported in either order."""
     deep, shallow = Sphere(vector(1.1, 0.02, 0), 0.1, "deep"), Sphere(vector(1.15, 0.12, 0), 0.1, "shallow")
     for shapes in ((deep, shallow), (shallow, deep)):
         found = refused(validator(np.array([[0, 0, 0], [-0.5, 0, 0]]), *shapes), "scene_collision")
@@ -200,7 +200,7 @@ def test_self_collision_between_waypoints() -> None:
 
 
 def meshes_asked(*shapes: Shape) -> int:
-    """How many distances Coal is asked for to validate the swing among these."""
+    """Number of distances that Coal computes to validate the swing among these shapes."""
     asked: list[int] = []
 
     class Counting(ExactCollision):
@@ -371,7 +371,7 @@ def at_the_limit() -> Trajectory:
     ("factor", "kind"), [(1.0, ""), (1.02, "velocity"), (1.49, "velocity"), (1.6, "jump")]
 )
 def test_times_compressed_under_rates_of_zero(factor: float, kind: str) -> None:
-    """Rates that a trajectory does not own up to are recomputed."""
+    """Rates are recomputed where a trajectory conceals them."""
     robot = replace(box_arm(), joints=tuple(replace(joint, acceleration=1e3) for joint in box_arm().joints))
     problem = Problem(robot, Scene(), SWING[0], JointGoal(SWING[1:]))
     good = at_the_limit()
@@ -398,7 +398,7 @@ def test_rates_that_are_not_those_of_the_positions(what: str, factor: float) -> 
 
 @pytest.mark.parametrize("end", [0, -1])
 def test_motions_begin_and_end_at_rest(end: int) -> None:
-    """By what they say, and by their positions where they say that they rest."""
+    """By their velocities, and by their positions if their velocities are 0."""
     problem, _ = problem_and_path(SWING)
     good = trajectory(2.0)
     moving = good.velocities.copy()
@@ -435,7 +435,7 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
 
 
 def in_micro_steps(step: float, time: float, way: float) -> Trajectory:
-    """Evenly, in steps that positions are not known better than, with rates of zero."""
+    """Evenly, in steps at the resolution of positions, with rates of zero."""
     count = round(way / step)
     rows = np.zeros((count + 1, 3))
     rows[:, 0] = np.arange(count + 1) * step
@@ -468,7 +468,7 @@ def test_micro_steps_hide_no_acceleration(back: bool) -> None:
 
 
 def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None:
-    """Out and back within one step: the rows stand in one place, the arm does not."""
+    """Out and back within one step: the rows are equal, but the arm moves between them."""
     robot = box_arm()
     rows = np.zeros((4, 3))
     speed = np.zeros((4, 3))
@@ -493,7 +493,7 @@ def test_a_motion_of_a_century_is_refused() -> None:
 
 
 def test_collision_alone_can_be_asked_for() -> None:
-    """Neither limits nor the ends matter then."""
+    """Limits, start and goal are not checked."""
     problem, path = problem_and_path(np.array([[-0.6, 0, 0], [0.6, 0, 0], [0.6, 2.9, 0]]))
     assert verifier(problem, VerifySettings()).collision_free(path)
     blocked = replace(problem, scene=Scene([Sphere(vector(1.2, 0, 0), 0.05)]))
