@@ -269,7 +269,9 @@ class DStarLiteSearch(_Search):
         super().__init__(checker, start, goals, settings, padding, incremental=True)
         self._last = np.zeros((len(goals), 2 ** len(start)), np.uint8)
         moves = np.abs(self._graph.lattice.moves[: len(self._graph.lattice.moves) // 2])
-        self._reaches = (0.5 * settings.spacing * moves @ largest_motion_radii(checker.robot)).astype(np.float32)
+        self._reaches = (0.5 * settings.spacing * moves @ largest_motion_radii(checker.robot)).astype(
+            np.float32
+        )
         """How far any point of the arm gets by half of each move [m]."""
         self._offset = 0
         self._start = int(table.find_or_add(self._table, self._graph.start_key))
