@@ -102,7 +102,7 @@ def random_edges(checker: CollisionChecker, rng: Generator) -> tuple[ndarray, nd
 
 def checked_configurations(space: Space, starts: ndarray, ends: ndarray) -> Int[ndarray, "n"]:
     """How many configurations of each edge a full check looks at."""
-    travel = np.abs(ends - starts) @ space.levers
+    travel = np.abs(ends - starts) @ space.motion_radii
     return W * np.maximum(np.ceil(travel / space.resolution / W), 1).astype(int)
 
 

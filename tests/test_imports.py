@@ -53,6 +53,7 @@ EXTRAS = {
     "roslibpy": {"interop"},
     "pinocchio": {"robots"},
     "example_robot_data": set(),
+    "toppra": set(),
 }
 """Distributions that the core install lacks, and the packages that may import them."""
 

@@ -1,7 +1,7 @@
 """The public names, each imported when it is first used."""
 
-from .certificates.proof import Certificate as Certificate
-from .certificates.proof import load_certificate as load_certificate
+from .certificates.certificate import Certificate as Certificate
+from .certificates.certificate import load_certificate as load_certificate
 from .certificates.search import certify as certify
 from .core.errors import InputError as InputError
 from .core.results import PlanResult as PlanResult

@@ -1,4 +1,4 @@
-"""The bounds of certificates, before formulas by hand, Coal and the validator's own kinematics."""
+"""The bounds of proofs, against formulas by hand, Coal and the validator's kinematics."""
 
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
@@ -14,7 +14,7 @@ from helpers.box_arm import box_arm
 from helpers.example_robots import example_robot
 from robotdiffuse.certificates.bounds import SCENE, Prover, Stretches
 from robotdiffuse.certificates.kinematics import Linkage
-from robotdiffuse.certificates.obstacles import CAP, Obstacles, Rounded, Surface
+from robotdiffuse.certificates.obstacles import CLEARANCE_CAP, Obstacles, Rounded, Surface
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import link_pose, placed_spheres
@@ -95,9 +95,9 @@ def test_distances_are_those_of_coal() -> None:
                 for piece, t in zip(pieces, at, strict=True)
             )
             if isinstance(body, Surface) and count == 3 and right > 0.1:  # of triangles far away, their balls
-                assert 0.6 * min(right, CAP) <= distance <= right + 1e-5
+                assert 0.6 * min(right, CLEARANCE_CAP) <= distance <= right + 1e-5
             elif right - less > 1e-3:
-                assert distance == pytest.approx(min(right - less, CAP), abs=2e-5)
+                assert distance == pytest.approx(min(right - less, CLEARANCE_CAP), abs=2e-5)
             else:
                 assert distance < 2e-3
 
@@ -173,7 +173,7 @@ def test_sphere_clearances_are_distances_of_the_placed_spheres() -> None:
     balls = placed_spheres(robot, q[0])
     still = sum(len(s) for link, s in robot.spheres.items() if robot.link_frame(link) == 0)
     right = (np.linalg.norm(balls[still:, :3] - [0.5, 0.2, 0.5], axis=1) - 0.1 - balls[still:, 3]).min()
-    assert found.clearance.min() == pytest.approx(min(right, CAP), abs=1e-12)
+    assert found.clearance.min() == pytest.approx(min(right, CLEARANCE_CAP), abs=1e-12)
     assert (found.displacement == 0).all()
 
 

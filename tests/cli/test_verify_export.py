@@ -48,7 +48,7 @@ def test_a_certificate_is_written_and_checked(planned: Path, capsys: pytest.Capt
     assert capsys.readouterr().out.startswith("holds: at least")
     assert run("certificate", "check", "c.json", "--problem", planned / "problem.json") == 0
     assert run("certificate", "check", "c.json", "--problem", planned / "other.json") == 1
-    assert "scene: new was not there" in capsys.readouterr().out
+    assert "scene: new was added" in capsys.readouterr().out
     assert run("certificate", "check", planned / "r.json") == 2
     assert "is not a certificate" in capsys.readouterr().err
 

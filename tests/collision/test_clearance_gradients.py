@@ -1,4 +1,4 @@
-"""The denoiser's inputs about obstacles: the same in training and planning, gradients by differences."""
+"""Clearances as network inputs: training and planning agree, and gradients match finite differences."""
 
 from dataclasses import replace
 
@@ -95,7 +95,7 @@ def test_gradients_are_those_of_the_clearances() -> None:
 
 @pytest.mark.parametrize("padding", [0.0, 0.03])
 def test_gradients_are_differences_over_all_spheres(padding: float) -> None:
-    """Of the whole robot: of the root of the cost that guidance descends, links against links left out."""
+    """For the whole robot: the root of guidance's collision cost, without self-collision."""
     checker, q = CollisionChecker(PANDA, SHAPES, padding), configurations(300).astype(np.float64)
     clearances, found = checker.clearances_and_gradients(q, LIMIT, MARGIN)
     np.testing.assert_array_equal(clearances, checker.link_clearances(q, LIMIT))
@@ -132,7 +132,7 @@ def test_gradients_of_a_cloud_are_those_of_what_it_covers() -> None:
 
 
 def test_the_denoiser_s_inputs() -> None:
-    """Rows, joints, clearances, and then gradients of order 1, whose sign tells the way into the obstacle."""
+    """Rows, joints, clearances, and then gradients of order 1, whose sign points into the obstacle."""
     scene, rng = Scene([Box((0.5, 0.0, 0.5), (0.4, 0.4, 0.4))]), np.random.default_rng(5)
     seen = {}
     q = configurations(2, 16, seed=6).astype(np.float64)

@@ -1,4 +1,4 @@
-"""Exact distances against closed forms, and the shapes that Coal is given in a roundabout way."""
+"""Exact distances against closed forms, also for the shapes that Coal represents indirectly."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""The certificate's bounds along short motions against what dense sampling finds there."""
+"""The motion certificate's bounds along short motions against dense sampling."""
 
 from dataclasses import replace
 from functools import cache
@@ -51,7 +51,7 @@ def clad_arm(name: str) -> Robot:
 
 
 def scene_of(rng: np.random.Generator, cloud: bool) -> Scene:
-    """One shape of each kind at random places, and maybe some points."""
+    """One shape of each kind at random places, and sometimes points."""
 
     def somewhere() -> ndarray:
         return rng.uniform([-0.6, -0.6, -0.2], [0.6, 0.6, 0.9])
@@ -73,7 +73,7 @@ def scene_of(rng: np.random.Generator, cloud: bool) -> Scene:
 
 
 def curve(rng: np.random.Generator, robot: Robot, width: float) -> ndarray:
-    """Waypoints along a bent way about so long, some twice."""
+    """Waypoints along a bent path of about this length, some of them repeated."""
     t = np.linspace(-1, 1, 9)[:, None]
     middle = rng.uniform(robot.lower, robot.upper)
     bend = np.abs(t) if rng.random() < 0.3 else t**2
@@ -96,12 +96,12 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
         CollisionChecker(robot, scene),
         ExactCollision(robot, scene),
     )
-    motion = Motion(q, motion_certificate.way_along(q, validator.checks.levers))
+    motion = Motion(q, motion_certificate.travel_along(q, validator.checks.motion_radii))
     whole = Pieces(
-        np.zeros(1), np.full(1, motion.way[-1]), np.ones((1, len(checks_of(robot))), dtype=np.bool_)
+        np.zeros(1), np.full(1, motion.travel[-1]), np.ones((1, len(checks_of(robot))), dtype=np.bool_)
     )
     best = np.ones(2)
-    found = motion_certificate.by_spheres(
+    found = motion_certificate.bound_by_spheres(
         validator.arm,
         validator.scene_arrays,
         motion,
@@ -110,7 +110,7 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
         best,
         make_swept_spheres(validator.arm.spheres, validator.scene_arrays),
     )
-    places = np.linspace(0, motion.way[-1], 41)
+    places = np.linspace(0, motion.travel[-1], 41)
     dense = motion_certificate.configurations(motion, places)
     apart = np.hstack([checker.link_clearances(dense), checker.pair_clearances(dense)])
     # towards points the checker's clearances are themselves bounds, up to the size of a voxel
@@ -119,7 +119,7 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
     assert (found.clearance[0] <= apart[20] + slack).all()
     posture = convex_bounds.make_posture(validator.arm.hulls, validator.solids, robot.dof)
     found.clearance[:], found.lower[:] = -np.inf, -np.inf
-    motion_certificate.by_hulls(
+    motion_certificate.bound_by_convex_parts(
         validator.arm, validator.solids, motion, validator.checks, found, np.ones(2), 0.5, 1e-4, posture
     )
     rows = [(*exact.link_distances(row), *exact.pair_distances(row)) for row in dense[::4]]
@@ -130,7 +130,7 @@ def test_bounds_hold_along_the_whole_piece(name: str, seed: int, width: float, c
 
 @given(robots, seeds)
 def test_planes_part_as_far_as_coal_says(name: str, seed: int) -> None:
-    """From any guess; 2 % is where the search for the plane ends."""
+    """From any initial guess, to the 2 % at which the search ends."""
     rng, robot = np.random.default_rng(seed), clad_arm(name)
     scene = scene_of(rng, False)
     q = rng.uniform(robot.lower, robot.upper)

@@ -1,4 +1,5 @@
-"""The certificate in time, against Coal at many moments; and what obstacles that move refuse."""
+"""The motion certificate among moving obstacles against Coal at many times; and what moving obstacles
+reject."""
 
 from pathlib import Path
 
@@ -7,7 +8,7 @@ import pytest
 
 import robotdiffuse as rd
 from robotdiffuse.collision.exact_meshes import ExactCollision
-from robotdiffuse.collision.moving_obstacles import FIRST_CONTACT, MovingCollision
+from robotdiffuse.collision.moving_obstacles import CONTACT_TIME_TOLERANCE, MovingCollision
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import rotation_about, transform
 from robotdiffuse.core.types import Trajectory
@@ -16,19 +17,19 @@ from robotdiffuse.problems.files import load_problem, problem_from_record, probl
 PANDA = rd.load_robot("panda")
 START, END = np.array([-0.6, 0.2, 0, -2.0, 0, 2.2, 0.2]), np.array([0.6, 0.2, 0, -2.0, 0, 2.2, 0.2])
 STEP = 0.01
-"""Between the moments that Coal looks at [s] ..."""
+"""Time between the samples by Coal [s]."""
 MOVED = 0.02
-"""... in which nothing here moves more than that [m]."""
+"""Upper bound on all motion in that time [m]."""
 AXIS = np.array([0.0, 0.6, 0.8])
 
 
 def swing(duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """There and back, evenly."""
+    """A motion there and back at constant speed."""
     return np.linspace(0.0, duration, 3), np.stack([START, END, START])
 
 
 def obstacle(k: int, rng: np.random.Generator) -> rd.MovingObstacle:
-    """Of each shape and each known motion in turn."""
+    """Obstacles of every shape and every kind of motion in turn."""
     at, velocity = rng.uniform([-0.2, -0.8, 0.2], [0.9, 0.8, 1.0]), 0.4 * rng.normal(size=3)
     shape = [
         rd.Sphere(at, 0.08),
@@ -70,7 +71,7 @@ def test_certificate_is_coals_verdict() -> None:
         touching, least = as_coal_sees(moves, times, q)
         if touching is not None:
             assert sweep.contact is not None
-            assert sweep.contact.time <= touching + FIRST_CONTACT, "later than Coal"
+            assert sweep.contact.time <= touching + CONTACT_TIME_TOLERANCE, "later than Coal"
             assert sweep.contact.time >= touching - 2 * STEP
             assert sweep.clearance == 0.0
         elif least > 0.005:  # nearer than that, something may have happened between two moments

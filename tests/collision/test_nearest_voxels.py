@@ -1,4 +1,4 @@
-"""What is nearest to each voxel, against SciPy's distance transform."""
+"""The nearest voxels with points, against SciPy's distance transform."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Lanes in compiled code against numpy."""
+"""SIMD lanes in compiled code, against NumPy."""
 
 import numpy as np
 import pytest
@@ -8,23 +8,23 @@ from numpy import ndarray
 from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.simd import (
     W,
+    absolute,
     by_sixteen,
+    copysign,
     first_lane,
+    floor,
     gather,
-    greatest,
-    highest,
     lane,
+    lane_numbers,
     lanes_array,
-    lanes_with,
-    least,
+    lanes_with_bit,
     load,
-    lowest,
-    magnitude,
-    ramp,
-    root,
+    maximum,
+    minimum,
+    reduce_max,
+    reduce_min,
+    sqrt,
     store,
-    whole,
-    with_sign,
 )
 
 
@@ -33,20 +33,20 @@ def _calculate(a, b, s, out):
     x, y = load(a, 0, 0), load(b, 1, 1)
     store(out, 0, 0, x + y * s)
     store(out, 1, 0, s - x)
-    store(out, 2, 0, least(x, y))
-    store(out, 3, 0, greatest(x, s))
-    store(out, 4, 0, root(magnitude(x)))
-    store(out, 5, 0, with_sign(y, x))
-    store(out, 6, 0, whole(x))
-    store(out, 7, 0, ramp())
-    return x < y, lowest(x), highest(x), lane(x, 3)
+    store(out, 2, 0, minimum(x, y))
+    store(out, 3, 0, maximum(x, s))
+    store(out, 4, 0, sqrt(absolute(x)))
+    store(out, 5, 0, copysign(y, x))
+    store(out, 6, 0, floor(x))
+    store(out, 7, 0, lane_numbers())
+    return x < y, reduce_min(x), reduce_max(x), lane(x, 3)
 
 
 @allocation_free()
 def _look_up(table, index, bit, out):
     found = gather(table, load(index, 0, 0))
     store(out, 0, 0, found)
-    mask = lanes_with(found, bit)
+    mask = lanes_with_bit(found, bit)
     total = 0
     while mask:
         total += first_lane(mask)

@@ -9,6 +9,7 @@ import robotdiffuse as rd
 from robotdiffuse.collision import exact_meshes, kernel_arrays
 from robotdiffuse.core.deadline import LONG, OutOfTimeError, check_time, check_timing, deadline
 from robotdiffuse.core.types import Status
+from robotdiffuse.planning.pipeline import start_velocity
 from robotdiffuse.planning.planner import one_of_each
 from robotdiffuse.planning.search.rrt_connect import RRTConnect
 from robotdiffuse.robots.kinematics import link_pose
@@ -70,14 +71,14 @@ def test_a_motion_whose_timing_takes_too_long_is_a_time_out(
 
 def test_a_start_velocity_whose_timing_takes_too_long_is_a_time_out(monkeypatch: pytest.MonkeyPatch) -> None:
     moving = rd.Problem(PANDA, rd.Scene(), LEFT, RIGHT, start_velocity=-0.1 * np.eye(7)[0])
-    attempt = RRTConnect().attempt
+    attempt = start_velocity.attempt
 
-    def then_slow(self: RRTConnect, *arguments: object) -> object:
+    def then_slow(*arguments: object) -> object:
         found = attempt(*arguments)  # type: ignore[arg-type]
         monkeypatch.setattr(speed_limits, "ROW_SECONDS", 1e3)
         return found
 
-    monkeypatch.setattr(RRTConnect, "attempt", then_slow)
+    monkeypatch.setattr(start_velocity, "attempt", then_slow)
     result = RRTConnect().plan(moving, 20.0)
     assert result.status is Status.TIMEOUT and "too short for timing" in result.reason
 
@@ -92,7 +93,7 @@ def test_a_motion_too_long_to_be_validated_ends_the_search() -> None:
 
 
 def test_a_grid_of_too_many_points_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(kernel_arrays, "GRID_SECONDS", 1e3)
+    monkeypatch.setattr(kernel_arrays, "GRID_SECONDS_PER_POINT", 1e3)
     result = RRTConnect().plan(problem(wall()), time_limit=20.0)
     assert result.status is Status.TIMEOUT
     assert "time limit of 20 s is too short to prepare the scene" in result.reason
@@ -113,7 +114,7 @@ def test_a_tree_of_the_validator_that_takes_too_long_is_refused(
     tip = link_pose(PANDA, LEFT, PANDA.tip)[:3, 3]
     vertices = wall().vertices - wall().vertices.mean(axis=0) + tip
     asked = problem(rd.PointCloud(vertices, 0.01) if cloud else rd.Mesh(vertices, wall().faces))
-    monkeypatch.setattr(exact_meshes, "TREE_SECONDS", 1e3)
+    monkeypatch.setattr(exact_meshes, "TREE_SECONDS_PER_ELEMENT", 1e3)
     refused = RRTConnect().plan(asked, time_limit=20.0)
     assert refused.status is Status.TIMEOUT
     assert "the validator's tree over the" in refused.reason

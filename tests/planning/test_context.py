@@ -90,7 +90,7 @@ def test_compiling_takes_no_time_of_the_call_and_is_noted() -> None:
 
 
 def test_a_solved_call_imports_no_toppra_and_no_matplotlib() -> None:
-    """Regression: importing toppra, and with it matplotlib, cost the first call over a second."""
+    """toppra, which imports matplotlib, once cost the first call over a second; now only tests import it."""
     code = (
         "import sys, numpy as np, robotdiffuse as rd\n"
         f"start = np.array({START.tolist()})\n"

@@ -14,7 +14,7 @@ import robotdiffuse as rd
 from helpers.example_robots import example_robot
 from helpers.made_arms import chain, row, written
 from robotdiffuse.certificates.checker import check
-from robotdiffuse.certificates.constraints import kept
+from robotdiffuse.certificates.constraints import constraint_bounds
 from robotdiffuse.cli import main, plan
 from robotdiffuse.cli.console import Spinner
 from robotdiffuse.cli.plan import load_and_plan
@@ -177,7 +177,7 @@ def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:
     problem = rd.Problem(
         robot=robot, scene=rd.Scene(), start=q[0], goal=rd.JointGoal(q[-1:]), constraints=[plane]
     )
-    (bounds,) = (found.bounds for found in kept(problem, q, 0.0))
+    (bounds,) = (found.bounds for found in constraint_bounds(problem, q, 0.0))
     heights = [
         abs((link_pose(robot, a + share * (b - a), "right_hand")[:3, 3] - plane.point) @ plane.normal)
         for a, b in pairwise(q)
@@ -187,7 +187,7 @@ def test_what_one_arm_keeps_is_not_loosened_by_the_other() -> None:
     still = q.copy()
     still[:, 1:4] = q[0, 1:4]  # the left arm, which only the moved one's bounds may depend on
     assert robot.joint_names[1:4] == ("left_shoulder", "left_elbow", "left_wrist")
-    np.testing.assert_array_equal(kept(problem, still, 0.0)[0].bounds, bounds)
+    np.testing.assert_array_equal(constraint_bounds(problem, still, 0.0)[0].bounds, bounds)
 
 
 def test_a_locked_arm_weighs_as_much_as_one_that_stands_still() -> None:

@@ -1,4 +1,4 @@
-"""Speeds along a course: limits hold from any place on, however often it is looked at anew."""
+"""Speeds along a timed path: limits hold from any place, however often the motion is replanned."""
 
 import numpy as np
 import pytest
@@ -33,10 +33,10 @@ def test_steps_keep_limits_and_end_at_rest(seed: int) -> None:
 
 
 def test_fastest_motion_to_the_end_is_that_of_the_timing() -> None:
-    """Within what the course spares of the limits, about 4 % of accelerations."""
-    from robotdiffuse.trajectories.speed_limits import TimingSettings, timed_piece
+    """They differ by the margin that the timed path leaves to the limits, about 4 % of accelerations."""
+    from robotdiffuse.trajectories.speed_limits import TimingSettings, time_line
 
     waypoints = np.array([np.zeros(7), np.full(7, 0.8), np.linspace(0, 1, 7)])
     line = BlendedPolyline(waypoints, half_widths(waypoints, np.array([0.1])))
-    fastest = timed_piece(PANDA, line, TimingSettings())[0][-1]
+    fastest = time_line(PANDA, line, TimingSettings())[0][-1]
     assert TimedPath(PANDA, line, True).onwards(0.0, 0.0).duration == pytest.approx(fastest, rel=0.05)

@@ -1,4 +1,4 @@
-"""Torques between two looks: bounds against dense ones, and peaks that no look sees."""
+"""Torques between samples: bounds against dense samples, and peaks between rows."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from robotdiffuse.core.types import Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.inertias import Payload
-from robotdiffuse.validation.torques import Pieces, first_beyond, pieces_held, pieces_of
+from robotdiffuse.validation.torques import Pieces, first_excess, static_pieces, trajectory_pieces
 from robotdiffuse.validation.validator import verify, verify_trajectory
 
 pytest.importorskip("pinocchio", reason="the extra `dynamics` (pin) is not installed")
@@ -18,7 +18,7 @@ LOOKS = 41
 
 
 def farthest_off(dynamics: Dynamics, pieces: Pieces) -> tuple[np.ndarray, np.ndarray]:
-    """How far torques leave their chords in each piece, at dense looks; and what that is at most."""
+    """Largest distances of torques from their chords in each piece, by dense samples, and their bounds."""
     bulges = dynamics.bends(pieces.along) / 8
     u = np.linspace(0.0, 1.0, LOOKS)
     piece = np.repeat(np.arange(len(bulges)), LOOKS)
@@ -34,22 +34,22 @@ def test_no_torque_leaves_its_chord_by_more_than_its_bound(name: str, step: floa
     dynamics = Dynamics(robot, Payload(1.5, [0.05, 0.0, 0.1], None, [0.01, 0.02, 0.03]), TURNED)
     for _ in range(20):
         motion = wild(robot, rng, step)
-        for pieces in (pieces_of(motion), pieces_held(motion.positions)):
+        for pieces in (trajectory_pieces(motion), static_pieces(motion.positions)):
             off, bulges = farthest_off(dynamics, pieces)
             assert (off <= bulges + 1e-9).all()
 
 
 def test_bounds_of_what_bends_most_are_near() -> None:
-    """A pendulum near its level: its torque is a sine, of which the bound knows all but where."""
+    """A pendulum near the horizontal, whose torque is a sine: the bound is almost tight."""
     robot = pendulum(10.0)
     dynamics = Dynamics(robot, Payload(0.0))
-    off, bulges = farthest_off(dynamics, pieces_held(np.array([[np.pi / 2 - 0.05], [np.pi / 2 + 0.05]])))
+    off, bulges = farthest_off(dynamics, static_pieces(np.array([[np.pi / 2 - 0.05], [np.pi / 2 + 0.05]])))
     assert off[0, 0] <= bulges[0, 0] <= 1.01 * off[0, 0]
 
 
 @pytest.mark.parametrize(("effort", "valid"), [(9.70, False), (9.73, True)])
 def test_a_peak_between_two_rows_is_found(effort: float, valid: bool) -> None:
-    """It bears 9.81 N m where it is level, which no row is; the validator allows a hundredth more."""
+    """The torque is 9.81 N m in the horizontal, between two rows; the validator allows 1 % more."""
     robot = pendulum(effort)
     path = JointPath(("hinge",), np.array([[0.3], [2.84], [2.9]]))
     problem = Problem(robot, rd.Scene(), path.positions[0], path.positions[-1], payload=Payload(0.0))
@@ -67,7 +67,7 @@ def test_a_peak_between_two_times_is_found() -> None:
     v = np.array([[0.0], [0.25], [0.25], [0.0]])
     motion = Trajectory(("hinge",), np.arange(4.0), rows, v, np.zeros((4, 1)))
     for effort, beyond in ((9.66, True), (9.75, False)):
-        found = first_beyond(Dynamics(pendulum(effort), Payload(0.0)), pieces_of(motion), 0.01)
+        found = first_excess(Dynamics(pendulum(effort), Payload(0.0)), trajectory_pieces(motion), 0.01)
         assert (found is not None) == beyond
         if found is not None:
             assert 1 < found.place < 2 and 1.01 * effort < found.torque < 9.82
@@ -77,22 +77,25 @@ def test_a_motion_that_winds_on_and_on_is_refused_in_bounded_time() -> None:
     winds = Trajectory(
         ("hinge",), np.array([0.0, 1e5]), np.zeros((2, 1)), np.full((2, 1), 2.0), np.zeros((2, 1))
     )
-    assert first_beyond(Dynamics(pendulum(9.9), Payload(0.0)), pieces_of(winds), 0.01) is not None
+    assert first_excess(Dynamics(pendulum(9.9), Payload(0.0)), trajectory_pieces(winds), 0.01) is not None
 
 
 def test_a_motion_of_one_row_is_held() -> None:
     row, still = np.array([[1.5]]), np.zeros((1, 1))
-    for pieces in (pieces_held(row), pieces_of(Trajectory(("hinge",), np.zeros(1), row, still, still))):
-        assert first_beyond(Dynamics(pendulum(10.0), Payload(0.0)), pieces, 0.01) is None
-        assert first_beyond(Dynamics(pendulum(9.0), Payload(0.0)), pieces, 0.01) is not None
+    for pieces in (
+        static_pieces(row),
+        trajectory_pieces(Trajectory(("hinge",), np.zeros(1), row, still, still)),
+    ):
+        assert first_excess(Dynamics(pendulum(10.0), Payload(0.0)), pieces, 0.01) is None
+        assert first_excess(Dynamics(pendulum(9.0), Payload(0.0)), pieces, 0.01) is not None
 
 
 def test_a_torque_that_touches_its_limit_is_settled() -> None:
-    """Halving ends where a thousandth of the limit is left."""
+    """Halving ends at a thousandth of the limit."""
     limit = 9.81 / 1.01
-    held = pieces_held(np.array([[1.0], [2.0]]))
-    assert first_beyond(Dynamics(pendulum(limit), Payload(0.0)), held, 0.01) is not None
-    assert first_beyond(Dynamics(pendulum(1.002 * limit), Payload(0.0)), held, 0.01) is None
+    held = static_pieces(np.array([[1.0], [2.0]]))
+    assert first_excess(Dynamics(pendulum(limit), Payload(0.0)), held, 0.01) is not None
+    assert first_excess(Dynamics(pendulum(1.002 * limit), Payload(0.0)), held, 0.01) is None
 
 
 def test_what_is_proved_holds_at_every_look() -> None:
@@ -101,10 +104,10 @@ def test_what_is_proved_holds_at_every_look() -> None:
     problem = Problem(panda, rd.Scene(), low, far, payload=payload)
     motion = rd.plan(problem, time_limit=10.0).trajectory
     assert motion is not None
-    dynamics, pieces = Dynamics(panda, payload), pieces_of(motion)
+    dynamics, pieces = Dynamics(panda, payload), trajectory_pieces(motion)
     rng, count = np.random.default_rng(0), len(motion.times) - 1
     torques = np.abs(dynamics.torques(*pieces.states(rng.integers(count, size=4000), rng.random(4000))))
     for share in (1.1, 1.003, 0.999, 0.95):
         dynamics.limits = share * torques.max(axis=0)
-        assert (first_beyond(dynamics, pieces, 0.0) is None) == (share > 1)
+        assert (first_excess(dynamics, pieces, 0.0) is None) == (share > 1)
     assert verify_trajectory(problem, motion).valid

@@ -1,4 +1,4 @@
-"""The validator: what it must refuse, what it must accept, and that its certificate holds."""
+"""The validator: motions that it must reject, motions that it must accept, and its certified clearances."""
 
 from dataclasses import replace
 from typing import Any
@@ -20,7 +20,7 @@ from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, PointCloud, Shape, Sphere
-from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
+from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
 from robotdiffuse.validation.validator import (
     Report,
     VerifySettings,
@@ -39,7 +39,7 @@ def vector(*values: float) -> np.ndarray:
 
 
 def validator(rows: np.ndarray, *shapes: Shape, robot: Robot | None = None, **settings: float) -> Report:
-    """The verdict on a path whose problem asks for its own first and last waypoint."""
+    """The report on a path for the problem from its first to its last waypoint."""
     robot = robot or box_arm()
     problem = Problem(robot, Scene(shapes), rows[0], JointGoal(rows[-1:]))
     return verify(problem, Path(robot.joint_names, rows), VerifySettings(**settings))  # type: ignore[arg-type]
@@ -99,7 +99,7 @@ def test_an_empty_scene_and_a_motion_of_one_waypoint() -> None:
 def test_a_thin_wall_between_two_waypoints_is_found(
     share: float, reach: float, thickness: float, extra: int, spheres: bool
 ) -> None:
-    """A straight arm swings through a wall that no coarse sampling need meet."""
+    """A straight arm swings through a wall that coarse sampling may miss."""
     angle = -1 + 2 * share
     turn = vector(np.cos(angle / 2), 0, 0, np.sin(angle / 2))
     wall = Box(reach * vector(np.cos(angle), np.sin(angle), 0), vector(0.2, thickness, 0.5), turn)
@@ -182,7 +182,7 @@ def test_the_first_of_two_collisions_is_reported() -> None:
 
 
 def test_a_contact_with_two_obstacles_at_once_has_a_depth() -> None:
-    """The nearer of two that the arm starts in, whichever the search met first."""
+    """The arm starts inside two obstacles: the deeper contact is reported in either order."""
     deep, shallow = Sphere(vector(1.1, 0.02, 0), 0.1, "deep"), Sphere(vector(1.15, 0.12, 0), 0.1, "shallow")
     for shapes in ((deep, shallow), (shallow, deep)):
         found = refused(validator(np.array([[0, 0, 0], [-0.5, 0, 0]]), *shapes), "scene_collision")
@@ -200,7 +200,7 @@ def test_self_collision_between_waypoints() -> None:
 
 
 def meshes_asked(*shapes: Shape) -> int:
-    """How many distances Coal is asked for to validate the swing among these."""
+    """Number of distances that Coal computes to validate the swing among these shapes."""
     asked: list[int] = []
 
     class Counting(ExactCollision):
@@ -371,14 +371,14 @@ def at_the_limit() -> Trajectory:
     ("factor", "kind"), [(1.0, ""), (1.02, "velocity"), (1.49, "velocity"), (1.6, "jump")]
 )
 def test_times_compressed_under_rates_of_zero(factor: float, kind: str) -> None:
-    """Rates that a trajectory does not own up to are recomputed."""
+    """Rates are recomputed where a trajectory conceals them."""
     robot = replace(box_arm(), joints=tuple(replace(joint, acceleration=1e3) for joint in box_arm().joints))
     problem = Problem(robot, Scene(), SWING[0], JointGoal(SWING[1:]))
     good = at_the_limit()
     assert verify_trajectory(problem, good).valid
     still = np.zeros_like(good.velocities)
     quick = replace(good, times=good.times / factor, velocities=still, accelerations=still)
-    kinds = {wrong.kind for wrong in wrong_rates(robot, quick, RATES)}
+    kinds = {wrong.kind for wrong in rate_violations(robot, quick, RATES)}
     assert kinds == ({kind, "velocity", "rates"} if kind else {"rates"})
     assert not verify_trajectory(problem, quick).valid
 
@@ -390,7 +390,7 @@ def test_rates_that_are_not_those_of_the_positions(what: str, factor: float) -> 
     problem, _ = problem_and_path(SWING)
     good = trajectory(1.0)
     bad = replace(good, **{what: factor * getattr(good, what)})
-    found = {wrong.kind: wrong for wrong in wrong_rates(problem.robot, bad, RATES)}
+    found = {wrong.kind: wrong for wrong in rate_violations(problem.robot, bad, RATES)}
     assert set(found) == {"rates"}
     assert refused(verify_trajectory(problem, bad), "rates").subject == "j0"
     assert what[:5] in found["rates"].message
@@ -398,12 +398,12 @@ def test_rates_that_are_not_those_of_the_positions(what: str, factor: float) -> 
 
 @pytest.mark.parametrize("end", [0, -1])
 def test_motions_begin_and_end_at_rest(end: int) -> None:
-    """By what they say, and by their positions where they say that they rest."""
+    """By their velocities, and by their positions if their velocities are 0."""
     problem, _ = problem_and_path(SWING)
     good = trajectory(2.0)
     moving = good.velocities.copy()
     moving[end, 0] = 0.5
-    kinds = {w.kind for w in wrong_rates(problem.robot, replace(good, velocities=moving), RATES)}
+    kinds = {w.kind for w in rate_violations(problem.robot, replace(good, velocities=moving), RATES)}
     assert "rest" in kinds
     assert not verify_trajectory(problem, replace(good, velocities=moving)).valid
     times = np.linspace(0, 1.2, 121)
@@ -430,12 +430,12 @@ def test_no_motion_within_the_limits_is_refused(seed: int, most: float) -> None:
     accelerations = np.concatenate([fine, fine[-1:]])[rows]
     place += rng.uniform(-1, 1, place.shape) * 0.99 * RATES.resolution
     motion = Trajectory(robot.joint_names, rows * step, place[rows], speed[rows], accelerations)
-    wrong = {w.message for w in wrong_rates(robot, motion, replace(RATES, agreement=2.0))}
+    wrong = {w.message for w in rate_violations(robot, motion, replace(RATES, agreement=2.0))}
     assert not wrong
 
 
 def in_micro_steps(step: float, time: float, way: float) -> Trajectory:
-    """Evenly, in steps that positions are not known better than, with rates of zero."""
+    """Evenly, in steps at the resolution of positions, with rates of zero."""
     count = round(way / step)
     rows = np.zeros((count + 1, 3))
     rows[:, 0] = np.arange(count + 1) * step
@@ -448,7 +448,7 @@ def test_micro_steps_hide_no_velocity(step: float, time: float) -> None:
     """Each of them within the resolution of positions, all of them 1.9 to 95 times as fast as the arm."""
     quick = in_micro_steps(step, time, max(step, 0.01))
     problem = Problem(box_arm(), Scene(), quick.positions[0], JointGoal(quick.positions[-1:]))
-    found = {wrong.kind: wrong.message for wrong in wrong_rates(problem.robot, quick, RATES)}
+    found = {wrong.kind: wrong.message for wrong in rate_violations(problem.robot, quick, RATES)}
     assert "j0 at" in found["velocity"]
     assert not verify_trajectory(problem, quick).valid
 
@@ -461,14 +461,14 @@ def test_micro_steps_hide_no_acceleration(back: bool) -> None:
         place = 1e-3 * np.abs((quick.times / 1e-3 + 0.5) % 1 - 0.5)
         quick = replace(quick, positions=np.outer(place, [1.9, 0, 0]))
     problem = Problem(box_arm(), Scene(), quick.positions[0], JointGoal(quick.positions[-1:]))
-    found = {wrong.kind: wrong.message for wrong in wrong_rates(problem.robot, quick, RATES)}
+    found = {wrong.kind: wrong.message for wrong in rate_violations(problem.robot, quick, RATES)}
     assert set(found) == {"rates", "acceleration"}
     assert "by its positions over 1 ms and more" in found["acceleration"]
     assert not verify_trajectory(problem, quick).valid
 
 
 def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None:
-    """Out and back within one step: the rows stand in one place, the arm does not."""
+    """Out and back within one step: the rows are equal, but the arm moves between them."""
     robot = box_arm()
     rows = np.zeros((4, 3))
     speed = np.zeros((4, 3))
@@ -482,7 +482,7 @@ def test_rows_far_apart_are_validated_as_controllers_move_between_them() -> None
     ball = Sphere(1.1 * vector(np.cos(0.73), np.sin(0.73), 0), 0.02)
     found = refused(verify_trajectory(replace(problem, scene=Scene([ball])), out), "scene_collision")
     assert 1.0 < found.time < 1.5
-    times, positions = between_rows(out, 1e-3)
+    times, positions = sample_cubics(out, 1e-3)
     assert np.isin(out.times, times).all()
     assert np.abs(positions[:, 0]).max() == pytest.approx(0.75, abs=1e-3)
 
@@ -493,7 +493,7 @@ def test_a_motion_of_a_century_is_refused() -> None:
 
 
 def test_collision_alone_can_be_asked_for() -> None:
-    """Neither limits nor the ends matter then."""
+    """Limits, start and goal are not checked."""
     problem, path = problem_and_path(np.array([[-0.6, 0, 0], [0.6, 0, 0], [0.6, 2.9, 0]]))
     assert verifier(problem, VerifySettings()).collision_free(path)
     blocked = replace(problem, scene=Scene([Sphere(vector(1.2, 0, 0), 0.05)]))

@@ -1,5 +1,6 @@
-"""Certificates of motions: a proof that a motion is free, and a small checker that needs no search.
+"""Certificates: proofs that motions are valid, and a small independent checker that needs no search.
 
-The checker (`checker.py`, with `bounds.py`, `kinematics.py`, `obstacles.py` and `requests.py`) is plain NumPy
-and shares no code with the validator; `writer.py` finds the proof for what the validator calls valid.
+The checker (`checker.py` with `bounds.py`, `kinematics.py`, `obstacles.py`, `requirements.py` and others) is
+plain NumPy and shares no code with the validator; `search.py` finds a proof for a motion that the validator
+accepts.
 """

@@ -1,10 +1,10 @@
-"""Clearances and displacements over stretches of a motion: what proofs consist of.
+"""Clearances and displacements over stretches of a motion, of which proofs consist.
 
-A stretch is free for a check, a link against the scene or two links, if in the middle of the stretch the
-clearance is more than any point of the link can be displaced from there to anywhere on it. Clearances are
-those of the robot's spheres, or of its convex meshes by planes that part them from what is near. Two links
-are seen from where the joints that move them part, so only the joints between them count: those of the
-further link, and of links on two arms those of both.
+A stretch is free for a claim (a link against the scene, or two links) if the clearance in the middle of the
+stretch exceeds the largest displacement of any point of the link from there to anywhere on the stretch.
+Clearances are those of the robot's spheres, or of its convex meshes by planes that separate them from what is
+near. Only the joints between two links count: motion is seen from the last common joint, so these are the
+joints of the link further from the base, and for links on two arms those of both.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,14 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.certificates.kinematics import Linkage, Postures
-from robotdiffuse.certificates.obstacles import BEYOND, CAP, MOST, Obstacles, Rounded, Surface
+from robotdiffuse.certificates.obstacles import (
+    CLEARANCE_CAP,
+    MAX_ARRAY_SIZE,
+    PLANE_RANGE,
+    Obstacles,
+    Rounded,
+    Surface,
+)
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
@@ -25,42 +32,44 @@ SCENE = "scene"
 
 
 class Claim(NamedTuple):
-    """One thing that is to be proved of the whole motion."""
+    """What has to be proved for the whole motion: that a link is free of the scene, or of another link."""
 
     link: str
     against: str
-    """SCENE, or the other link, nearer to the base."""
+    """SCENE, the name of a moving obstacle, or the other link, which is nearer to the base."""
 
 
 class Stretches(NamedTuple):
-    """Stretches of a motion, each for one claim; places are rows plus the share of the way to the next."""
+    """Stretches of a motion, each for one claim; a place is a row plus the share of the way to the next."""
 
     claim: Int[ndarray, "n"]
+    """Index of the claim."""
     start: Float[ndarray, "n"]
     stop: Float[ndarray, "n"]
 
     def some(self, rows: ndarray) -> "Stretches":
+        """The stretches of these rows, given by indices or a mask."""
         return Stretches(self.claim[rows], self.start[rows], self.stop[rows])
 
 
 class Plane(NamedTuple):
-    """A plane between a part of a link and something else, in the middle of a stretch."""
+    """A plane that separates a part of a link from something else, in the middle of a stretch."""
 
     stretch: int
     part: int
-    """Of the link's convex meshes; or of its spheres, where it has no mesh."""
+    """Index of the link's convex mesh, or of its sphere if it has no mesh."""
     other: int
-    """Of the scene's obstacles, or of the other link's parts."""
+    """Index of the scene's obstacle, or of the other link's part."""
     normal: tuple[float, float, float]
-    """Towards the link, in the base's frame."""
+    """Points towards the link, in the base frame."""
 
 
 class Part(NamedTuple):
-    """The hull of vertices in the frame of the link, rounded; and a ball about it."""
+    """A convex part of a link: the convex hull of vertices, inflated by a radius, and a ball around it."""
 
     vertices: Float[ndarray, "v 3"]
     faces: Int[ndarray, "f 3"]
-    """None of a single vertex."""
+    """Empty for a single vertex."""
     rounding: float
     center: Float[ndarray, "3"]
     radius: float
@@ -68,16 +77,16 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Bounds:
-    """In the middles of stretches, and from there to their ends."""
+    """Bounds of stretches."""
 
     clearance: Float[ndarray, "n"]
-    """[m], at most CAP."""
+    """In the middles of the stretches [m], at most CLEARANCE_CAP."""
     displacement: Float[ndarray, "n"]
-    """[m]"""
+    """Of any point of the link from the middle to anywhere on the stretch [m]."""
 
 
 class Prover:
-    """Bounds for a robot in a scene along straight lines through configurations."""
+    """Computes bounds for a robot in a scene along straight lines through configurations."""
 
     def __init__(self, robot: Robot, scene: Scene, q: Float[ndarray, "rows dof"]) -> None:
         self.robot, self.q = robot, q
@@ -93,7 +102,8 @@ class Prover:
 
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
-        """Moving links against the scene; pairs of links that move against each other and may not touch."""
+        """Moving links against the scene, and pairs of links that move relative to each other and may not
+        touch."""
         moved = {link: self._moved[self._of[link]] for link in self.links}
         level = {link: int(joints.sum()) for link, joints in moved.items()}
         moving = [Claim(link, SCENE) for link in self.links if level[link] > 0]
@@ -106,14 +116,14 @@ class Prover:
         return (*moving, *pairs)
 
     def at(self, places: Float[ndarray, "n"]) -> Float[ndarray, "n dof"]:
-        """Configurations."""
+        """Configurations at places."""
         low = np.clip(places.astype(int), 0, max(len(self.q) - 2, 0))
         high = np.minimum(low + 1, len(self.q) - 1)
         share = (places - low)[:, None]
         return (1 - share) * self.q[low] + share * self.q[high]
 
     def spans(self, start: ndarray, stop: ndarray, middle: ndarray) -> Float[ndarray, "n dof"]:
-        """How far each joint goes at most between the middle of a stretch and anywhere on it."""
+        """Largest distance of each joint from the middle of a stretch to anywhere on it [rad] or [m]."""
         q = self.at(middle)
         spans = np.maximum(np.abs(self.at(start) - q), np.abs(self.at(stop) - q))
         first, last = np.floor(start).astype(int) + 1, np.ceil(stop).astype(int) - 1
@@ -128,7 +138,7 @@ class Prover:
         return spans
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
-        """What can be said of stretches; by the planes for those that `by_planes` marks, else by spheres."""
+        """Bounds of stretches, by `planes` for those that `by_planes` marks, else by the spheres."""
         ends, which = np.unique(
             np.column_stack([stretches.start, stretches.stop]), axis=0, return_inverse=True
         )
@@ -136,7 +146,7 @@ class Prover:
         middle = (ends[:, 0] + ends[:, 1]) / 2
         spans = self.spans(ends[:, 0], ends[:, 1], middle)
         postures = self.linkage.place(self.at(middle))
-        clearance = np.full(len(which), CAP)
+        clearance = np.full(len(which), CLEARANCE_CAP)
         displacement = np.zeros(len(which))
         for pairs in (False, True):
             is_pair = np.array([claim.against != SCENE for claim in self.claims], bool)
@@ -152,7 +162,8 @@ class Prover:
         return Bounds(clearance, displacement)
 
     def _expand(self, links: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-        """For each of the links all its balls: which row, which ball; and where the balls of each begin."""
+        """All balls of the given links: the row in `links` and index of each ball, and the first ball of each
+        row."""
         counts = self._first[links + 1] - self._first[links]
         begin = np.cumsum(counts) - counts
         row = np.repeat(np.arange(len(links)), counts)
@@ -160,6 +171,7 @@ class Prover:
         return row, ball, begin
 
     def _placed(self, postures: Postures, posture: ndarray, link: ndarray, points: ndarray) -> ndarray:
+        """Points of link frames in the base frame."""
         T = postures.T[posture, link]
         return np.einsum("nij,nj->ni", T[:, :3, :3], points) + T[:, :3, 3]
 
@@ -177,15 +189,16 @@ class Prover:
             moved = moved & ~self._moved[nearer]
             distances = self._to_links(postures, at, centers, nearer[row])
         else:
-            distances = self.obstacles.distances(centers).min(axis=1, initial=CAP)
+            distances = self.obstacles.distances(centers).min(axis=1, initial=CLEARANCE_CAP)
         went = self.linkage.displacement(postures, at, centers, radius, moved[row], spans)
         clearance = np.minimum.reduceat(distances - radius, begin)
-        return np.minimum(clearance, CAP), np.maximum.reduceat(went, begin) + others
+        return np.minimum(clearance, CLEARANCE_CAP), np.maximum.reduceat(went, begin) + others
 
     def _displaced(
         self, postures: Postures, posture: ndarray, links: ndarray, moved: ndarray, spans: ndarray
     ) -> Float[ndarray, "n"]:
-        """How far links go at most by these joints; of two links on one chain the nearer has none."""
+        """Upper bounds on the displacement of links by these joints [m]; 0 for a link that none of them
+        moves."""
         went = np.zeros(len(links))
         some = np.flatnonzero(moved.any(axis=1))
         if len(some):
@@ -199,9 +212,9 @@ class Prover:
         return went
 
     def _to_links(self, postures: Postures, at: ndarray, centers: ndarray, link: ndarray) -> ndarray:
-        """From points to the spheres of a link each."""
+        """Distances of points to the spheres of one link each [m]."""
         found = np.empty(len(at))
-        step = MOST // 64
+        step = MAX_ARRAY_SIZE // 64
         for first in range(0, len(at), step):
             some = slice(first, first + step)
             row, ball, begin = self._expand(link[some])
@@ -220,12 +233,16 @@ class Prover:
         ways: list[ndarray],
         displacement: ndarray,
     ) -> tuple[ndarray, ndarray]:
-        """Of each part to each obstacle, or part of the other link, the clearance of the balls about them, or
-        the widest gap that a plane shows, and what is left of it along the stretch; of these the least."""
+        """Clearance and displacement of the `marked` stretches by planes.
+
+        For each part and each obstacle, or part of the other link, it takes the clearance of the balls around
+        them, or the widest gap that a plane shows, and what remains of it along the stretch; then the minimum
+        of each.
+        """
         normals: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
         for plane in planes:
             normals.setdefault(plane[:3], []).append(plane.normal)
-        least, left = np.full(len(marked), CAP), np.full(len(marked), CAP)
+        least, left = np.full(len(marked), CLEARANCE_CAP), np.full(len(marked), CLEARANCE_CAP)
         places = [(self.claims[stretches.claim[i]], postures.T[which[i]]) for i in marked]
         standing = [placed(self.parts[claim.link], T[self._of[claim.link]]) for claim, T in places]
         in_scene = [k for k, (claim, _) in enumerate(places) if claim.against == SCENE]
@@ -261,21 +278,23 @@ class Prover:
                         widest = gaps(part, body, n).max(axis=-1)
                         remaining = (gaps(part, body, n, nearer) - against).max(axis=-1)
                         least_of, left_of = np.maximum(apart[o], widest), np.maximum(along[o], remaining)
-                        beyond = BEYOND if isinstance(body, Surface) else CAP
+                        beyond = PLANE_RANGE if isinstance(body, Surface) else CLEARANCE_CAP
                         apart[o] = max(apart[o], least_of.min(initial=beyond))
                         along[o] = max(along[o], left_of.min(initial=beyond - displacement[k]))
-                least[k] = min(least[k], apart.min(initial=CAP))
-                left[k] = min(left[k], along.min(initial=CAP))
+                least[k] = min(least[k], apart.min(initial=CLEARANCE_CAP))
+                left[k] = min(left[k], along.min(initial=CLEARANCE_CAP))
         return least, least - left
 
     def others(self, claim: Claim, T: ndarray, part: Part) -> Sequence[Rounded | Surface | Part]:
-        """What a part of a link is checked against; of surfaces, what is near."""
+        """The bodies that a part of a link is checked against; of a surface only the elements that are
+        near."""
         if claim.against == SCENE:
             return self.obstacles.near(part.center, part.radius)
         return placed(self.parts[claim.against], T[self._of[claim.against]])
 
     def balls_apart(self, part: Part, bodies: Sequence[Rounded | Surface | Part]) -> Float[ndarray, "bodies"]:
-        """How far the ball about a part is from the obstacles, or from those about parts of a link."""
+        """Distances of the ball around a part to the obstacles, or to the balls around parts of a link
+        [m]."""
         others = [body for body in bodies if isinstance(body, Part)]
         if not others:
             return self.obstacles.distances(part.center[None])[0] - part.radius
@@ -284,7 +303,7 @@ class Prover:
 
 
 def _steps(prover: Prover, start: float, stop: float) -> Float[ndarray, "rows dof"]:
-    """Where a stretch begins, turns and ends, from its middle."""
+    """Differences from the middle of a stretch to its start, its stop and the waypoints between."""
     inner = np.arange(int(np.floor(start)) + 1, int(np.ceil(stop)))
     ends = prover.at(np.array([start, (start + stop) / 2, stop]))
     return np.concatenate([ends[[0, 2]], prover.q[inner]]) - ends[1]
@@ -296,8 +315,11 @@ def gaps(
     normals: Float[ndarray, "k 3"],
     nearer: Float[ndarray, "k v"] | None = None,
 ) -> Float[ndarray, "*elements k"]:
-    """How far unit vectors part them [m]; of a surface, each of its elements. With `nearer`, when the part's
-    vertices have gone so far against them."""
+    """Widths of the gaps that planes with these unit normals show between a part and a body [m].
+
+    For a surface, one width per element. `nearer`: how far each vertex of the part has moved against the
+    normal.
+    """
     heights = normals @ part.vertices.T
     nearest = (heights if nearer is None else heights - nearer).min(axis=1) - part.rounding
     if isinstance(body, Part):
@@ -306,7 +328,7 @@ def gaps(
 
 
 def placed(parts: tuple[Part, ...], T: Float[ndarray, "4 4"]) -> list[Part]:
-    """Parts where their link stands."""
+    """Parts in the base frame, T being the pose of their link."""
     R, t = T[:3, :3], T[:3, 3]
     return [part._replace(vertices=part.vertices @ R.T + t, center=R @ part.center + t) for part in parts]
 
@@ -316,7 +338,7 @@ def _has_geometry(robot: Robot, link: str) -> bool:
 
 
 def _balls(robot: Robot, link: str) -> Float[ndarray, "n 4"]:
-    """The spheres of a link, which cover it; one about its meshes where it has none."""
+    """The spheres that cover a link; one sphere around its meshes if it has none."""
     if len(robot.spheres.get(link, ())):
         return robot.spheres[link]
     if not robot.meshes.get(link):

@@ -1,8 +1,8 @@
-"""The checker: is what a certificate says so? It searches for nothing, and shares no code with the validator.
+"""The checker of proofs. It needs no search and shares no code with the validator.
 
-Every claim that the robot gives rise to must be there, its stretches must cover the motion without a gap, and
-of each the clearance and the displacement are worked out anew: they must be what the certificate says, and
-leave something over. So a certificate that passes is a proof, whoever wrote it.
+The proof must contain every claim that follows from the robot, and the stretches of each claim must cover the
+motion without a gap. The checker recomputes clearance and displacement of every stretch: they must agree with
+the proof, and the clearance must exceed the displacement. So a proof that passes is right, whoever wrote it.
 """
 
 from collections.abc import Iterator
@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.certificates.bounds import CAP, SCENE, Claim, Prover
-from robotdiffuse.certificates.content import (
+from robotdiffuse.certificates.bounds import CLEARANCE_CAP, SCENE, Claim, Prover
+from robotdiffuse.certificates.content_hashes import (
     differences,
     motion_hash,
     request_parts,
@@ -20,8 +20,8 @@ from robotdiffuse.certificates.content import (
     scene_parts,
 )
 from robotdiffuse.certificates.moving_obstacles import MovingProver
-from robotdiffuse.certificates.proof import AGREEMENT, Certificate, Proof, Tolerances
-from robotdiffuse.certificates.requests import configurations, wrong
+from robotdiffuse.certificates.proof import BOUND_TOLERANCE, MotionProof, StretchProof, Tolerances
+from robotdiffuse.certificates.requirements import configurations, requirement_errors
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
@@ -34,7 +34,7 @@ class Findings:
     """What re-checking found."""
 
     differences: tuple[str, ...]
-    """A line for each thing that is not as the certificate says; none if the proof holds."""
+    """One line for each difference from the proof; empty if the proof holds."""
 
     @property
     def valid(self) -> bool:
@@ -42,15 +42,14 @@ class Findings:
 
 
 def check(
-    certificate: Certificate, problem: Problem | None = None, at_most: Tolerances = VALIDATOR
+    certificate: MotionProof, problem: Problem | None = None, at_most: Tolerances = VALIDATOR
 ) -> Findings:
-    """Re-check a certificate for a problem, by default the one that it holds, made with tolerances of at most
-    these.
+    """Re-check a proof for a problem, by default the one in its file, with tolerances of at most `at_most`.
 
-    Robot, scene and motion must be those that were certified, by content; the motion must keep the limits,
-    begin at the start and end at the goal; and every stretch must be proved. Stops at waypoints, twitching,
-    and whether rates agree with positions beyond their limits are left to the validator. Raises InputError for a
-    certificate without a problem where none is given, and for shapes that certificates do not know.
+    Robot, scene and motion must have the content that was certified. The motion must keep the limits, begin
+    at the start and end at the goal, and every stretch must be proved free. Stops at waypoints, twitching,
+    and whether rates agree with positions beyond their limits are left to the validator. Raises InputError if
+    neither the file nor the caller gives a problem, and for shapes that certificates do not support.
     """
     if problem is None:
         if certificate.problem is None:
@@ -69,55 +68,59 @@ def check(
             found.append(f"tolerances: {name} is {said:g}, looser than {most:g}")
     if certificate.motion_hash != hash_of(certificate.motion):
         found.append("motion: it is not the one that was certified: its hash differs")
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # what is not finite is a difference
-        found += wrong(problem, certificate)
+    with np.errstate(
+        over="ignore", invalid="ignore", divide="ignore"
+    ):  # non-finite values become differences
+        found += requirement_errors(problem, certificate)
         if tuple(certificate.motion.joint_names) == problem.robot.joint_names:
-            found += _unproved(problem, certificate)
-            found += _unproved_in_time(problem, certificate)
+            found += _proof_errors(problem, certificate)
+            found += _moving_proof_errors(problem, certificate)
     return Findings(tuple(found))
 
 
 def hash_of(motion: Path | Trajectory) -> str:
-    """Of the motion, exactly as it is."""
+    """Hash of a motion, without any rounding."""
     rates = (motion.times, motion.velocities, motion.accelerations) if isinstance(motion, Trajectory) else ()
     return motion_hash(motion.joint_names, motion.positions, *rates)
 
 
-def _unproved(problem: Problem, certificate: Certificate) -> Iterator[str]:
+def _proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
+    """Differences in the proof in the scene and between links."""
     prover = Prover(problem.robot, problem.scene, configurations(certificate.motion, certificate.between))
     proof = certificate.proof
     said = {"scene": certificate.scene_clearance, "self": certificate.self_clearance}
     of_pairs = np.array([claim.against != SCENE for claim in proof.claims], bool)[proof.stretches.claim]
-    yield from _of_proof(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, said)
+    yield from _bound_errors(prover, proof, {"scene": ~of_pairs, "self": of_pairs}, said)
 
 
-def _unproved_in_time(problem: Problem, certificate: Certificate) -> Iterator[str]:
-    """Of obstacles that move."""
+def _moving_proof_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
+    """Differences in the proof among moving obstacles."""
     motion, proof = certificate.motion, certificate.moving
     if not problem.moving or not isinstance(motion, Trajectory) or not (np.diff(motion.times) > 0).all():
         return
     if proof is None:
-        yield "proof: nothing is said of obstacles that move"
+        yield "proof: there is none among moving obstacles"
         return
     times = np.sort(np.concatenate([motion.times, certificate.between]), kind="stable")
     prover = MovingProver(problem.robot, problem.moving, configurations(motion, certificate.between), times)
     every, said = np.ones(len(proof.stretches.claim), bool), {"scene": certificate.scene_clearance}
-    yield from _of_proof(prover, proof, {"scene": every}, said)
+    yield from _bound_errors(prover, proof, {"scene": every}, said)
 
 
-def _of_proof(
-    prover: Prover, proof: Proof, kinds: dict[str, ndarray], said: dict[str, float]
+def _bound_errors(
+    prover: Prover, proof: StretchProof, kinds: dict[str, ndarray], said: dict[str, float]
 ) -> Iterator[str]:
-    """What is wrong with a proof that leaves so much of each kind of stretches."""
+    """Differences in stretches and bounds. `kinds` marks the stretches of each kind of clearance; `said`
+    holds the clearance that the proof states for each kind [m]."""
     stretches, known = proof.stretches, {claim: k for k, claim in enumerate(prover.claims)}
     for claim in proof.claims:
         if claim not in known:
-            yield f"proof: nothing is to be proved of {described(claim)}"
+            yield f"proof: {describe_claim(claim)} needs no proof"
             return
     for missing in known.keys() - set(proof.claims):
-        yield f"proof: nothing is said of {described(missing)}"
+        yield f"proof: {describe_claim(missing)} is missing"
     if len(set(proof.claims)) < len(proof.claims):
-        yield "proof: a claim is there twice"
+        yield "proof: it contains a claim twice"
         return
     gaps = list(_gaps(proof, float(len(prover.q) - 1)))
     if gaps or not len(stretches.claim):
@@ -131,7 +134,7 @@ def _of_proof(
     bounds = prover.bounds(stretches._replace(claim=own), proof.by_planes, list(proof.planes))
     for what in ("clearance", "displacement"):
         written, right = getattr(proof, what), getattr(bounds, what)
-        off = np.flatnonzero(np.abs(written - right) > AGREEMENT)
+        off = np.flatnonzero(np.abs(written - right) > BOUND_TOLERANCE)
         if len(off):
             i = int(off[0])
             more = f" ({len(off) - 1} more)" if len(off) > 1 else ""
@@ -140,8 +143,8 @@ def _of_proof(
     for what, which in kinds.items():
         least = said[what]
         if not least > 0:
-            yield f"proof: a {what} clearance of {least:g} m is none"
-        unproved = np.flatnonzero(which & (left < min(least, CAP) - AGREEMENT))
+            yield f"proof: its {what} clearance is {least:g} m, which is not positive"
+        unproved = np.flatnonzero(which & (left < min(least, CLEARANCE_CAP) - BOUND_TOLERANCE))
         if len(unproved):
             i = int(unproved[0])
             yield f"proof: {_place(proof, i)} is clear by {left[i]:.6f} m, not by {least:.6f} m"
@@ -151,26 +154,27 @@ def _of_proof(
             yield f"proof: {_place(proof, i)} is not shown to be free: {left[i]:.6f} m are left"
 
 
-def _gaps(proof: Proof, last: float) -> Iterator[str]:
-    """Where the stretches of a claim do not follow each other from the first row to the last."""
+def _gaps(proof: StretchProof, last: float) -> Iterator[str]:
+    """Gaps between the stretches of a claim, from the first row of the motion to the last."""
     stretches = proof.stretches
     for k, claim in enumerate(proof.claims):
         rows = np.flatnonzero(stretches.claim == k)
         start, stop = stretches.start[rows], stretches.stop[rows]
         edges = np.concatenate([[0.0], stop]), np.concatenate([start, [last]])
-        # without stretches a motion of one row has no gap, and yet nothing is said of it
+        # A motion of one row has no gap even without stretches, but then its row is not proved.
         empty = not len(rows)
         broken = np.flatnonzero((edges[0] != edges[1]) | np.append(stop < start, empty))
         if len(broken):
             low, high = (float(side[broken[0]]) for side in edges)
-            yield f"proof: nothing is said of {described(claim)} from row {low:g} to row {high:g}"
+            yield f"proof: {describe_claim(claim)} is missing from row {low:g} to row {high:g}"
 
 
-def described(claim: Claim) -> str:
+def describe_claim(claim: Claim) -> str:
+    """A claim in words: 'panda_link5 against the scene'."""
     return f"{claim.link} against {'the scene' if claim.against == SCENE else claim.against}"
 
 
-def _place(proof: Proof, i: int) -> str:
+def _place(proof: StretchProof, i: int) -> str:
     stretches = proof.stretches
     claim = proof.claims[int(stretches.claim[i])]
-    return f"{described(claim)} from row {stretches.start[i]:g} to row {stretches.stop[i]:g}"
+    return f"{describe_claim(claim)} from row {stretches.start[i]:g} to row {stretches.stop[i]:g}"

@@ -1,10 +1,10 @@
-"""Path constraints along a motion: the checker's own proof, from one configuration to the next.
+"""Bounds of path constraints from one configuration to the next: the checker's own proof.
 
-Between two configurations joints move by dq at constant rates. A frame's origin p then leaves the chord by
-at most an eighth of its second derivative, which is at most sum_jk |dq_j dq_k| L_max(j,k), L_k being the
-distance of p from axis k all along. The distance to a convex body is convex, so the greater of both ends and
-that bound it; an axis of the frame leaves its chord by at most (sum_j |dq_j|)² / 8; and an angle between
-orientations grows no faster than both turn.
+Between two configurations joints move by dq at constant rates. A frame's origin p then leaves the chord by at
+most an eighth of its second derivative, which is at most sum_jk |dq_j dq_k| L_max(j,k), where L_k bounds the
+distance of p from axis k all along. The distance to a convex body is a convex function, so it is bounded by
+its greater value at the two ends plus that deviation. An axis of the frame leaves its chord by at most (sum_j
+|dq_j|)² / 8, and the angle between two orientations grows no faster than the sum of their rotations.
 """
 
 from typing import NamedTuple
@@ -21,8 +21,8 @@ from robotdiffuse.problems.goals import JointGoal, poses_of
 from robotdiffuse.problems.problem import Problem
 
 
-class Kept(NamedTuple):
-    """What is said of one quantity of a constraint."""
+class ConstraintBound(NamedTuple):
+    """Upper bounds of one quantity of a constraint."""
 
     name: str
     limit: float
@@ -32,68 +32,69 @@ class Kept(NamedTuple):
 
 
 class _Body(NamedTuple):
-    """A box, without extent or without end along some of its axes."""
+    """A box whose half sizes may be 0 or infinite along some of its axes."""
 
     center: ndarray
     R: ndarray
     half: ndarray
 
     def distances(self, points: ndarray) -> ndarray:
-        """Negative within."""
+        """Signed distances of points [m], negative inside."""
         beyond = np.abs((points - self.center) @ self.R) - self.half
         return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
 
 
-class _Along(NamedTuple):
-    """A frame from each of n + 1 configurations to the next."""
+class _FrameMotion(NamedTuple):
+    """Motion of a frame from each of n + 1 configurations to the next."""
 
     p: Float[ndarray, "n1 3"]
     R: Float[ndarray, "n1 3 3"]
     turn: Float[ndarray, "n"]
-    """At most [rad], ..."""
+    """Upper bound of its rotation [rad]."""
     went: Float[ndarray, "n"]
-    """... the way of its origin [m], ..."""
+    """Upper bound of the path length of its origin [m]."""
     sag: Float[ndarray, "n"]
-    """... and how far that leaves the chord [m]."""
+    """Upper bound of the origin's distance from the chord [m]."""
     slack: Float[ndarray, "n"]
-    """What a joint off by 1 rad or m each moves the origin [m]."""
+    """Upper bound of the origin's displacement if every joint is off by 1 rad or 1 m [m]."""
     joints: int
+    """Number of joints that move the frame."""
 
 
-def kept(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[Kept]:
-    """Bounds along the straight lines through configurations, and along motions which those leave by at most
-    `chord`, each joint [rad] or [m]. Raises InputError for a line whose goal does not say one pose."""
+def constraint_bounds(problem: Problem, q: Float[ndarray, "n dof"], chord: float) -> list[ConstraintBound]:
+    """Bounds along straight lines through configurations, and along all motions within `chord` of these lines
+    in each joint [rad] or [m]. Raises InputError for a Cartesian line if the goal is not a single pose."""
     linkage = Linkage(problem.robot)
     q = q if len(q) > 1 else np.repeat(q, 2, axis=0)
     frames = {constraint.frame for constraint in problem.constraints}
     placed = linkage.place(q, *frames) if len(frames) == 1 else linkage.place(q)
     found = []
     for constraint in problem.constraints:
-        along = _along(linkage, placed, q, constraint.frame)
+        along = _frame_motion(linkage, placed, q, constraint.frame)
         name = f"{constraint.kind} of {constraint.frame}"
         if isinstance(constraint, AxisCone):
             cosines = along.R @ constraint.axis @ constraint.direction
             least = np.minimum(cosines[1:], cosines[:-1]) - along.turn**2 / 8
             bounds = np.arccos(np.clip(least, -1.0, 1.0)) + chord * along.joints
-            found.append(Kept(name, constraint.angle, bounds))
+            found.append(ConstraintBound(name, constraint.angle, bounds))
             continue
         if isinstance(constraint, CartesianLine):
-            T_start, T_goal = _ends(problem, linkage, constraint)
+            T_start, T_goal = _line_poses(problem, linkage, constraint)
             body = _segment(T_start[:3, 3], T_goal[:3, 3])
         else:
             body = _body(constraint)
         limit = 0.0 if isinstance(constraint, PositionBox) else constraint.tolerance
         apart = body.distances(along.p)
         bounds = np.maximum(apart[1:], apart[:-1]) + along.sag + chord * along.slack
-        found.append(Kept(name, limit, bounds))
+        found.append(ConstraintBound(name, limit, bounds))
         if isinstance(constraint, CartesianLine) and constraint.angle is not None:
-            bounds = _turned(along, T_start, T_goal, chord)
-            found.append(Kept(f"{name}, its angle", constraint.angle, bounds))
+            bounds = _angle_bounds(along, T_start, T_goal, chord)
+            found.append(ConstraintBound(f"{name}, its angle", constraint.angle, bounds))
     return found
 
 
-def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
-    """A line for each frame that is faster than its constraint allows, by more than a share, at some row."""
+def frame_speed_errors(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
+    """A line for each frame that exceeds its constraint's speed by more than a share `slack` at some row."""
     linkage, lines = Linkage(problem.robot), []
     for one in problem.constraints:
         if not isinstance(one, CartesianLine) or one.speed is None:
@@ -102,23 +103,23 @@ def too_fast(problem: Problem, motion: Trajectory, slack: float) -> list[str]:
         joints, rates = linkage.rates(postures, one.frame)
         speeds = np.linalg.norm((rates * motion.velocities[:, joints, None]).sum(axis=1), axis=1)
         if speeds.max() > one.speed * (1 + slack):
-            lines.append(f"motion: {one.frame} moves at {speeds.max():.4g} m/s, of {one.speed:g} allowed")
+            lines.append(f"motion: {one.frame} moves at {speeds.max():.4g} m/s; {one.speed:g} m/s is allowed")
     return lines
 
 
-def _along(linkage: Linkage, postures: Postures, q: ndarray, frame: str) -> _Along:
+def _frame_motion(linkage: Linkage, postures: Postures, q: ndarray, frame: str) -> _FrameMotion:
     T, (joints, rates) = postures.T[:, linkage.links.index(frame)], linkage.rates(postures, frame)
     step = np.abs(np.diff(q, axis=0))[:, joints]
     lengths = np.linalg.norm(rates[:-1], axis=2)
     went, sag = np.zeros(len(step)), np.zeros(len(step))
     for j in reversed(range(len(joints))):
         if not linkage.slides[joints[j]]:
-            lengths[:, j] += went  # what later joints have moved it
+            lengths[:, j] += went  # later joints may have moved it away by so much
         went = went + step[:, j] * lengths[:, j]
         before = step[:, :j].sum(axis=1)
         sag += lengths[:, j] * step[:, j] * (step[:, j] + 2 * before) / 8
     turn = step[:, ~linkage.slides[joints]].sum(axis=1)
-    return _Along(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), len(joints))
+    return _FrameMotion(T[:, :3, 3], T[:, :3, :3], turn, went, sag, lengths.sum(axis=1), len(joints))
 
 
 def _body(constraint: Constraint) -> _Body:
@@ -140,13 +141,13 @@ def _segment(start: ndarray, goal: ndarray) -> _Body:
 
 
 def _with_z(z: ndarray) -> Float[ndarray, "3 3"]:
-    """A rotation whose third column is a unit vector."""
+    """A rotation matrix with a given unit vector as its third column."""
     x = np.cross(z, np.eye(3)[int(np.abs(z).argmin())])
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _ends(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndarray, ndarray]:
+def _line_poses(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndarray, ndarray]:
     """T_base_frame at start and goal."""
     k = linkage.links.index(line.frame)
     start, goal = linkage.place(problem.start[None]).T[0], problem.goal
@@ -156,11 +157,12 @@ def _ends(problem: Problem, linkage: Linkage, line: CartesianLine) -> tuple[ndar
         other = linkage.links.index(pose.frame)
         if (linkage.moved[k] == linkage.moved[other]).all():
             return start[k], pose.T_base_frame @ np.linalg.inv(start[other]) @ start[k]
-    raise InputError(f"cartesian_line of {line.frame}: the goal does not say one pose of it")
+    raise InputError(f"cartesian_line of {line.frame}: the goal does not determine one pose of it")
 
 
-def _turned(along: _Along, T_start: ndarray, T_goal: ndarray, chord: float) -> ndarray:
-    """The angle from the orientation that belongs to the frame's share of the segment."""
+def _angle_bounds(along: _FrameMotion, T_start: ndarray, T_goal: ndarray, chord: float) -> ndarray:
+    """Bounds of the angle between the frame's orientation and the one interpolated at its place on the
+    line."""
     way = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(way))
     turn = _rotation_vector(T_goal[:3, :3] @ T_start[:3, :3].T)
@@ -170,7 +172,7 @@ def _turned(along: _Along, T_start: ndarray, T_goal: ndarray, chord: float) -> n
     K = cross_matrix(axis)
     angles = (share * whole)[:, None, None]
     wanted = (np.eye(3) + np.sin(angles) * K + (1 - np.cos(angles)) * (K @ K)) @ T_start[:3, :3]
-    # by the chord between rotations, which is exact near 0 too
+    # from the norm of the difference of rotations, which is accurate near 0 too
     chords = np.linalg.norm(along.R - wanted, axis=(1, 2))
     off = 2 * np.arcsin(np.clip(chords / np.sqrt(8), 0.0, 1.0))
     reach = whole / length

@@ -1,6 +1,6 @@
-"""Where links are, and how far they can go from there: the checker's own kinematics, in NumPy.
+"""The checker's own kinematics in NumPy: poses of links, and bounds on their displacement.
 
-It reads a robot's joints and nothing that searches or the validator make of them.
+It uses only a robot's joints, and nothing that planners or the validator derive from them.
 """
 
 from functools import cached_property
@@ -14,18 +14,18 @@ from robotdiffuse.robots.robot import Joint, Robot
 
 
 class Postures(NamedTuple):
-    """An arm at n configurations, in the frame of its base."""
+    """A robot at n configurations, in the base frame."""
 
     T: Float[ndarray, "n links 4 4"]
-    """Of `Linkage.links`."""
+    """Poses of `Linkage.links`."""
     origins: Float[ndarray, "n dof 3"]
-    """A point on the axis of each planned joint [m], ..."""
+    """A point on the axis of each planned joint [m]."""
     axes: Float[ndarray, "n dof 3"]
-    """... and its direction."""
+    """Unit direction of each planned joint's axis."""
 
 
 class Linkage:
-    """A robot as joints and links."""
+    """The joints and links of a robot."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -44,7 +44,8 @@ class Linkage:
         return np.stack([moved[link] for link in self.links])
 
     def place(self, q: Float[ndarray, "n dof"], link: str | None = None) -> Postures:
-        """The arm at configurations; with a link, nothing but what that hangs from, the rest at zeros."""
+        """Poses at configurations. With `link`, only the links between the base and that link; the rest is
+        0."""
         n, dof = len(q), len(self._planned)
         T, origins, axes = np.zeros((n, len(self.links), 4, 4)), np.zeros((n, dof, 3)), np.zeros((n, dof, 3))
         T[:, :, 3, 3], sines, rests = 1.0, np.sin(q).T[:, :, None, None], 1 - np.cos(q).T[:, :, None, None]
@@ -60,7 +61,7 @@ class Linkage:
             if j is not None:
                 origins[:, j], axes[:, j] = p, R @ (turn @ along)
             if j is not None and not self.slides[j]:
-                K = cross_matrix(along)  # of Rodrigues' formula
+                K = cross_matrix(along)  # for Rodrigues' formula
                 R = _times(R, turn) + sines[j] * _times(R, turn @ K) + rests[j] * _times(R, turn @ K @ K)
             else:
                 R = _times(R, turn)
@@ -72,7 +73,7 @@ class Linkage:
         return Postures(T, origins, axes)
 
     def _up_to(self, link: str) -> list[Joint]:
-        """Joints, parents first."""
+        """Joints from the base to a link, parents first."""
         found, above = list[Joint](), {joint.child: joint for joint in self.robot.joints}
         while link in above:
             found.append(above[link])
@@ -82,8 +83,7 @@ class Linkage:
     def rates(
         self, postures: Postures, link: str
     ) -> tuple[Int[ndarray, "joints"], Float[ndarray, "n joints 3"]]:
-        """The planned joints that move a link, and how far each moves its origin in 1 rad or m, to first
-        order [m]."""
+        """The planned joints that move a link, and the derivatives of its origin by each of them [m]."""
         k = self.links.index(link)
         joints = np.flatnonzero(self.moved[k])
         arms, axes = postures.T[:, k, None, :3, 3] - postures.origins[:, joints], postures.axes[:, joints]
@@ -98,12 +98,12 @@ class Linkage:
         moved: Bool[ndarray, "m dof"],
         spans: Float[ndarray, "n dof"],
     ) -> Float[ndarray, "m"]:
-        """How far any point of balls can go at most [m] when joints leave their postures by up to `spans`.
+        """Upper bound on the displacement of any point of balls [m] when joints move by up to `spans`.
 
-        Balls are given where they are in the postures of `rows`, and `moved` are the joints that move them,
-        seen from a body before these. The last joint is turned first: joint j turns a ball, which the later
-        ones have taken d away, on a circle of at most its distance from the axis plus d, so by at most
-        spans_j times that. Axes of earlier joints are still where they are in the posture.
+        Balls are given at their places in the postures of `rows`; `moved` marks the joints that move them,
+        seen from a body before these joints. Turning the last joint first, joint j moves a ball that later
+        joints have displaced by d on a circle of radius at most its distance from the axis plus d, so by at
+        most spans_j times that. Axes of earlier joints are still where they are in the posture.
         """
         went = np.zeros(len(rows))
         for j in reversed(range(len(self.slides))):
@@ -123,13 +123,14 @@ class Linkage:
         steps: Float[ndarray, "rows dof"],
         normals: Float[ndarray, "k 3"],
     ) -> Float[ndarray, "k v"]:
-        """How far points go against unit vectors at most [m], when joints leave their posture for anything on
-        the straight lines through `steps` from it; only the joints `moved_by`, each behind the one before,
-        count.
+        """Upper bound on the movement of points against unit vectors [m].
 
-        To first order a point goes along the normal as a linear function of the joints, whose least value is
-        at one of the steps. The rest is at most sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), where the joints'
-        second derivatives of the point, by j <= k, are at most its greatest distance L_k from axis k.
+        Joints move from their posture to anywhere on the straight lines through `steps`, which are
+        differences from it. Only the joints `moved_by` count, each behind the one before.
+
+        To first order a point's movement along the normal is a linear function of the joints, with its
+        minimum at one of the steps. The remainder is at most sum_k L_k D_k (D_k / 2 + sum_{j<k} D_j), because
+        the second derivative of the point by joints j <= k is at most its greatest distance L_k from axis k.
         """
         which, spans = moved_by.tolist(), np.abs(steps).max(axis=0)
         rates = np.cross(axes[which, None], points[None] - origins[which, None])
@@ -151,6 +152,7 @@ def _times(R: Float[ndarray, "n 3 3"], right: Float[ndarray, "3 m"]) -> Float[nd
 
 
 def cross_matrix(axis: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+    """The matrix of the cross product with a vector."""
     x, y, z = axis
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 

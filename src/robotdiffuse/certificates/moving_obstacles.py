@@ -1,7 +1,8 @@
-"""Clearances to obstacles that move, over stretches of a timed motion.
+"""Clearances to moving obstacles over stretches of a timed motion.
 
-A stretch is free of an obstacle if at its middle, in place and time, the clearance of the link's spheres is
-more than any point of the link and any of the obstacle can go from there until either end.
+A stretch is free of an obstacle if the clearance of the link's spheres in its middle, in place and time,
+exceeds the sum of the largest displacements of any point of the link and of the obstacle from there until
+either end.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.certificates.bounds import CAP, Bounds, Claim, Plane, Prover, Stretches
+from robotdiffuse.certificates.bounds import CLEARANCE_CAP, Bounds, Claim, Plane, Prover, Stretches
 from robotdiffuse.certificates.obstacles import Obstacles
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
@@ -19,7 +20,8 @@ from robotdiffuse.scenes.scene import Scene
 
 
 class MovingProver(Prover):
-    """Bounds for a robot among moving obstacles along straight lines through configurations at times."""
+    """Computes bounds for a robot among moving obstacles along straight lines through configurations at
+    times."""
 
     def __init__(
         self,
@@ -34,12 +36,12 @@ class MovingProver(Prover):
 
     @cached_property
     def claims(self) -> tuple[Claim, ...]:
-        """Moving links against each obstacle."""
+        """Each moving link against each obstacle."""
         links = [link for link in self.links if self._moved[self._of[link]].any()]
         return tuple(Claim(link, one.name) for link in links for one in self.moving)
 
     def bounds(self, stretches: Stretches, by_planes: ndarray, planes: list[Plane]) -> Bounds:
-        """What can be said of stretches, by spheres alone."""
+        """Bounds of stretches by the spheres; planes are not used."""
         middle = (stretches.start + stretches.stop) / 2
         spans = self.spans(stretches.start, stretches.stop, middle)
         postures = self.linkage.place(self.at(middle))
@@ -68,5 +70,5 @@ class MovingProver(Prover):
             local = np.einsum("nji,nj->ni", there[:, :3, :3], centers[balls] - there[:, :3, 3])
             stands = one.pose(float(one.track[0][0]))
             distances[balls] = self._shapes[i].distances(local @ stands[:3, :3].T + stands[:3, 3])[:, 0]
-        clearance = np.minimum(np.minimum.reduceat(distances - radii, first), CAP)
+        clearance = np.minimum(np.minimum.reduceat(distances - radii, first), CLEARANCE_CAP)
         return Bounds(clearance, np.maximum.reduceat(went, first) + obstacle)

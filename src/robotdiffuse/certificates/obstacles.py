@@ -1,4 +1,5 @@
-"""Distances of points to obstacles, and how far obstacles reach in a direction: the checker's own."""
+"""The checker's own geometry: distances of points to obstacles, and how far obstacles reach in a
+direction."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -12,18 +13,19 @@ from robotdiffuse.core.transforms import rotation_from_quaternion
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
-CAP = 1.0
-"""Clearances are not told apart beyond this [m]."""
-BEYOND = 0.2
-"""Elements of surfaces further from a part's ball than this [m] count as being there, and need no planes."""
-NEAR = 4.0
-"""Triangles further away than this many times their size count as balls."""
-MOST = 1_000_000
-"""Numbers in an array at a time."""
+CLEARANCE_CAP = 1.0
+"""Larger clearances are reported as this [m]."""
+PLANE_RANGE = 0.2
+"""Elements of surfaces further from a part's ball than this are taken to be at this distance, without planes
+[m]."""
+EXACT_TRIANGLE_RANGE = 4.0
+"""Triangles further away than this many times their size are replaced by balls around them."""
+MAX_ARRAY_SIZE = 1_000_000
+"""Numbers in a temporary array at most, about."""
 
 
 class Rounded(NamedTuple):
-    """The sum of a box, a disc about its z axis and a ball: a sphere, box, cylinder or capsule."""
+    """The Minkowski sum of a box, a disc about its z axis and a ball: a sphere, box, cylinder or capsule."""
 
     center: Float[ndarray, "3"]
     R: Float[ndarray, "3 3"]
@@ -32,20 +34,20 @@ class Rounded(NamedTuple):
     rounding: float
 
     def reach(self, n: Float[ndarray, "k 3"]) -> Float[ndarray, "k"]:
-        """The greatest n x of its points x, for unit vectors n."""
+        """The maximum of n · x over its points x, for unit vectors n (its support function)."""
         local = n @ self.R
         across = np.hypot(local[:, 0], local[:, 1])
         return n @ self.center + np.abs(local) @ self.half + self.disc * across + self.rounding
 
 
 class Surface(NamedTuple):
-    """Triangles, or points, each with a ball of a radius about all its points."""
+    """Triangles or points, inflated by a radius."""
 
     corners: Float[ndarray, "m 1|3 3"]
     radius: float
 
     def reach(self, n: Float[ndarray, "k 3"]) -> Float[ndarray, "m k"]:
-        """The same of each of its elements."""
+        """The same for each of its elements."""
         return (self.corners @ n.T).max(axis=1) + self.radius
 
 
@@ -53,13 +55,13 @@ class Obstacles:
     """The obstacles of a scene."""
 
     def __init__(self, scene: Scene) -> None:
-        """Raises InputError for a shape that certificates do not know."""
+        """Raises InputError for a shape that certificates do not support."""
         shapes = [s for s in scene.shapes if not (isinstance(s, PointCloud) and len(s.points) == 0)]
         self.names = tuple(shape.name for shape in shapes)
         self.bodies: tuple[Rounded | Surface, ...] = tuple(map(_body, shapes))
         rounded = [(i, body) for i, body in enumerate(self.bodies) if isinstance(body, Rounded)]
         self._at = np.array([i for i, _ in rounded], int)
-        # into the frames of all bodies at once
+        # to transform points into the frames of all bodies at once
         self._turns = np.concatenate([np.zeros((3, 0)), *(body.R for _, body in rounded)], axis=1)
         self._shifts = np.concatenate([np.zeros(0), *(body.center @ body.R for _, body in rounded)])
         self._half = np.array([body.half for _, body in rounded]).reshape(-1, 3)
@@ -68,27 +70,27 @@ class Obstacles:
         self._indices = {i: _Index(body) for i, body in enumerate(self.bodies) if isinstance(body, Surface)}
 
     def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n obstacles"]:
-        """How far points are from each obstacle [m], at most CAP; 0 or less inside."""
-        found = np.full((len(points), len(self.bodies)), CAP)
-        step = max(MOST // max(3 * len(self._at), 1), 1)
+        """Distances of points to each obstacle [m], at most CLEARANCE_CAP; 0 or less inside."""
+        found = np.full((len(points), len(self.bodies)), CLEARANCE_CAP)
+        step = max(MAX_ARRAY_SIZE // max(3 * len(self._at), 1), 1)
         for first in range(0, len(points), step):
             some = slice(first, first + step)
-            found[some, self._at] = np.minimum(self._to_rounded(points[some]), CAP)
+            found[some, self._at] = np.minimum(self._to_rounded(points[some]), CLEARANCE_CAP)
         for i, index in self._indices.items():
             found[:, i] = index.distances(points)
         return found
 
     def near(self, center: Float[ndarray, "3"], radius: float) -> tuple[Rounded | Surface, ...]:
-        """The bodies; of surfaces, at least the elements that come within BEYOND of a ball."""
+        """The bodies; a surface is reduced to elements near a ball, at least to those within PLANE_RANGE."""
         return tuple(
-            self._indices[i].near(center, radius + BEYOND) if isinstance(body, Surface) else body
+            self._indices[i].near(center, radius + PLANE_RANGE) if isinstance(body, Surface) else body
             for i, body in enumerate(self.bodies)
         )
 
     def _to_rounded(self, points: ndarray) -> ndarray:
         local = (points @ self._turns - self._shifts).reshape(len(points), -1, 3)
         out = np.maximum(np.abs(local) - self._half, 0.0)
-        # a disc: what is beyond the box across the axis, less its radius
+        # the disc: the distance from the box across the axis, less its radius
         across = np.maximum(np.hypot(out[..., 0], out[..., 1]) - self._disc, 0.0)
         return np.hypot(across, out[..., 2]) - self._rounding
 
@@ -116,43 +118,44 @@ def _body(shape: Shape) -> Rounded | Surface:
 
 
 class _Index:
-    """The elements of a surface by where they are."""
+    """A spatial index of the elements of a surface."""
 
     def __init__(self, surface: Surface) -> None:
-        from scipy.spatial import KDTree  # half of what importing the checker takes
+        from scipy.spatial import KDTree  # imported here: it would double the import time of the checker
 
         self.surface = surface
         self._classes = [(KDTree(middles), rows, size) for middles, rows, size in _by_size(surface.corners)]
 
     def distances(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        """To the nearest element [m], at most CAP: exactly where that is near, else to the ball around it."""
-        found = np.full(len(points), CAP)
+        """Distances to the nearest element [m], at most CLEARANCE_CAP: exact where it is near, else to a ball
+        around it."""
+        found = np.full(len(points), CLEARANCE_CAP)
         for tree, rows, size in self._classes:
             to_middle = tree.query(points)[0]
-            near = (to_middle <= NEAR * size) & (to_middle - size < found)
+            near = (to_middle <= EXACT_TRIANGLE_RANGE * size) & (to_middle - size < found)
             if len(self.surface.corners[0]) == 1:
                 near[:] = False
             found = np.where(near, found, np.minimum(found, to_middle - size))
             which = np.flatnonzero(near)
             within = tree.query_ball_point(points[which], to_middle[which] + size)
             counts = np.array([len(some) for some in within], int)
-            for some in np.array_split(np.arange(len(which)), counts.sum() * 9 // MOST + 1):
+            for some in np.array_split(np.arange(len(which)), counts.sum() * 9 // MAX_ARRAY_SIZE + 1):
                 if len(some):
                     of = np.repeat(which[some], counts[some])
                     triangles = self.surface.corners[rows[np.concatenate(within[some]).astype(int)]]
                     np.minimum.at(found, of, _to_triangles(points[of], triangles))
-        return np.minimum(found - self.surface.radius, CAP)
+        return np.minimum(found - self.surface.radius, CLEARANCE_CAP)
 
     def near(self, center: Float[ndarray, "3"], reach: float) -> Surface:
-        """Those that come within a distance of a point, and perhaps more."""
+        """The elements that come within a distance of a point, and possibly others."""
         reach += self.surface.radius
         found = [rows[tree.query_ball_point(center, reach + size)] for tree, rows, size in self._classes]
         return self.surface._replace(corners=self.surface.corners[np.sort(np.concatenate(found).astype(int))])
 
 
 def _by_size(corners: Float[ndarray, "m c 3"]) -> Iterator[tuple[ndarray, ndarray, float]]:
-    """Elements of about one size: their middles, their rows, and the radius of balls about the middles that
-    hold them."""
+    """Groups of elements of similar size: their middles, their rows, and the radius of balls about the
+    middles that contain them."""
     middles = corners.mean(axis=1)
     sizes = np.sqrt(((corners - middles[:, None]) ** 2).sum(axis=-1)).max(axis=1)
     octaves = np.ceil(np.log2(np.maximum(sizes, 1e-6))).astype(int)
@@ -162,7 +165,7 @@ def _by_size(corners: Float[ndarray, "m c 3"]) -> Iterator[tuple[ndarray, ndarra
 
 
 def _to_triangles(p: Float[ndarray, "n 3"], triangles: Float[ndarray, "n 3 3"]) -> Float[ndarray, "n"]:
-    """From each point to its triangle: to the plane if the foot is within, else to an edge."""
+    """Distances of points to one triangle each: to its plane if the foot point is inside, else to an edge."""
     a, b, c = np.moveaxis(triangles, 1, 0)
     normal = np.cross(b - a, c - a)
     area = np.sqrt((normal**2).sum(axis=1))

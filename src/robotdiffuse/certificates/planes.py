@@ -1,4 +1,4 @@
-"""Planes between convex bodies, by Coal's nearest points: what writing a certificate searches for."""
+"""Separating planes between convex bodies, from Coal's nearest points: the search part of writing a proof."""
 
 # Coal's Python module has no type information.
 # pyright: reportAttributeAccessIssue=false
@@ -16,10 +16,10 @@ from robotdiffuse.certificates.obstacles import Rounded, Surface
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.coal_geometry import coal_convex, coal_pose
 
-MOST_PLANES = 64
-"""Of a part and a surface: concave ones need several."""
+MAX_PLANES = 64
+"""Planes between a part and a surface at most; concave surfaces need several."""
 DECIMALS = 7
-"""Of normals."""
+"""Decimals of normals in files."""
 
 Normal = tuple[float, float, float]
 
@@ -27,11 +27,11 @@ Normal = tuple[float, float, float]
 class _Body(NamedTuple):
     geometry: coal.CollisionGeometry
     T: Float[ndarray, "4 4"]
-    """Where it stands in the frame of its link, or of the base."""
+    """Its pose in the frame of its link, or in the base frame."""
 
 
 class PlaneFinder:
-    """Finds planes for the stretches of a prover."""
+    """Finds separating planes for the stretches of a prover."""
 
     def __init__(self, prover: Prover) -> None:
         self.prover = prover
@@ -41,7 +41,8 @@ class PlaneFinder:
         )
 
     def planes(self, todo: Stretches, rows: ndarray, needed: Float[ndarray, "rows"]) -> list[Plane]:
-        """For the stretches of these rows: planes that leave gaps of what is needed [m], where there are."""
+        """Planes for the stretches of these rows; pairs of bodies with balls further apart than `needed` [m]
+        need none, and bodies that touch have none."""
         prover = self.prover
         middle = (todo.start[rows] + todo.stop[rows]) / 2
         postures = prover.linkage.place(prover.at(middle))
@@ -77,11 +78,12 @@ class PlaneFinder:
 
 
 def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterator[Normal]:
-    """Planes so that one of them parts each element that is near: that of the nearest, of the next, ..."""
+    """Planes that together separate all near elements of a surface by `needed`, starting with the nearest
+    one."""
     shown = np.full(len(surface.corners), -np.inf)
     order = np.argsort(np.sqrt(((surface.corners - part.center) ** 2).sum(axis=-1)).min(axis=1))
     asked = np.zeros(len(order), bool)
-    for _ in range(MOST_PLANES):
+    for _ in range(MAX_PLANES):
         left = order[(shown[order] < needed) & ~asked[order]]
         if not len(left):
             return
@@ -100,7 +102,7 @@ def _around(first: _Body, part: Part, surface: Surface, needed: float) -> Iterat
 
 
 def _normal(first: _Body, second: _Body) -> Normal | None:
-    """From the nearest point of the second to that of the first; None if they touch."""
+    """Unit vector from the nearest point of the second body to that of the first; None if they touch."""
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     coal.distance(first.geometry, coal_pose(first.T), second.geometry, coal_pose(second.T), request, result)
     between = np.asarray(result.getNearestPoint1()) - np.asarray(result.getNearestPoint2())

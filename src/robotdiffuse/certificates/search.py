@@ -1,8 +1,8 @@
-"""Writing certificates: the search for a proof that the checker can re-check without one.
+"""The search for a proof, which the checker can re-check without a search.
 
-A motion that the validator calls valid is cut, for each claim apart, until every stretch is proved by the bounds
-that the checker uses. Where spheres are too coarse, planes are laid through the middle between the nearest
-points of convex bodies, which Coal finds.
+For each claim, a motion that the validator accepts is split until every stretch is proved by the checker's
+own bounds. Where spheres are too coarse, planes between the nearest points of convex bodies, which Coal
+finds, prove it.
 """
 
 from dataclasses import replace
@@ -12,66 +12,72 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.certificates.bounds import CAP, SCENE, Plane, Prover, Stretches
+from robotdiffuse.certificates.bounds import CLEARANCE_CAP, SCENE, Plane, Prover, Stretches
+from robotdiffuse.certificates.certificate import Certificate
 from robotdiffuse.certificates.checker import hash_of
-from robotdiffuse.certificates.constraints import kept
-from robotdiffuse.certificates.content import request_parts, robot_parts, scene_parts
+from robotdiffuse.certificates.constraints import constraint_bounds
+from robotdiffuse.certificates.content_hashes import request_parts, robot_parts, scene_parts
 from robotdiffuse.certificates.moving_obstacles import MovingProver
 from robotdiffuse.certificates.planes import PlaneFinder
-from robotdiffuse.certificates.proof import DECIMALS, Certificate, Proof, Tolerances
-from robotdiffuse.certificates.requests import configurations, not_covered
-from robotdiffuse.certificates.torques import most_torques
+from robotdiffuse.certificates.proof import DECIMALS, StretchProof, Tolerances
+from robotdiffuse.certificates.requirements import configurations, not_covered
+from robotdiffuse.certificates.torques import torque_bounds
 from robotdiffuse.core.errors import InputError, check_type
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.validation.validator import DEFAULT, VerifySettings, check_motion, verify, verify_trajectory
 
-SHARE = 0.5
-"""Of the clearances that the validator certifies: what the certificate proves. More takes more stretches."""
-MOST_PARTS = 8
-"""A stretch is cut into at most this many at a time."""
+CLEARANCE_SHARE = 0.5
+"""The proof shows this share of the clearances that the validator certifies; a larger one needs more
+stretches."""
+MAX_SPLIT = 8
+"""A stretch is split into at most this many parts at a time."""
 PLANES_BELOW = 0.02
-"""Sphere clearance [m] below which planes are looked for: spheres stick out by about as much."""
-DISPLACED = 0.1
-"""Longest displacement of stretches that planes are looked for [m]."""
-SPARE = 2e-6
-"""What is left over at least, for rounding [m]."""
-MOST_STRETCHES = 200_000
+"""Sphere clearance below which planes are tried: the spheres stick out by about as much [m]."""
+PLANES_DISPLACEMENT = 0.1
+"""Largest displacement of stretches for which planes are tried [m]."""
+ROUNDING_RESERVE = 2e-6
+"""Clearance minus displacement exceeds what is proved by this, to absorb rounding [m]."""
+MAX_STRETCHES = 200_000
 PLACE_DECIMALS = 7
-HALVINGS = 20
-"""Of the way between two configurations until path constraints are shown to be kept there."""
+MAX_HALVINGS = 20
+"""Halvings of the way between two configurations at most, to prove path constraints or torques there."""
 
 
 class NotValidError(InputError):
-    """The motion is not valid, so that there is nothing to certify."""
+    """The motion is not valid, so it cannot be certified."""
 
 
 def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT) -> Certificate:
-    """A certificate for a motion that the validator calls valid.
+    """A certificate of a motion that the validator accepts with these settings.
 
-    Raises `NotValidError`, an InputError, with what the validator found if it does not; and InputError for
-    obstacles and requests that certificates do not know, and where no proof is found in reasonable size.
+    Raises `NotValidError`, an InputError, with the first violation if the validator rejects the motion.
+    Raises InputError for obstacles and requirements that certificates do not support, and if no proof of
+    reasonable size is found.
     """
     check_problem(problem)
     check_motion("motion", motion, (Path, Trajectory))
     check_type("settings", settings, VerifySettings, "VerifySettings")
-    beside = not_covered(problem, motion)
-    if beside:
-        raise InputError(
-            f"the problem has {', '.join(beside)}, which certificates do not prove anything about"
-        )
+    unsupported = not_covered(problem, motion)
+    if unsupported:
+        raise InputError(f"certificates prove nothing about {', '.join(unsupported)}, which the problem has")
     validator = verify_trajectory if isinstance(motion, Trajectory) else verify
     report = validator(problem, motion, settings)  # type: ignore[arg-type]
     if report.violation is not None:
         raise NotValidError(
             f"the motion is not valid: {report.violation.message} (at {report.violation.time:.3f})"
         )
-    least = {SCENE: SHARE * (report.scene_clearance or 0.0), "": SHARE * (report.self_clearance or 0.0)}
+    least = {
+        SCENE: CLEARANCE_SHARE * (report.scene_clearance or 0.0),
+        "": CLEARANCE_SHARE * (report.self_clearance or 0.0),
+    }
     tolerances = Tolerances(**{name: getattr(settings, name) for name in Tolerances.__dataclass_fields__})
     if problem.constraints:
         tolerances = replace(tolerances, chord=settings.constraint_chord)
-    between, bounds = _keeping(problem, motion, _between(motion, tolerances.chord), tolerances.chord)
-    looks, torques = _bearing(problem, motion, tolerances.rate_slack)
+    between, bounds = _prove_constraints(
+        problem, motion, _between(motion, tolerances.chord), tolerances.chord
+    )
+    samples, torques = _prove_torques(problem, motion, tolerances.rate_slack)
     q = configurations(motion, between)
     proof, left = _prove(Prover(problem.robot, problem.scene, q), least)
     moving = None
@@ -94,52 +100,52 @@ def certify(problem: Problem, motion: Path | Trajectory, settings: VerifySetting
         request_parts(problem),
         moving,
         bounds,
-        looks,
+        samples,
         torques,
     )
 
 
-def _keeping(
+def _prove_constraints(
     problem: Problem, motion: Path | Trajectory, between: Float[ndarray, "k"], chord: float
 ) -> tuple[Float[ndarray, "m"], tuple[tuple[str, float], ...]]:
-    """Times, or places of a path, between the rows from which to which all path constraints are shown to be
-    kept; and what they are at most."""
+    """Places between the rows (see `MotionProof.between`) from each of which to the next all path constraints
+    are proved, and upper bounds of the constraints' quantities."""
     if not problem.constraints:
         return between, ()
     timed = isinstance(motion, Trajectory)
     rows = motion.times if timed else np.arange(len(motion.positions), dtype=float)
-    for _ in range(HALVINGS):
-        shown = kept(problem, configurations(motion, between), chord)
+    for _ in range(MAX_HALVINGS):
+        shown = constraint_bounds(problem, configurations(motion, between), chord)
         open_ = np.any([one.bounds > one.limit for one in shown], axis=0)
         if not open_.any():
             return between, tuple((one.name, float(one.bounds.max())) for one in shown)
         at = np.sort(np.concatenate([rows, between]), kind="stable")
         more = (at[:-1] + at[1:])[open_[: len(at) - 1]] / 2
         between = np.sort(np.concatenate([between, more]))
-        if len(between) > MOST_STRETCHES:
+        if len(between) > MAX_STRETCHES:
             break
     raise InputError("no proof was found for the path constraints: the motion is too near to their limits")
 
 
-def _bearing(
+def _prove_torques(
     problem: Problem, motion: Path | Trajectory, slack: float
 ) -> tuple[Float[ndarray, "k"], tuple[tuple[str, float], ...]]:
-    """Times, or places of a path, between the rows from which to which all torques are shown to be within
-    their limits; and what they are at most."""
-    looks = np.zeros(0)
+    """Places between the rows (see `MotionProof.between`) from each of which to the next all torques are
+    proved to be within their limits, and upper bounds of the torques."""
+    samples = np.zeros(0)
     if problem.payload is None:
-        return looks, ()
+        return samples, ()
     timed = isinstance(motion, Trajectory)
     rows = motion.times if timed else np.arange(len(motion.positions), dtype=float)
-    for _ in range(HALVINGS):
-        most = most_torques(problem, motion, looks)
+    for _ in range(MAX_HALVINGS):
+        most = torque_bounds(problem, motion, samples)
         open_ = (most > problem.robot.effort * (1 + slack)).any(axis=1)
         if not open_.any():
-            return looks, tuple(zip(problem.robot.joint_names, most.max(axis=0).tolist(), strict=True))
-        at = np.sort(np.concatenate([rows, looks]))
-        if len(at) == 1 or len(at) > MOST_STRETCHES:
+            return samples, tuple(zip(problem.robot.joint_names, most.max(axis=0).tolist(), strict=True))
+        at = np.sort(np.concatenate([rows, samples]))
+        if len(at) == 1 or len(at) > MAX_STRETCHES:
             break
-        looks = np.sort(np.concatenate([looks, ((at[:-1] + at[1:]) / 2)[open_]]))
+        samples = np.sort(np.concatenate([samples, ((at[:-1] + at[1:]) / 2)[open_]]))
     raise InputError("no proof was found for the torques: the motion is too near to their limits")
 
 
@@ -148,12 +154,13 @@ def _record(problem: Problem) -> dict[str, object] | None:
 
     try:
         return problem_record(problem)
-    except InputError:  # a robot that only this program has
+    except InputError:  # a robot that was made in this program and has no file
         return None
 
 
 def _between(motion: Path | Trajectory, chord: float) -> Float[ndarray, "k"]:
-    """Times between the rows at which the cubics through them leave the straight lines by at most `chord`."""
+    """Times between the rows such that the cubics leave the straight lines between them by at most
+    `chord`."""
     if not isinstance(motion, Trajectory) or len(motion.times) < 2:
         return np.zeros(0)
     h = np.diff(motion.times)[:, None]
@@ -161,7 +168,7 @@ def _between(motion: Path | Trajectory, chord: float) -> Float[ndarray, "k"]:
     bend = np.maximum(np.abs(6 * mean - 4 * v0 - 2 * v1), np.abs(6 * mean - 2 * v0 - 4 * v1)) / h
     off = (bend * h**2 / 8).max(axis=1, initial=0.0)
     parts = np.maximum(np.ceil(np.sqrt(off / chord)), 1).astype(int)
-    if parts.sum() > MOST_STRETCHES:
+    if parts.sum() > MAX_STRETCHES:
         raise InputError("the motion bends too much between its rows to be certified; give more rows")
     within = [t + d * np.arange(1, n) / n for t, d, n in zip(motion.times, h[:, 0], parts, strict=False)]
     return np.concatenate([np.zeros(0), *within])
@@ -175,12 +182,13 @@ class _Found(NamedTuple):
     planes: list[Plane]
 
 
-def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, float]]:
-    """Stretches that are proved for all claims, and what is left over of each kind."""
+def _prove(prover: Prover, least: dict[str, float]) -> tuple[StretchProof, dict[str, float]]:
+    """A proof of all claims, and the clearance that it shows by kind (SCENE or ""); `least` is asked for
+    [m]."""
     count, last = len(prover.claims), float(len(prover.q) - 1)
     todo = Stretches(np.arange(count), np.zeros(count), np.full(count, last))
     against_scene = np.array([claim.against == SCENE for claim in prover.claims], bool)
-    targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + SPARE
+    targets = np.where(against_scene, least.get(SCENE, 0.0), least[""]) + ROUNDING_RESERVE
     in_time = isinstance(prover, MovingProver)
     tools = None if in_time else PlaneFinder(prover)
     done: list[_Found] = []
@@ -190,7 +198,11 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
         found = prover.bounds(todo, np.zeros(n, bool), [])
         clearance, displacement = _down(found.clearance), _up(found.displacement)
         by_planes, planes, target = np.zeros(n, bool), list[Plane](), targets[todo.claim]
-        close = (clearance - displacement < target) & (clearance < PLANES_BELOW) & (displacement < DISPLACED)
+        close = (
+            (clearance - displacement < target)
+            & (clearance < PLANES_BELOW)
+            & (displacement < PLANES_DISPLACEMENT)
+        )
         if tools is not None and close.any():
             rows = np.flatnonzero(close)
             planes = tools.planes(todo, rows, displacement[rows] + target[rows])
@@ -200,12 +212,12 @@ def _prove(prover: Prover, least: dict[str, float]) -> tuple[Proof, dict[str, fl
             chosen = by_planes[rows]
             clearance[rows[chosen]], displacement[rows[chosen]] = better[chosen], less[chosen]
         proved = clearance - displacement >= target
-        done.append(_kept(todo, proved, by_planes, clearance, displacement, planes))
+        done.append(_proved_part(todo, proved, by_planes, clearance, displacement, planes))
         total += n
-        if total > MOST_STRETCHES:
-            raise InputError(f"no proof of less than {MOST_STRETCHES:,} stretches was found for the motion")
+        if total > MAX_STRETCHES:
+            raise InputError(f"no proof of less than {MAX_STRETCHES:,} stretches was found for the motion")
         todo = _cut(todo, clearance, displacement, target, ~proved)
-    return _joined(prover, done)
+    return _join(prover, done)
 
 
 def _renumbered(planes: list[Plane], rows: ndarray) -> list[Plane]:
@@ -213,7 +225,7 @@ def _renumbered(planes: list[Plane], rows: ndarray) -> list[Plane]:
     return [plane._replace(stretch=number[plane.stretch]) for plane in planes]
 
 
-def _kept(
+def _proved_part(
     todo: Stretches,
     proved: ndarray,
     by_planes: ndarray,
@@ -233,11 +245,11 @@ def _kept(
 def _cut(
     todo: Stretches, clearance: ndarray, displacement: ndarray, target: ndarray, which: ndarray
 ) -> Stretches:
-    """Those that are not proved, in as many parts as their displacement asks for."""
-    spare = np.maximum(clearance - target, displacement / MOST_PARTS)
-    # where spheres are too near, until planes may help
-    asked = np.where(clearance < PLANES_BELOW, displacement / DISPLACED, 1.2 * displacement / spare)
-    parts = np.clip(np.ceil(asked), 2, MOST_PARTS).astype(int)
+    """The stretches that are not proved, each split into as many parts as its displacement requires."""
+    spare = np.maximum(clearance - target, displacement / MAX_SPLIT)
+    # where spheres are too coarse, parts are made short enough for planes
+    asked = np.where(clearance < PLANES_BELOW, displacement / PLANES_DISPLACEMENT, 1.2 * displacement / spare)
+    parts = np.clip(np.ceil(asked), 2, MAX_SPLIT).astype(int)
     claims, starts, stops = [], [], []
     for i in np.flatnonzero(which).tolist():
         low, high, n = float(todo.start[i]), float(todo.stop[i]), int(parts[i])
@@ -253,7 +265,7 @@ def _cut(
     return Stretches(np.concatenate(claims), np.concatenate(starts), np.concatenate(stops))
 
 
-def _joined(prover: Prover, done: list[_Found]) -> tuple[Proof, dict[str, float]]:
+def _join(prover: Prover, done: list[_Found]) -> tuple[StretchProof, dict[str, float]]:
     claim, start, stop = (np.concatenate(parts) for parts in zip(*(f.stretches for f in done), strict=True))
     order = np.lexsort((start, claim))
     place = np.empty(len(order), int)
@@ -272,11 +284,11 @@ def _joined(prover: Prover, done: list[_Found]) -> tuple[Proof, dict[str, float]
     left = clearance - displacement
     of_scene = np.array([c.against == SCENE for c in prover.claims], bool)[stretches.claim]
     least = {
-        SCENE: float(_down(left[of_scene]).min(initial=CAP)),
-        "": float(_down(left[~of_scene]).min(initial=CAP)),
+        SCENE: float(_down(left[of_scene]).min(initial=CLEARANCE_CAP)),
+        "": float(_down(left[~of_scene]).min(initial=CLEARANCE_CAP)),
     }
     planes.sort()
-    proof = Proof(prover.claims, stretches, by_planes, clearance, displacement, tuple(planes))
+    proof = StretchProof(prover.claims, stretches, by_planes, clearance, displacement, tuple(planes))
     return proof, least
 
 

@@ -1,9 +1,10 @@
-"""Torques of a payload along a motion: the checker's own inverse dynamics and its proof from look to look.
+"""Torques of a payload along a motion: the checker's own inverse dynamics, and bounds between samples.
 
-Between two looks positions are cubics, or straight, velocities what these amount to, and accelerations lines
-between those of the rows. A torque then leaves its chord by at most an eighth of its greatest second
-derivative times the square of the time between. Torques are sums and products of vectors that turn with the
-links, so the product rule bounds that derivative by what links and joints do at most along the way.
+Samples are the rows of the motion and places between them. Between two samples, positions are cubics or
+straight lines, velocities their derivatives, and accelerations are interpolated linearly between the rows. A
+torque then leaves its chord by at most an eighth of its greatest second derivative times the square of the
+time between. Torques are sums and products of vectors that rotate with the links, so the product rule bounds
+that derivative by bounds on the motion of links and joints.
 """
 
 from typing import NamedTuple
@@ -19,12 +20,12 @@ from robotdiffuse.robots.inertias import Inertia
 
 GRAVITY = 9.81
 """Along -z of the world [m/s²]."""
-ALMOST = 1e-9
-"""Lightest mass that counts [kg]."""
+MIN_MASS = 1e-9
+"""Smaller masses are ignored [kg]."""
 
 
 class Bound(NamedTuple):
-    """Of the length of vectors, or the size of numbers, and of their first two derivatives."""
+    """Upper bounds of the norm of vectors, or the size of numbers, and of their first two derivatives."""
 
     size: ndarray
     first: ndarray
@@ -42,43 +43,47 @@ class Bound(NamedTuple):
 
 
 class States(NamedTuple):
-    """At looks; and bounds [m, dof] by time, of paths by the share, from each look to the next."""
+    """A motion at n samples, and bounds [m, dof] from each sample to the next, with derivatives by time (of
+    paths, by the share of the way)."""
 
     q: Float[ndarray, "n dof"]
     v: Float[ndarray, "n dof"]
     a: Float[ndarray, "n dof"]
-    lasts: Float[ndarray, "m"]
-    """From look to look [s]; 1 for a path."""
+    durations: Float[ndarray, "m"]
+    """Time from each sample to the next [s]; 1 for a path."""
     places: Bound
     """Of positions."""
     speeds: Bound
-    """Of velocities; 0 where configurations are held."""
+    """Of velocities; 0 for a path, whose configurations are at rest."""
     pulls: Bound
     """Of accelerations."""
 
 
-def most_torques(
-    problem: Problem, motion: Path | Trajectory, looks: Float[ndarray, "k"]
+def torque_bounds(
+    problem: Problem, motion: Path | Trajectory, samples: Float[ndarray, "k"]
 ) -> Float[ndarray, "m dof"]:
-    """What each joint bears at most from each look to the next [N m] or [N]. Looks are the rows and, between
-    them, further times, or places of a path: rows plus shares."""
-    states = _states(motion, looks)
+    """Upper bounds of each joint's torque from each sample to the next [N m] or [N].
+
+    Samples are the rows and, between them, `samples`: times, or for a path rows plus shares of the way to the
+    next.
+    """
+    states = _states(motion, samples)
     torques = np.abs(inverse_dynamics(problem, states.q, states.v, states.a))
-    bends = _bends(problem, states)
-    return np.maximum(torques[:-1], torques[1:]) + bends * states.lasts[:, None] ** 2 / 8
+    second_derivatives = _second_derivative_bounds(problem, states)
+    return np.maximum(torques[:-1], torques[1:]) + second_derivatives * states.durations[:, None] ** 2 / 8
 
 
-def _states(motion: Path | Trajectory, looks: Float[ndarray, "k"]) -> States:
+def _states(motion: Path | Trajectory, samples: Float[ndarray, "k"]) -> States:
     if not isinstance(motion, Trajectory) or len(motion.times) == 1:
-        return _held(motion.positions, looks)
+        return _static_states(motion.positions, samples)
     times, h = motion.times, np.diff(motion.times)[:, None]
-    at = np.sort(np.concatenate([times, looks]))
+    at = np.sort(np.concatenate([times, samples]))
     row = np.clip(np.searchsorted(times, at, side="right") - 1, 0, len(times) - 2)
     u = (at - times[row])[:, None] / h[row]
     rows = motion.positions, motion.velocities, motion.accelerations
     (q0, v0, a0), (q1, v1, a1) = ([of[:-1] for of in rows], [of[1:] for of in rows])
     mean = (q1 - q0) / h
-    # Hermite's basis, its derivative, and both derivatives of that, of which the first is linear
+    # Hermite's basis, its derivative, and bounds of both derivatives of that, of which the first is linear
     q = (1 - u) ** 2 * ((1 + 2 * u) * q0[row] + h[row] * u * v0[row])
     q += u**2 * ((3 - 2 * u) * q1[row] - h[row] * (1 - u) * v1[row])
     v = 6 * u * (1 - u) * mean[row] + (1 - u) * (1 - 3 * u) * v0[row] + u * (3 * u - 2) * v1[row]
@@ -99,9 +104,9 @@ def _states(motion: Path | Trajectory, looks: Float[ndarray, "k"]) -> States:
     )
 
 
-def _held(positions: Float[ndarray, "n dof"], looks: Float[ndarray, "k"]) -> States:
+def _static_states(positions: Float[ndarray, "n dof"], samples: Float[ndarray, "k"]) -> States:
     rows = np.arange(len(positions))
-    at = np.sort(np.concatenate([rows, looks]))
+    at = np.sort(np.concatenate([rows, samples]))
     q = np.column_stack([np.interp(at, rows, joint) for joint in positions.T])
     q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
     step = np.abs(np.diff(q, axis=0))
@@ -113,7 +118,7 @@ def _held(positions: Float[ndarray, "n dof"], looks: Float[ndarray, "k"]) -> Sta
 def inverse_dynamics(
     problem: Problem, q: Float[ndarray, "n dof"], v: Float[ndarray, "n dof"], a: Float[ndarray, "n dof"]
 ) -> Float[ndarray, "n dof"]:
-    """Torques by Newton's and Euler's equations for each link, in the frame of the base."""
+    """Torques [n, dof] by the Newton-Euler equations of each link, in the base frame [N m] or [N]."""
     robot, linkage = problem.robot, Linkage(problem.robot)
     postures, number = linkage.place(q), {joint.name: j for j, joint in enumerate(robot.planned_joints)}
     T = {link: postures.T[:, k] for k, link in enumerate(linkage.links)}
@@ -132,7 +137,7 @@ def inverse_dynamics(
             else:
                 w, dw = w + along, dw + bent + np.cross(w, along)
         turning[joint.child] = w, dw, pull
-    carried = _carried(problem)
+    carried = _masses(problem)
     force, moment = ({link: still for link in linkage.links} for _ in range(2))
     torques = np.empty_like(q)
     for joint in reversed(robot.joints):
@@ -155,11 +160,12 @@ def inverse_dynamics(
     return torques
 
 
-def _bends(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
-    """Second derivatives of torques at most, from each look to the next: the same equations in bounds."""
+def _second_derivative_bounds(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
+    """Upper bounds on the second derivatives of torques from each sample to the next: the same equations on
+    bounds."""
     robot, linkage = problem.robot, Linkage(problem.robot)
     number = {joint.name: j for j, joint in enumerate(robot.planned_joints)}
-    none = np.zeros(len(states.lasts))
+    none = np.zeros(len(states.durations))
     still = Bound(none, none, none)
     turning = {robot.base: (still, still, still, Bound(none + GRAVITY, none, none))}
     axes, arms = dict[str, Bound](), dict[str, Bound]()
@@ -167,7 +173,7 @@ def _bends(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
         seen, w, dw, pull = turning[joint.parent]
         held = joint.motion(robot.locked.get(joint.name, 0.0)) if joint.name not in number else np.eye(4)
         reach = float(np.linalg.norm((joint.T_parent_joint @ held)[:3, 3]))
-        axis, arm = _turned(1.0, seen), _turned(reach, seen)
+        axis, arm = _rotating(1.0, seen), _rotating(reach, seen)
         j = number.get(joint.name)
         if j is None:
             pull = pull + dw * arm + w * (w * arm)
@@ -181,14 +187,14 @@ def _bends(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
                 pull = pull + dw * arm + w * (w * arm)
                 seen, w, dw = seen + rate, w + along, dw + bent * axis + w * along
         turning[joint.child], axes[joint.child], arms[joint.child] = (seen, w, dw, pull), axis, arm
-    carried = _carried(problem)
+    carried = _masses(problem)
     force, moment = ({link: still for link in linkage.links} for _ in range(2))
-    bends = np.empty((len(none), robot.dof))
+    second_derivatives = np.empty((len(none), robot.dof))
     for joint in reversed(robot.joints):
         link, (seen, w, dw, pull) = joint.child, turning[joint.child]
         for body in carried.get(link, ()):
             arm, most = (
-                _turned(float(np.linalg.norm(body.com)), seen),
+                _rotating(float(np.linalg.norm(body.com)), seen),
                 float(np.linalg.eigvalsh(body.moments)[-1]),
             )
             inertia = Bound(none + most, 2 * most * seen.size, most * (2 * seen.first + 4 * seen.size**2))
@@ -197,22 +203,24 @@ def _bends(problem: Problem, states: States) -> Float[ndarray, "m dof"]:
             moment[link] = moment[link] + inertia * dw + w * (inertia * w) + arm * own
         j = number.get(joint.name)
         if j is not None:
-            bends[:, j] = (axes[link] * (force[link] if linkage.slides[j] else moment[link])).second
+            second_derivatives[:, j] = (
+                axes[link] * (force[link] if linkage.slides[j] else moment[link])
+            ).second
         force[joint.parent] = force[joint.parent] + force[link]
         moment[joint.parent] = moment[joint.parent] + moment[link] + arms[link] * force[link]
-    return bends
+    return second_derivatives
 
 
-def _turned(length: float, seen: Bound) -> Bound:
-    """A vector of a link, which turns with it as it is seen."""
+def _rotating(length: float, seen: Bound) -> Bound:
+    """Bounds of a vector of constant length that rotates with a link whose rotation is bounded by `seen`."""
     return Bound(length + 0 * seen.size, length * seen.size, length * (seen.first + seen.size**2))
 
 
-def _carried(problem: Problem) -> dict[str, list[Inertia]]:
-    """What each link weighs, and the payload."""
+def _masses(problem: Problem) -> dict[str, list[Inertia]]:
+    """The inertias of each link, with the payload's."""
     payload, found = problem.payload, {link: [of] for link, of in problem.robot.inertias.items()}
     assert payload is not None
-    if payload.mass > ALMOST:
+    if payload.mass > MIN_MASS:
         link = payload.link or problem.robot.tip
         found.setdefault(link, []).append(Inertia(payload.mass, payload.com, np.diag(payload.moments)))
     return found

@@ -1,4 +1,5 @@
-"""Collision checking: the compiled kernels, the differentiable signed distance, and the exact meshes."""
+"""Collision checking: compiled kernels, exact meshes, motion certificates and differentiable signed
+distances."""
 
 from robotdiffuse.collision.checker import CollisionChecker
 

@@ -1,5 +1,5 @@
-"""Link clearances of many configurations in as many packed scenes, and gradients: the denoiser's input in
-training."""
+"""Link clearances and their gradients for batches of configurations, each batch entry in a packed scene of
+its own: network inputs of the denoiser in training."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,7 @@ from jaxtyping import Float32
 from numba import njit
 from numpy import ndarray
 
-from robotdiffuse.collision.kernel_arrays import BOX_SLACK, NO_BOX, RobotArrays, SceneArrays, compile_scene
+from robotdiffuse.collision.kernel_arrays import BOX_SLACK, EMPTY_BOX, RobotArrays, SceneArrays, compile_scene
 from robotdiffuse.collision.kernels.clearance_gradients import clearances_and_gradients_into
 from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_clearance import clearances_into, make_clearance_workspace
@@ -17,12 +17,13 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.scene_arrays import BOX, SPHERE, PackedScenes
 from robotdiffuse.scenes.shapes import Box
 
-_ZERO, _ONE, _FAR = np.float32(0.0), np.float32(1.0), np.float32(NO_BOX[0, 0])
+_ZERO, _ONE, _NO_BOX_CORNER = np.float32(0.0), np.float32(1.0), np.float32(EMPTY_BOX[0, 0])
 
 
 @allocation_free()
 def _unpack(kinds, params, spheres, boxes):
-    """Writes the rows of SceneArrays; returns how many spheres and boxes there are."""
+    """Writes the spheres and boxes of a packed scene as rows of SceneArrays; returns how many there are of
+    each."""
     n, m = 0, 0
     for k in range(len(kinds)):
         p = params[k]
@@ -56,17 +57,17 @@ def _unpack(kinds, params, spheres, boxes):
 
 
 class _Rows(NamedTuple):
-    """Room for the rows of SceneArrays, for one scene after the other."""
+    """Memory for rows of SceneArrays, which is reused for one scene after the other."""
 
     spheres: ndarray
     boxes: ndarray
     solids: ndarray
-    around: ndarray
+    solid_boxes: ndarray
 
 
 @njit(cache=True)
 def _make_rows(obstacles):
-    """For so many obstacles and a floor."""
+    """Memory for so many obstacles and a floor."""
     return _Rows(
         np.empty((obstacles, 4), np.float32),
         np.empty((obstacles + 1, 15), np.float32),
@@ -77,11 +78,12 @@ def _make_rows(obstacles):
 
 @njit(cache=True)
 def _join(spheres, boxes, solids, around):
-    """Writes what `arrays._solids` makes of these; returns how many rows of 16 boxes there are."""
+    """Writes what `kernel_arrays._solids` computes from spheres and boxes; returns the number of rows of
+    `around`, each of 16 bounding boxes."""
     n, total = len(spheres), len(spheres) + len(boxes)
     solids[:total] = _ZERO
     rows = (total + W - 1) // W
-    around[:rows, : 3 * W], around[:rows, 3 * W :] = _FAR, -_FAR
+    around[:rows, : 3 * W], around[:rows, 3 * W :] = _NO_BOX_CORNER, -_NO_BOX_CORNER
     for k in range(total):
         solid = solids[k]
         if k < n:
@@ -101,21 +103,22 @@ def _join(spheres, boxes, solids, around):
 
 @njit(cache=True)
 def _scene(empty, floors, floor, kinds, params, rows):
-    """A packed scene with its floor, one of `floors`, first of the boxes, in these rows."""
+    """The SceneArrays of a packed scene, in the memory `rows`; its floor, one of `floors`, is the first
+    box."""
     fixed = 0
     if floor >= 0:
         rows.boxes[0] = floors[floor]
         fixed = 1
     n, m = _unpack(kinds, params, rows.spheres, rows.boxes[fixed:])
     spheres, boxes = rows.spheres[:n], rows.boxes[: fixed + m]
-    sixteens = _join(spheres, boxes, rows.solids, rows.around)
+    sixteens = _join(spheres, boxes, rows.solids, rows.solid_boxes)
     return SceneArrays(
         spheres,
         boxes,
         empty.cylinders,
         empty.capsules,
         rows.solids[: n + fixed + m],
-        rows.around[:sixteens],
+        rows.solid_boxes[:sixteens],
         empty.points,
         empty.point_rows,
         empty.cell_first,
@@ -154,7 +157,10 @@ def packed_link_clearances(
     robot: RobotArrays, scenes: PackedScenes, q: Float32[ndarray, "batch frames dof"], limit: float
 ) -> Float32[ndarray, "batch frames links"]:
     """Signed distances of the moving links to obstacles and floor of each sample's own scene [m], at most
-    `limit`. `robot` comes from `compile_robot`."""
+    `limit`.
+
+    `robot` comes from `compile_robot`.
+    """
     return _packed_link_clearances(robot, *_arrays(scenes), q, np.float32(limit))
 
 
@@ -170,7 +176,7 @@ def packed_clearances_and_gradients(
 
 
 def _arrays(scenes: PackedScenes) -> tuple[SceneArrays, ndarray, ndarray, ndarray, ndarray]:
-    """No obstacle at all, the different floors, the floor of each scene or -1, kinds and params."""
+    """An empty scene, the distinct floors, the index of each scene's floor or -1, kinds and parameters."""
     kinds, params = (np.ascontiguousarray(array) for array in (scenes.kinds, scenes.params))
     floors = np.zeros((len(scenes), 6)) if scenes.floors is None else scenes.floors
     different, floor = np.unique(floors, axis=0, return_inverse=True)

@@ -13,15 +13,16 @@ from robotdiffuse.scenes.scene import Scene
 
 
 class CollisionChecker:
-    """Collision of covering spheres against the obstacles of a scene and between links.
+    """Checks the covering spheres of a robot for collision with a scene and between links.
 
-    The spheres cover the robot's meshes, so that what is called free is free. Links that no planned joint
-    moves are checked against other links alone, for no motion could change how they stand to the scene.
-    A mesh obstacle counts by its surface: the arm is one piece that starts outside, so it cannot get in.
+    The spheres cover the robot's meshes, so a configuration that is reported free is free. Links that no
+    planned joint moves are checked only against other links, since no motion changes their pose in the scene.
+    Of a mesh obstacle only the surface counts: the arm is connected and starts outside, so it cannot get
+    inside.
     """
 
     def __init__(self, robot: Robot, scene: Scene, padding: float = 0.0) -> None:
-        """`padding` [m] is added to the spheres' radii towards the scene."""
+        """`padding` [m] is added to the spheres' radii for checks against the scene."""
         self.robot, self.scene, self.padding = robot, scene, np.float32(padding)
         self.robot_arrays = compile_robot(robot)
         self.scene_arrays = compile_scene_for(robot, scene)
@@ -36,9 +37,9 @@ class CollisionChecker:
         return lane_collision.free_many(self.robot_arrays, self.scene_arrays, self._rows(q), self.padding)
 
     def link_clearances(self, q: Float[ndarray, "n dof"], limit: float = 1.0) -> Float[ndarray, "n links"]:
-        """Signed distance of each moving link to the scene [m], at most `limit`; the lower, the faster.
+        """Signed distance of each moving link to the scene [m], at most `limit`; a lower limit is faster.
 
-        Towards point clouds and meshes at most 0.3 m, and a lower bound beyond 0.1 m.
+        Distances to point clouds and meshes are at most 0.3 m, and lower bounds beyond 0.1 m.
         """
         arrays = self.robot_arrays, self.scene_arrays
         return lane_clearance.link_clearances(*arrays, self._rows(q), np.float32(limit)) - self.padding
@@ -46,10 +47,10 @@ class CollisionChecker:
     def clearances_and_gradients(
         self, q: Float[ndarray, "n dof"], limit: float, margin: float
     ) -> tuple[Float[ndarray, "n links"], Float[ndarray, "n dof"]]:
-        """`link_clearances`, and the gradients by the joints of how far the arm is too close [m/rad].
+        """`link_clearances`, and the gradient by the joints of the arm's violation of the margin [m/rad].
 
-        That is the root of the sum of h² over the covering spheres, with the hinge h = max(0, margin - D) on
-        their signed distances to the scene; 0 where no link is within the margin [m].
+        The violation is the root of the sum of h² over the covering spheres, with the hinge h = max(0, margin
+        - D) on their signed distances D to the scene; it is 0 where no link is within the margin [m].
         """
         links, gradients = clearance_gradients.clearances_and_gradients(
             self.robot_arrays,
@@ -62,14 +63,14 @@ class CollisionChecker:
 
     def pair_clearances(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n pairs"]:
         """Distance between the links of each checked pair [m], at most 1 m."""
-        return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), distance.CAP)
+        return lane_clearance.pair_clearances(self.robot_arrays, self._rows(q), distance.CLEARANCE_CAP)
 
     def cost_gradients(
         self, q: Float[ndarray, "n dof"], margin: float, self_margin: float = 0.01
     ) -> tuple[Float[ndarray, "n"], Float[ndarray, "n dof"]]:
-        """Collision cost of each configuration and its gradient: the paper's hinge, squared.
+        """Collision cost of each configuration and its gradient: the paper's hinge loss, squared.
 
-        `margin` and `self_margin` [m]: distances to obstacles and between links below which cost arises.
+        `margin` and `self_margin` [m]: distances to obstacles and between links below which there is a cost.
         """
         return lane_clearance.cost_gradients(
             self.robot_arrays,
@@ -80,7 +81,8 @@ class CollisionChecker:
         )
 
     def _rows(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
-        """Compiled code trusts its arguments, so they are looked at here."""
+        """Configurations as the kernels take them. Compiled code does not check its arguments, so this
+        does."""
         if q.shape[1] != self.robot.dof:
             raise InputError(f"q has {q.shape[1]} columns; it must have the {self.robot.dof} planned joints")
         if not np.isfinite(q).all():

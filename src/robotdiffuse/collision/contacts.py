@@ -1,4 +1,4 @@
-"""Every contact of a motion, not only the first: for people who ask what all is wrong with it."""
+"""All contacts of a motion, not only the first."""
 
 import numpy as np
 from jaxtyping import Float
@@ -8,35 +8,34 @@ from robotdiffuse.collision.convex_geometry import checks_of
 from robotdiffuse.collision.exact_meshes import Distance, ExactCollision
 from robotdiffuse.collision.kernels import motion_certificate as kernel
 from robotdiffuse.collision.kernels.motion_certificate import Motion
-from robotdiffuse.collision.motions import EPISODE_TRAVEL, Contact, ContinuousCollision
+from robotdiffuse.collision.motions import DEPTH_SAMPLE_TRAVEL, Contact, ContinuousCollision
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
-MOST_LOOKS = 5000
-"""Configurations at which contacts are followed."""
+MAX_CONFIGURATIONS = 5000
+"""Motion certificates at most in a search for contacts."""
 
 
 def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: float) -> list[Contact]:
-    """All contacts along straight lines through waypoints, in order, each from where two bodies come nearer
-    than `contact` [m] until they part.
+    """All contacts along straight lines through waypoints, in order.
 
-    Where nothing touches the certificate says so; while something does, all else is looked at every 1 cm of
-    motion.
+    A contact begins where two bodies come nearer than `contact` [m] and lasts until they separate. The motion
+    certificate finds the next contact; while there is one, distances are computed every 1 cm of motion.
     """
     validator, exact = ContinuousCollision(robot, scene, contact, 0.5), ExactCollision(robot, scene)
-    motion = Motion(for_kernels(q), kernel.way_along(q, validator.checks.levers))
-    end, at, found = float(motion.way[-1]), 0.0, list[Contact]()
-    for _ in range(MOST_LOOKS):
-        low = kernel.segment_at(motion.way, at)[0]
+    motion = Motion(for_kernels(q), kernel.travel_along(q, validator.checks.motion_radii))
+    end, at, found = float(motion.travel[-1]), 0.0, list[Contact]()
+    for _ in range(MAX_CONFIGURATIONS):
+        low = kernel.segment_at(motion.travel, at)[0]
         here = kernel.configurations(motion, np.array([at]))
         rest = np.concatenate([here, q[low + 1 :]])
         first = validator.sweep(rest).contact
         if first is None:
             break
-        # places in the rest, as rows and shares, to places on the way
+        # converts the place in `rest`, a row plus a share, to a place on the whole motion
         row, part = int(first.at), first.at - int(first.at)
-        ways = np.concatenate([[at], motion.way[low + 1 :]])
+        ways = np.concatenate([[at], motion.travel[low + 1 :]])
         at = float(ways[row] + part * (ways[min(row + 1, len(ways) - 1)] - ways[row]))
         at = _follow(exact, motion, at, contact, first, found)
         if at >= end:
@@ -47,15 +46,16 @@ def contacts(robot: Robot, scene: Scene, q: Float[ndarray, "n dof"], contact: fl
 def _follow(
     exact: ExactCollision, motion: Motion, at: float, contact: float, first: Contact, found: list[Contact]
 ) -> float:
-    """Adds the contacts from one on until the arm is free; where that is."""
+    """Adds the contacts from the given one until the arm is free to `found`; returns the place where it is
+    free."""
     checks = {(check.link, check.other): check for check in checks_of(exact.robot)}
     open_ones: dict[tuple[str, str | None, str], int] = {}
     begun = _place(motion, at)
     open_ones[first.check.link, first.check.other, first.other] = len(found)
     found.append(first._replace(at=begun))
-    end = float(motion.way[-1])
+    end = float(motion.travel[-1])
     while at < end:
-        at = min(at + EPISODE_TRAVEL, end)
+        at = min(at + DEPTH_SAMPLE_TRAVEL, end)
         q = kernel.configurations(motion, np.array([at]))[0]
         near = [d for d in (*exact.link_distances(q), *exact.pair_distances(q)) if d.distance <= contact]
         now = {_key(d, checks): d for d in near}
@@ -80,5 +80,6 @@ def _key(distance: Distance, checks: dict) -> tuple[str, str | None, str]:
 
 
 def _place(motion: Motion, at: float) -> float:
-    low, share = kernel.segment_at(motion.way, at)
+    """Waypoint index plus fraction of the segment."""
+    low, share = kernel.segment_at(motion.travel, at)
     return low + share

@@ -1,7 +1,7 @@
-"""The exact geometry of robots and scenes: convex parts of links, solids, and what is checked against what.
+"""The exact geometry of robots and scenes: convex parts of links, solids, and the pairs that are checked.
 
-Covering spheres play no part here, so that they can be tested against it. A link with spheres but without
-meshes is taken as its spheres.
+It does not use the covering spheres, so they can be tested against it. Only a link without meshes is
+represented by its spheres.
 """
 
 from functools import lru_cache
@@ -19,7 +19,7 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape
 
 
 class Check(NamedTuple):
-    """One thing to check: a link against the scene (`other` None), or two links against each other."""
+    """A collision check: a link against the scene (`other` is None), or two links against each other."""
 
     link: str
     other: str | None
@@ -29,22 +29,22 @@ class Check(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A convex part of a link, in the coordinates of the frame that the link is fixed to: the hull of
-    vertices, rounded."""
+    """A convex part of a link in the frame that the link is fixed to: a convex hull, inflated by
+    `rounding`."""
 
     frame: int
     vertices: Float[ndarray, "v 3"]
     faces: Int[ndarray, "f 3"]
-    """None of a ball, which has one vertex."""
+    """Empty for a ball, which has one vertex."""
     rounding: float
     center: Float[ndarray, "3"]
-    """Of a ball around the part."""
+    """Centre of a ball around the part."""
     radius: float
 
 
 class Solid(NamedTuple):
-    """A scene shape as the sum of a box, a disc around its z axis and a ball; or, with `bounds`, a surface or
-    a cloud of points within such a box."""
+    """A scene shape as the Minkowski sum of a box, a disc around its z axis and a ball. With `bounds`, the
+    sum only bounds a surface or point cloud."""
 
     shape: Shape
     T_base_box: Float[ndarray, "4 4"]
@@ -91,7 +91,7 @@ def checks_of(robot: Robot) -> tuple[Check, ...]:
 
 @once_per_robot
 def hulls_of(robot: Robot) -> tuple[Hulls, dict[str, range]]:
-    """What compiled code reads of the parts, and which of them are each link's."""
+    """The arrays of all parts for compiled code, and the range of each link's parts."""
     of_links, every = {}, list[Part]()
     for link, parts in parts_of(robot).items():
         of_links[link] = range(len(every), len(every) + len(parts))
@@ -109,12 +109,12 @@ def hulls_of(robot: Robot) -> tuple[Hulls, dict[str, range]]:
 
 @lru_cache(maxsize=16)
 def solids_of(scene: Scene) -> tuple[Solid, ...]:
-    """The obstacles of a scene; an empty point cloud is none."""
+    """The obstacles of a scene, without empty point clouds."""
     return tuple(solid for solid in map(_solid, scene.shapes) if solid is not None)
 
 
 def solid_arrays(solids: tuple[Solid, ...]) -> Solids:
-    """What compiled code reads of them."""
+    """The arrays of solids for compiled code."""
     T = np.array([solid.T_base_box for solid in solids]).reshape(-1, 4, 4)
     return Solids(
         np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),
@@ -152,7 +152,8 @@ def _bounded(shape: Shape, points: Float[ndarray, "n 3"], inflation: float) -> S
 
 
 def describe_contact(link: str, other: str, depth: float, itself: bool) -> str:
-    """'panda_link5 is 3.2 cm inside sphere_2', or for two links of the robot (`itself`) 'overlap by'."""
+    """A contact in words: 'panda_link5 is 3.2 cm inside sphere_2'; two links (`itself`) 'overlap by' a depth
+    [m]."""
     length = f"{depth * 100:.1f} cm" if depth >= 0.01 else f"{depth * 1000:.1f} mm"
     if depth < 5e-5:
         return f"{link} touches {other}"

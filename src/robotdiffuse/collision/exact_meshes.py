@@ -1,7 +1,7 @@
-"""Exact collision of the robot's convex meshes with the scene, by Coal: the geometry of the validator.
+"""Exact distances between the robot's convex meshes and the scene, by Coal: the validator's geometry.
 
-Covering spheres play no part here, so that they can be tested against it. A link with spheres but without
-meshes is taken as its spheres. Distances are signed [m]: negative inside, by penetration depth.
+It does not use the covering spheres, so they can be tested against it. Only a link without meshes is
+represented by its spheres. Distances are signed [m]: negative inside, by penetration depth.
 """
 
 # Coal's Python module has no type information.
@@ -35,16 +35,17 @@ from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
-CHUNK = 8192
-"""Configurations that `collides` treats at once; bounds its memory."""
-BEYOND = 1e-6
-"""A positive distance [m]: `collides` need not know any that is larger."""
-MOST_CONTACTS = 200
-"""Triangles or points of one obstacle that the depth of a link is looked for at; 1,000 take 5 ms."""
+CHUNK_SIZE = 8192
+"""Configurations that `collides` processes at once; bounds its memory."""
+CLEAR_DISTANCE = 1e-6
+"""`collides` does not compute distances beyond this [m]."""
+MAX_CONTACTS = 200
+"""Triangles or points of one obstacle at which the depth of a link is computed; 1,000 take 5 ms."""
 
 
 class Distance(NamedTuple):
-    """Signed distance [m] of a link to an obstacle or another link (`other`; None if there is none)."""
+    """Signed distance [m] of a link to the nearest obstacle or to another link; `other` is None if there is
+    none."""
 
     link: str
     other: str | None
@@ -52,26 +53,26 @@ class Distance(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """A convex part of a link as Coal has it."""
+    """A convex part of a link as a Coal object."""
 
     geometry: coal.CollisionGeometry
     frame: int
     T_frame_piece: Float[ndarray, "4 4"] | None
-    """None: the geometry is in frame coordinates already."""
+    """None if the geometry is given in the frame already."""
 
 
-TREE_SECONDS = 4e-6
-"""That a point or a triangle takes in Coal's tree, about [s]."""
+TREE_SECONDS_PER_ELEMENT = 4e-6
+"""Approximate time in which Coal adds a point or triangle to its tree [s]."""
 
 
 class _Obstacle(NamedTuple):
-    """A scene shape as Coal has it."""
+    """A scene shape as a Coal object."""
 
     name: str
     geometry: coal.CollisionGeometry
     T: coal.Transform3s
     surface: bool
-    """A triangle mesh or points rather than a solid."""
+    """Whether it is a triangle mesh or a point cloud rather than a solid."""
     inflation: float
     """The radius of each point of a point cloud [m]."""
 
@@ -95,7 +96,7 @@ def _pieces(robot: Robot) -> dict[str, tuple[_Piece, ...]]:
 
 @once_per_robot
 def _balls(robot: Robot) -> dict[str, tuple[int, ndarray, ndarray]]:
-    """Of the parts of each link: its frame, and the centres [k, 3] and radii [k] of balls around them."""
+    """For each link its frame, and the centres [k, 3] and radii [k] of balls around its parts."""
     return {
         link: (parts[0].frame, np.stack([p.center for p in parts]), np.array([p.radius for p in parts]))
         for link, parts in parts_of(robot).items()
@@ -130,20 +131,21 @@ def _obstacle(solid: Solid) -> _Obstacle:
 
 @lru_cache(maxsize=16)
 def _obstacles(scene: Scene) -> tuple[_Obstacle, ...]:
-    """Kept for a few scenes: the tree over 100,000 points takes half a second."""
+    """The Coal objects of a scene, cached: building the tree over 100,000 points takes half a second."""
     obstacles: list[_Obstacle] = []
     for solid in solids_of(scene):
         count, what = _surfaces(solid.shape)
         if count:
             check_time(
-                f"the validator's tree over the {count:,} {what} of {solid.shape.name}", TREE_SECONDS * count
+                f"the validator's tree over the {count:,} {what} of {solid.shape.name}",
+                TREE_SECONDS_PER_ELEMENT * count,
             )
         obstacles.append(_obstacle(solid))
     return tuple(obstacles)
 
 
 def _surfaces(shape: Shape) -> tuple[int, str]:
-    """How many surfaces Coal sorts into a tree, and what they are."""
+    """Number of elements in Coal's tree for a shape, and what they are; 0 for a solid."""
     if isinstance(shape, PointCloud):
         return len(shape.distinct_points), "points"
     return (len(shape.mesh.faces), "triangles") if isinstance(shape, Triangulated) else (0, "")
@@ -151,7 +153,7 @@ def _surfaces(shape: Shape) -> tuple[int, str]:
 
 @dataclass(frozen=True)
 class _Candidates:
-    """What a check consists of: pairs of a piece with an obstacle, or of two pieces."""
+    """The pairs of a check: pieces with obstacles, or pieces of two links."""
 
     firsts: tuple[_Piece, ...]
     seconds: tuple[_Piece | _Obstacle, ...]
@@ -163,10 +165,9 @@ class _Candidates:
 
 
 class ExactCollision:
-    """Signed distances and collision of a robot's exact meshes with a scene and with itself.
+    """Signed distances and collisions of a robot's exact meshes with a scene and with each other.
 
-    Links that no planned joint moves are checked against moving links only. Not safe for use by several
-    threads at once.
+    Links that no planned joint moves are checked only against moving links. Not thread-safe.
     """
 
     checks: tuple[Check, ...]
@@ -182,12 +183,12 @@ class ExactCollision:
         self._request.enable_signed_distance = True
         self._first_contact, self._contacts = coal.CollisionRequest(), coal.CollisionRequest()
         self._first_contact.enable_contact = self._contacts.enable_contact = True
-        self._contacts.num_max_contacts = MOST_CONTACTS
+        self._contacts.num_max_contacts = MAX_CONTACTS
         self._collide = coal.CollisionRequest()
 
     @cached_property
     def _boxes(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """Of the obstacles' boxes: R_box_base [o,3,3], centres [o,3], half sizes [o,3] and roundings [o]."""
+        """The obstacles' boxes: R_box_base [o,3,3], centres [o,3], half sizes [o,3] and roundings [o]."""
         T = np.stack([solid.T_base_box for solid in self._solids])
         return (
             np.ascontiguousarray(np.swapaxes(T[:, :3, :3], 1, 2)),
@@ -220,9 +221,10 @@ class ExactCollision:
     def _signed(
         self, piece: _Piece, other: _Piece | _Obstacle, frames: ndarray, cutoff: float, depth: bool
     ) -> float:
-        """Signed distance of two geometries; for a surface, any value of at least `cutoff` if beyond it.
+        """Signed distance of two geometries [m]; for a surface beyond `cutoff`, any value of at least
+        `cutoff`.
 
-        Without `depth`, one of a surface may be understated below zero, but its sign is right.
+        Without `depth`, the penetration of a surface may be too small, but the sign is right.
         """
         T_piece = self._place(piece, frames)
         result = coal.DistanceResult()
@@ -231,7 +233,8 @@ class ExactCollision:
             return coal.distance(piece.geometry, T_piece, other.geometry, T_other, self._request, result)
         if not other.surface:
             return coal.distance(piece.geometry, T_piece, other.geometry, other.T, self._request, result)
-        # The distance to a pierced surface is slow and stops at any one triangle, so contacts come first.
+        # Coal's distance to a surface that is penetrated is slow and uses any one triangle, so contacts come
+        # first.
         request, hits = self._contacts if depth else self._first_contact, coal.CollisionResult()
         coal.collide(piece.geometry, T_piece, other.geometry, other.T, request, hits)
         if hits.isCollision():
@@ -249,11 +252,11 @@ class ExactCollision:
         cutoffs: Float[ndarray, "n"],
         stop: float = -np.inf,
     ) -> tuple[Float[ndarray, "n"], list[str | None]]:
-        """Signed distance of one check (an index into `checks`) at each configuration, up to its cutoff.
+        """Signed distance of one check, an index into `checks`, at each configuration, at most its cutoff
+        [m].
 
-        Distances beyond the cutoff come back as the cutoff. Rows are treated in order, and none after the
-        first that is at most `stop`: those are NaN, and the depth of that one may be understated. Returns too
-        the name of the nearest obstacle or link, None beyond the cutoff.
+        Also returns the name of the nearest obstacle or link, None beyond the cutoff. Rows are processed in
+        order. If a distance is at most `stop`, all later ones are NaN, and its own depth may be too small.
         """
         frames = forward_frames(self.robot, q)
         distances = np.full(len(q), np.nan)
@@ -282,9 +285,11 @@ class ExactCollision:
         """Signed distance of every checked pair of links."""
         return self._all(q, range(len(self.links), len(self.checks)))
 
-    def distance_seen_from(self, link: str, q: Float[ndarray, "dof"], T: Float[ndarray, "4 4"]) -> float:
-        """Signed distance of a link to the nearest obstacle after the arm was moved by T, base and all [m]:
-        that to obstacles which moved the other way."""
+    def distance_from_moved_base(
+        self, link: str, q: Float[ndarray, "dof"], T: Float[ndarray, "4 4"]
+    ) -> float:
+        """Signed distance of a link to the nearest obstacle [m] if the whole robot, with its base, is moved
+        by T; that equals the distance to obstacles that move by the inverse of T."""
         frames = T @ forward_frames(self.robot, q[None])[0]
         others = self._obstacles
         return min(
@@ -304,7 +309,7 @@ class ExactCollision:
     def collides(self, q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
         """Whether each configuration touches the scene or itself."""
         return np.concatenate(
-            [np.zeros(0, bool), *(self._chunk(q[i : i + CHUNK]) for i in range(0, len(q), CHUNK))]
+            [np.zeros(0, bool), *(self._chunk(q[i : i + CHUNK_SIZE]) for i in range(0, len(q), CHUNK_SIZE))]
         )
 
     def _chunk(self, q: ndarray) -> ndarray:
@@ -319,7 +324,7 @@ class ExactCollision:
                     continue
                 piece, other = candidates.pair(column)
                 if isinstance(other, _Obstacle) and other.inflation > 0:
-                    hit[row] = self._signed(piece, other, frames[row], BEYOND, depth=False) <= 0
+                    hit[row] = self._signed(piece, other, frames[row], CLEAR_DISTANCE, depth=False) <= 0
                     continue
                 T_other = self._place(other, frames[row]) if isinstance(other, _Piece) else other.T
                 T_piece = self._place(piece, frames[row])
@@ -330,15 +335,15 @@ class ExactCollision:
 
 
 @once_per_robot
-def make_ready(robot: Robot) -> None:
-    """Make what Coal needs of a robot, and load it, so that no call with a short limit has to."""
+def warm_up(robot: Robot) -> None:
+    """Load Coal and build its objects of a robot now, so that no call with a short time limit has to."""
     explain_collision(robot, Scene([Sphere([0.0, 0.0, 100.0], 1.0)]), (robot.lower + robot.upper) / 2)
 
 
 def explain_collision(robot: Robot, scene: Scene, q: Float[ndarray, "dof"]) -> str | None:
-    """The deepest collision at a configuration in words, e.g. 'panda_link5 is 3.2 cm inside sphere_2'.
+    """The deepest collision at a configuration in words: 'panda_link5 is 3.2 cm inside sphere_2'.
 
-    None if the exact meshes are free.
+    None if the exact meshes are free of collision.
     """
     exact = ExactCollision(robot, scene)
     checks = (*exact.link_distances(q), *exact.pair_distances(q))

@@ -1,6 +1,6 @@
-"""Robot and scene as flat float32 arrays: the one form that both compiled kernels read.
+"""Robots and scenes as flat float32 arrays, the arguments of the compiled kernels.
 
-The arrays of a scene have the same types whatever the scene holds, so that no obstacle causes a compilation.
+The arrays of a scene have the same types whatever it contains, so that no obstacle causes a compilation.
 """
 
 from collections.abc import Sequence
@@ -12,8 +12,14 @@ import numpy as np
 from numpy import ndarray
 
 from robotdiffuse.collision.kernels.simd import W, by_sixteen
-from robotdiffuse.collision.point_cloud_grid import EMPTY, PointGrid, build_grid, cover, thin
-from robotdiffuse.collision.sphere_pair_tables import no_tables, tabulate
+from robotdiffuse.collision.point_cloud_grid import (
+    NO_SPHERES,
+    PointGrid,
+    build_grid,
+    cover_triangles,
+    thin_points,
+)
+from robotdiffuse.collision.sphere_pair_tables import build_pair_tables, no_tables
 from robotdiffuse.core.deadline import check_time
 from robotdiffuse.robots.joint_tables import JointTable
 from robotdiffuse.robots.motion_bounds import motion_radii
@@ -21,32 +27,33 @@ from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Sphere, Triangulated
 
-ROUNDING = 4e-7
-"""Obstacles grow by this share of their coordinates: more than float32 rounds off."""
+FLOAT32_ROUNDING = 4e-7
+"""Obstacles grow by this share of their coordinates, which is more than float32 rounding."""
 
 BOX_SLACK = 1e-6
-"""Boxes around obstacles grow by this, absolutely and relatively: more than rounding does."""
+"""Boxes around obstacles grow by this, absolutely [m] and relatively, which is more than rounding."""
 
-NO_BOX = np.repeat([[1e18, -1e18]], 3, axis=1)
+EMPTY_BOX = np.repeat([[1e18, -1e18]], 3, axis=1)
 """Lower and upper corner of a box that is far from everything [m]."""
 
 
 class RobotArrays(NamedTuple):
-    """Frames, spheres and pairs of a robot; groups are links with spheres, those of the fixed base first."""
+    """Frames, spheres and pairs of a robot. A group is a link with spheres; fixed links come first."""
 
     offsets: ndarray
-    """[dof, 13] rotation (row-major) and translation of `Robot.frame_offsets`; 1 where the joint slides."""
+    """[dof, 13] rotation (row-major) and translation of `Robot.frame_offsets`, and 1 for a prismatic joint,
+    else 0."""
     spheres: ndarray
     """[n, 4] x y z radius in the frame of the group."""
     first: ndarray
     """[groups + 1] first sphere of each group."""
     rows: ndarray
-    """[rows, 4 * 16] the spheres of each group by sixteen: x of all, y, z, radius; the
-    last one fills up."""
+    """[rows, 4 * 16] the spheres of each group in rows of sixteen: x of all, then y, z and radius. The last
+    sphere is repeated to fill a row."""
     row_bounds: ndarray
     """[rows, 4] a sphere around all spheres of the row."""
     row_sizes: ndarray
-    """[rows] spheres in the row, without what fills it up."""
+    """[rows] number of spheres in the row, without repetitions."""
     first_row: ndarray
     """[groups + 1] first row of each group."""
     frame: ndarray
@@ -54,15 +61,17 @@ class RobotArrays(NamedTuple):
     bounds: ndarray
     """[groups, 4] a sphere around all spheres of the group."""
     pairs: ndarray
-    """[pairs, 4] groups that are checked against each other, a row of `near` or -1, and a bit there."""
-    near: ndarray
-    """[tables, ...] where pairs close to each other along the arm may touch: see `near_pairs.py`."""
+    """[pairs, 4] two groups that are checked against each other, their row of `pair_tables` or -1, and their
+    bit."""
+    pair_tables: ndarray
+    """[tables, ...] joint values at which pairs may touch: see `sphere_pair_tables.py`."""
     parents: ndarray | None
-    """[dof] `Robot.parents`; None of a chain, for which code is compiled apart."""
+    """[dof] `Robot.parents`; None for a chain, for which the kernels are compiled separately."""
 
 
 class SceneArrays(NamedTuple):
-    """Obstacles by type. Oriented shapes: centre, world-to-shape rotation (row-major), three dimensions."""
+    """Obstacles by type. Rows of oriented shapes: centre, world-to-shape rotation (row-major), three
+    dimensions."""
 
     spheres: ndarray
     """[n, 4] centre, radius."""
@@ -73,35 +82,37 @@ class SceneArrays(NamedTuple):
     capsules: ndarray
     """[n, 15] ..., radius, half height, 0."""
     solids: ndarray
-    """[n, 17] all of these in one form: centre, rotation, half edges, a radius around, 1 if it is round about
-    its z axis between flat ends. The row of a cylinder has its radius for the first two half edges."""
-    around: ndarray
-    """[rows, 6 * 16] boxes around the solids by sixteen: low x of all, y, z, high x, y, z."""
+    """[n, 17] all of these in one format: centre, rotation, half edges, rounding radius, and 1 for a
+    cylinder, else 0. The first two half edges of a cylinder are its radius."""
+    solid_boxes: ndarray
+    """[rows, 6 * 16] axis-aligned boxes around the solids in rows of sixteen: low x of all, then low y, low
+    z, high x, high y and high z."""
     points: ndarray
     """[n, 4] centre, radius; sorted by cell."""
     point_rows: ndarray
-    """[rows, 4 * 16] the points by sixteen: x of all, y, z, radius; the
-    last one fills up."""
+    """[rows, 4 * 16] the points in rows of sixteen: x of all, then y, z and radius. The last one is
+    repeated."""
     cell_first: ndarray
     """[cells + 1] first point of each cell."""
     grid: ndarray
-    """[nx * ny * nz] distance from each voxel's centre to the nearest point's; beyond the band a bound."""
+    """[nx * ny * nz] distance from each voxel's centre to the nearest point's centre; beyond the band a lower
+    bound."""
     nearest: ndarray
-    """[nx * ny * nz] the point that is nearest to each voxel's centre, -1 beyond the band."""
+    """[nx * ny * nz] index of the point that is nearest to each voxel's centre, -1 far beyond the band."""
     grid_frame: ndarray
-    """[14] origin x y z, edges of voxel and cell, largest and least radius of a point, band; nx, ny, nz; the
-    numbers of cells."""
+    """[14] origin x y z; edges of voxel and cell; largest and smallest radius of a point; band; numbers of
+    voxels nx, ny, nz; numbers of cells."""
 
 
 def robot_groups(robot: Robot) -> tuple[str, ...]:
-    """Links with spheres: fixed ones first, then in tree order."""
+    """Links with spheres: fixed ones first, then in the order of the tree."""
     links = [link for link in robot.link_names if len(robot.spheres.get(link, ()))]
     return tuple(sorted(links, key=lambda link: robot.link_frame(link) > 0))
 
 
 @once_per_robot
 def compile_robot(robot: Robot) -> RobotArrays:
-    """The arrays of a robot with its joints locked as they are."""
+    """The arrays of a robot, with its locked joints at their values."""
     groups = robot_groups(robot)
     placed = [_placed_groups(robot)[link] for link in groups]
     spheres, clusters = [group.spheres for group in placed], [group.rows for group in placed]
@@ -115,28 +126,31 @@ def compile_robot(robot: Robot) -> RobotArrays:
         offsets=np.ascontiguousarray(offsets, np.float32),
         spheres=np.concatenate(spheres).astype(np.float32) if spheres else np.zeros((0, 4), np.float32),
         first=np.cumsum([0] + [len(s) for s in spheres]).astype(np.int32),
-        rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [EMPTY, *rows]]),
+        rows=np.concatenate([by_sixteen(row, row[-1:]) for row in [NO_SPHERES, *rows]]),
         row_bounds=np.array([row for group in placed for row in group.row_bounds], np.float32).reshape(-1, 4),
         row_sizes=np.array([len(row) for row in rows], np.int64),
         first_row=np.cumsum([0] + [len(of_group) for of_group in clusters]).astype(np.int32),
         frame=np.array([robot.link_frame(link) for link in groups], np.int32),
         bounds=np.array([group.bounds for group in placed], np.float32).reshape(-1, 4),
         pairs=np.array([(a, b, -1, 0) for a, b in pairs], np.int32).reshape(-1, 4),
-        near=no_tables(),
+        pair_tables=no_tables(),
         parents=robot.branching,
     )
     if not pairs:
         return arrays
     rows = [link for link in robot.link_names if link in robot.spheres]
-    levers = motion_radii(robot)[[rows.index(link) for link in groups]]
-    found, near = tabulate(arrays, robot.lower, robot.upper, levers, _known_tables(robot, pairs, groups))
-    return arrays._replace(pairs=found, near=near)
+    group_radii = motion_radii(robot)[[rows.index(link) for link in groups]]
+    found, tables = build_pair_tables(
+        arrays, robot.lower, robot.upper, group_radii, _known_tables(robot, pairs, groups)
+    )
+    return arrays._replace(pairs=found, pair_tables=tables)
 
 
 def _known_tables(
     robot: Robot, pairs: list[tuple[int, int]], groups: tuple[str, ...]
 ) -> dict[int, JointTable]:
-    """The robot's tables by the number of their pair, of pairs that still have those joints between them."""
+    """The robot's tables by index of the pair, for pairs that still have exactly the table's joints between
+    them."""
     number = {frozenset((groups[a], groups[b])): p for p, (a, b) in enumerate(pairs)}
     found = {}
     for table in robot.tables:
@@ -147,7 +161,7 @@ def _known_tables(
 
 
 class _Group(NamedTuple):
-    """The spheres of a link in its frame, whole and in rows, and spheres around them."""
+    """The spheres of a link in its frame, all together and in rows, and spheres around both."""
 
     spheres: ndarray
     rows: list[ndarray]
@@ -157,7 +171,7 @@ class _Group(NamedTuple):
 
 @once_per_robot
 def _placed_groups(robot: Robot) -> dict[str, _Group]:
-    """By link; of a robot that holds something, the arm's own are those of the arm."""
+    """The groups by link. A robot that holds something reuses those of the bare arm."""
     placed = {} if robot.bare is None else dict(_placed_groups(robot.bare))
     links = [link for link in robot_groups(robot) if link not in placed]
     whole, parts = [], []
@@ -175,7 +189,7 @@ def _placed_groups(robot: Robot) -> dict[str, _Group]:
 
 @once_per_robot
 def reach_bound(robot: Robot) -> float:
-    """What the distance of any sphere's surface from the base's origin never exceeds [m]."""
+    """Upper bound on the distance of any sphere's surface from the base's origin [m]."""
     lengths = np.linalg.norm(robot.frame_offsets[:, :3, 3], axis=1)
     slides = np.where(robot.prismatic, np.maximum(np.abs(robot.lower), np.abs(robot.upper)), 0.0)
     arrays = compile_robot(robot)
@@ -185,7 +199,7 @@ def reach_bound(robot: Robot) -> float:
 
 
 def _clusters(spheres: ndarray) -> list[ndarray]:
-    """Spheres in parts of at most sixteen: halves along the direction in which they extend most."""
+    """Spheres in parts of at most sixteen, by halving along the direction of largest extent."""
     if len(spheres) <= W:
         return [spheres]
     centred = spheres[:, :3] - spheres[:, :3].mean(axis=0)
@@ -195,8 +209,8 @@ def _clusters(spheres: ndarray) -> list[ndarray]:
 
 
 def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
-    """A small sphere around each set of spheres: its centre moves towards the farthest one (Badoiu and
-    Clarkson)."""
+    """A nearly minimal sphere around each set of spheres (Badoiu and Clarkson: the centre repeatedly moves
+    towards the farthest one)."""
     if not sets:
         return []
     most, each = max(map(len, sets)), np.arange(len(sets))
@@ -211,22 +225,22 @@ def _bounding_spheres(sets: Sequence[ndarray]) -> list[ndarray]:
     return list(np.column_stack([centres, reach.max(axis=1) + 1e-6]))
 
 
-GRID_SECONDS = 7e-7
-"""That a point of meshes and clouds takes, about [s]."""
+GRID_SECONDS_PER_POINT = 7e-7
+"""Approximate time in which the grid is built, per point of meshes and clouds [s]."""
 
 
 @lru_cache(maxsize=8)
 def compile_scene_for(robot: Robot, scene: Scene) -> SceneArrays:
-    """The arrays of a scene as far as the robot can get near it; those of the last few scenes are kept, since
-    a search and the validator ask for the same."""
+    """The arrays of the part of a scene that the robot can come near. The last few are cached, because a
+    search and the validator use the same."""
     largest = float(compile_robot(robot).spheres[:, 3].max(initial=0.0))
     return compile_scene(scene, reach_bound(robot), largest)
 
 
 def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> SceneArrays:
-    """The arrays of a scene around a robot that reaches so far from its base's origin [m].
+    """The arrays of a scene around a robot that reaches `reach` far from its base's origin [m].
 
-    Points well beyond are left out. `radius` is that of the robot's largest sphere [m].
+    Points well beyond that are left out. `radius` is that of the robot's largest sphere [m].
     """
     spheres, boxes, cylinders, capsules, points = [], [], [], [], []
     for shape in scene.shapes:
@@ -255,7 +269,7 @@ def compile_scene(scene: Scene, reach: float = np.inf, radius: float = 0.0) -> S
 def _solids(
     spheres: ndarray, boxes: ndarray, cylinders: ndarray, capsules: ndarray
 ) -> tuple[ndarray, ndarray]:
-    """Fields of SceneArrays."""
+    """`SceneArrays.solids` and `SceneArrays.solid_boxes`."""
     rows = np.zeros((len(spheres) + len(boxes) + len(cylinders) + len(capsules), 17), np.float32)
     a, b, c = np.cumsum([len(spheres), len(boxes), len(cylinders)]).tolist()
     rows[:a, :3], rows[:a, 3:12:4], rows[:a, 15] = spheres[:, :3], 1, spheres[:, 3]
@@ -270,27 +284,28 @@ def _solids(
     middle, rotation, half = rows[:, :3], np.abs(rows[:, 3:12].reshape(-1, 3, 3)), rows[:, 12:15]
     extent = np.einsum("nij,ni->nj", rotation, half) + rows[:, 15:16]
     extent += BOX_SLACK * (1 + np.abs(middle) + extent)
-    return rows, by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), NO_BOX)
+    return rows, by_sixteen(np.concatenate([middle - extent, middle + extent], axis=1), EMPTY_BOX)
 
 
 @lru_cache(maxsize=8)
 def _grid_around(shapes: tuple[PointCloud | Triangulated, ...], reach: float, radius: float) -> PointGrid:
-    """The grid of point clouds and meshes; the same ones in another scene have the same."""
+    """The grid of point clouds and meshes, cached, so that scenes with the same clouds and meshes share
+    it."""
     clouds: list[ndarray] = []
     for i, shape in enumerate(shapes):
         points = sum(map(len, clouds))
         check_time(f"{len(shapes) - i} of {len(shapes)} meshes and clouds after {points:,} points")
         if isinstance(shape, PointCloud):
-            clouds.append(thin(shape.points, shape.point_radius, reach))
+            clouds.append(thin_points(shape.points, shape.point_radius, reach))
         else:
-            clouds.append(cover(shape.mesh.world_vertices[shape.mesh.faces], reach))
-    cloud = np.concatenate(clouds) if clouds else EMPTY
-    check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS * len(cloud))
+            clouds.append(cover_triangles(shape.mesh.world_vertices[shape.mesh.faces], reach))
+    cloud = np.concatenate(clouds) if clouds else NO_SPHERES
+    check_time(f"the grid of {len(cloud):,} points", GRID_SECONDS_PER_POINT * len(cloud))
     return build_grid(cloud, radius)
 
 
 def _round(shapes: Sequence[Cylinder | Capsule], reach: float) -> ndarray:
-    """The rows of shapes about their z axes."""
+    """The rows of cylinders or capsules."""
     half = np.array([[shape.radius, shape.radius, shape.height / 2] for shape in shapes]).reshape(-1, 3)
     return np.ascontiguousarray(_oriented(shapes, half, (2,), reach)[:, [*range(13), 14, 11]])
 
@@ -298,10 +313,11 @@ def _round(shapes: Sequence[Cylinder | Capsule], reach: float) -> ndarray:
 def _oriented(
     shapes: Sequence[Box | Cylinder | Capsule], half: ndarray, axes: tuple[int, ...], reach: float
 ) -> ndarray:
-    """Centre, world-to-shape rotation and half extents, cropped along some axes to what the robot gets near.
+    """Centre, world-to-shape rotation and half extents, cropped along some axes to what the robot can come
+    near.
 
-    A point within reach is as far from the rest of the shape as from all of it, and a floor of 1 km keeps its
-    precision in float32.
+    Cropping does not change the distance to points within reach, and keeps the precision of a floor of 1 km
+    in float32.
     """
     if not shapes:
         return np.zeros((0, 15), np.float32)
@@ -324,8 +340,8 @@ def _oriented(
 
 
 def _grown(rows: ndarray, sizes: slice) -> ndarray:
-    """The rows with their sizes larger by what rounding to float32 may take away."""
+    """The rows with sizes increased by what rounding to float32 may take away."""
     rows[:, sizes] += (
-        ROUNDING * (np.abs(rows[:, :3]).max(axis=1) + np.abs(rows[:, sizes]).max(axis=1))[:, None]
+        FLOAT32_ROUNDING * (np.abs(rows[:, :3]).max(axis=1) + np.abs(rows[:, sizes]).max(axis=1))[:, None]
     )
     return rows

@@ -1,13 +1,14 @@
-"""Collision of motions: the space that searches check them in, and the validator's certificate.
+"""Collision of motions: the arguments of compiled searches, and the motion certificate of the validator.
 
-The certificate says that a motion is free between its waypoints too, or where it first is not. A piece of
-the motion is free for a link if a lower bound of its clearance along the piece is positive; otherwise the
-piece is split. The bound comes from the clearance in the piece's middle, the velocity there towards what is
-near, and a bound on what the arm's curved way can add (`kernels/sweep.py`). Of two links, the further one is
-seen from the nearer one, so only the joints between them count. Clearances are those of the covering spheres,
-many configurations at once (`kernels/swept_spheres.py`); where the spheres are too coarse, of the convex
-meshes, by planes that part them (`kernels/hulls.py`). Coal says the distances to surfaces and clouds of
-points, and whether bodies touch.
+The motion certificate proves that a motion is free between its waypoints too, or finds its first contact. A
+piece of the motion is free for a link if a lower bound of its clearance along the piece is positive;
+otherwise the piece is split. The bound is computed from the clearance in the piece's middle, the velocity
+there towards what is near, and a bound on the curvature of the motion (`kernels/motion_certificate.py`).
+Between two links only the joints between them count, because motion is seen from the nearer one. Clearances
+are those of the covering spheres, for many configurations at once (`kernels/swept_spheres.py`). Where the
+spheres are too coarse, separating planes between the convex meshes give the bound
+(`kernels/convex_bounds.py`). Coal computes distances to surfaces and point clouds, and decides whether bodies
+touch.
 """
 
 from dataclasses import replace
@@ -23,7 +24,7 @@ from robotdiffuse.collision.convex_geometry import Check, checks_of, hulls_of, s
 from robotdiffuse.collision.kernel_arrays import compile_robot, compile_scene_for, robot_groups
 from robotdiffuse.collision.kernels import motion_certificate as kernel
 from robotdiffuse.collision.kernels.motion_certificate import (
-    CAP,
+    CLEARANCE_CAP,
     PAIR,
     SCENE,
     Arm,
@@ -41,14 +42,15 @@ from robotdiffuse.scenes.scene import Scene
 if TYPE_CHECKING:
     from robotdiffuse.collision.exact_meshes import ExactCollision
 
-FINEST = 0.002
-"""Least distance between two checks of a motion that is searched with [m]."""
-FIRST_TRAVEL = 0.16
-"""Motion bound of the pieces that a motion is cut into at first [m]; half and twice are about as fast."""
-FIRST_CONTACT_TRAVEL = 1e-3
+FINEST_RESOLUTION = 0.002
+"""Smallest resolution of motion checks in a search [m]."""
+INITIAL_TRAVEL = 0.16
+"""Motion bound of the pieces into which a motion is first split [m]; half and twice as much are about as
+fast."""
+CONTACT_TRAVEL_TOLERANCE = 1e-3
 """The first contact is located to within this motion bound [m]."""
-EPISODE_TRAVEL, EPISODE_SAMPLES = 0.01, 64
-"""Step [m] and number of the configurations at which the depth of a contact is looked for."""
+DEPTH_SAMPLE_TRAVEL, DEPTH_SAMPLES = 0.01, 64
+"""Step [m] and number of the configurations at which the depth of a contact is computed."""
 
 
 def search_space(
@@ -57,7 +59,7 @@ def search_space(
     padding: float = 0.0,
     near_ends: Float[ndarray, "m columns"] | None = None,
 ) -> Space:
-    """What the compiled search needs; `resolution`, `padding` [m] and `near_ends` as in its docstring."""
+    """The arguments of a compiled search; `resolution`, `padding` [m] and `near_ends` as in `Space`."""
     robot = checker.robot
     ends = np.zeros((0, robot.dof + 1)) if near_ends is None else near_ends.copy()
     ends[:, -1] += checker.padding
@@ -66,21 +68,21 @@ def search_space(
         checker.scene_arrays,
         robot.lower.astype(np.float32),
         robot.upper.astype(np.float32),
-        levers(robot),
+        largest_motion_radii(robot),
         np.float32(resolution),
         checker.padding + np.float32(padding),
         ends.astype(np.float32),
     )
 
 
-def finer(resolution: float) -> float:
-    """For after a path that the validator refused: it found contact between two checks, so look twice as closely
-    [m]."""
-    return max(resolution / 2, FINEST)
+def finer_resolution(resolution: float) -> float:
+    """For after a path that the validator refused: it found contact between two checks, so look twice as
+    closely [m]."""
+    return max(resolution / 2, FINEST_RESOLUTION)
 
 
-def levers(robot: Robot) -> Float[ndarray, "dof"]:
-    """Largest distance of any point of the arm from each joint's axis [m]."""
+def largest_motion_radii(robot: Robot) -> Float[ndarray, "dof"]:
+    """Largest distance of any point of the arm from each joint's axis [m]; 1 for a prismatic joint."""
     return motion_radii(robot).max(axis=0, initial=0.0).astype(np.float32)
 
 
@@ -97,33 +99,34 @@ class Contact(NamedTuple):
 
 
 class Sweep(NamedTuple):
-    """What is known of a motion."""
+    """The result of certifying a motion."""
 
     contact: Contact | None
     scene_clearance: float
-    """A lower bound on all clearances to the scene along the motion [m], at most 1 m; 0 with a contact."""
+    """Lower bound on all clearances to the scene along the motion [m], at most 1 m; 0 if there is a
+    contact."""
     self_clearance: float
     """The same between links."""
 
 
 class ContinuousCollision:
-    """Validates whole motions of a robot in a scene. Not safe for use by several threads at once."""
+    """Certifies whole motions of a robot in a scene. Not thread-safe."""
 
     def __init__(self, robot: Robot, scene: Scene, contact: float, tightness: float) -> None:
-        """Meshes nearer than `contact` [m] touch. Pieces are split until each certified clearance is at least
-        the share `tightness`, in (0, 1), of the least one measured of its kind: to the scene, or between
-        links."""
+        """Meshes nearer than `contact` [m] count as touching. Pieces are split until each certified clearance
+        is at least the share `tightness`, in (0, 1), of the smallest measured one of its kind: to the scene,
+        or between links."""
         self.robot, self.scene, self.contact, self.tightness = robot, scene, contact, tightness
         self.arm, self.checks = _arm(robot), _checks(robot)
         self.scene_arrays = compile_scene_for(robot, scene)
         self.solids = solid_arrays(solids_of(scene))
 
     def sweep(self, q: Float[ndarray, "n dof"]) -> Sweep:
-        """Validate the motion along straight joint-space lines through the waypoints (at least one)."""
+        """Certify the motion along straight lines in joint space through the waypoints (at least one)."""
         q = for_kernels(q)
-        motion = Motion(q, kernel.way_along(q, self.checks.levers))
-        todo = kernel.first_pieces(motion, self.checks, FIRST_TRAVEL)
-        best, certified = np.full(2, CAP), np.full(2, CAP)
+        motion = Motion(q, kernel.travel_along(q, self.checks.motion_radii))
+        todo = kernel.first_pieces(motion, self.checks, INITIAL_TRAVEL)
+        best, certified = np.full(2, CLEARANCE_CAP), np.full(2, CLEARANCE_CAP)
         hit: tuple[float, int] | None = None
         while len(todo.start):
             found, rows, columns = kernel.rounds(
@@ -151,14 +154,17 @@ class ContinuousCollision:
     def _ask(
         self, motion: Motion, found: Round, rows: ndarray, columns: ndarray, best: ndarray
     ) -> tuple[tuple[float, int], Round] | None:
-        """Ask Coal what the round leaves to it. With a contact: its place and check, and what remains of the
-        round, since what follows the contact matters no more; what precedes it does, closer and closer."""
+        """Let Coal compute the distances that the round leaves to it.
+
+        If there is a contact, returns its place and check, and the part of the round before it: an earlier
+        contact may still be found there, and what follows no longer matters. Else returns None.
+        """
         todo, clearance, lower = found.pieces, found.clearance, found.lower
         kinds = self.checks.kind[columns]
         travel = found.travel[rows, columns]
         middle = (todo.start + todo.stop) / 2
         at = kernel.configurations(motion, middle[rows])
-        cutoffs = np.clip(travel + best[kinds], 2 * self.contact, CAP)
+        cutoffs = np.clip(travel + best[kinds], 2 * self.contact, CLEARANCE_CAP)
         distances, _ = self._exact.nearest(at, columns, cutoffs, stop=self.contact)
         asked = int(np.isfinite(distances).sum())
         touched = distances[asked - 1] <= self.contact
@@ -170,7 +176,7 @@ class ContinuousCollision:
         if not touched:
             return None
         row = int(rows[asked])
-        keep = row + int(todo.stop[row] - todo.start[row] > 2 * FIRST_CONTACT_TRAVEL)
+        keep = row + int(todo.stop[row] - todo.start[row] > 2 * CONTACT_TRAVEL_TOLERANCE)
         todo.stop[row] = middle[row]
         clearance[row:] = lower[row:] = -np.inf
         parts = (todo.start, todo.stop, todo.undecided)
@@ -180,30 +186,31 @@ class ContinuousCollision:
     @cached_property
     def _exact(self) -> "ExactCollision":
         from robotdiffuse.collision.exact_meshes import (
-            ExactCollision,  # and Coal, which most motions do not need
+            ExactCollision,  # imports Coal, which most motions do not need
         )
 
         return ExactCollision(self.robot, self.scene)
 
     def _contact(self, motion: Motion, at: float, check: int) -> Contact:
-        """The contact of a check at a place, with its depth until the check comes free of that obstacle."""
-        steps = at + EPISODE_TRAVEL * np.arange(EPISODE_SAMPLES)
-        steps = steps[steps <= max(motion.way[-1], at)]
+        """The contact of a check at a place, with its greatest depth until the check is free of that
+        obstacle."""
+        steps = at + DEPTH_SAMPLE_TRAVEL * np.arange(DEPTH_SAMPLES)
+        steps = steps[steps <= max(motion.travel[-1], at)]
         checks, cutoffs = np.full(len(steps), check), np.full(len(steps), 2 * self.contact)
         distances, names = self._exact.nearest(kernel.configurations(motion, steps), checks, cutoffs)
         other = names[0]
         left = [i for i, name in enumerate(names) if name != other or distances[i] > self.contact]
         episode = distances[: left[0] if left else len(steps)]
         depth = max(0.0, -float(episode.min(initial=0)))
-        low, share = kernel.segment_at(motion.way, at)
-        if share == 0.0:  # the first of waypoints that are the same
-            low = int(np.searchsorted(motion.way, at))
+        low, share = kernel.segment_at(motion.travel, at)
+        if share == 0.0:  # the first of several equal waypoints
+            low = int(np.searchsorted(motion.travel, at))
         return Contact(checks_of(self.robot)[check], str(other), low + share, depth)
 
 
 @once_per_robot
 def _groups(robot: Robot) -> tuple[dict[str, int], dict[frozenset[str | None], int]]:
-    """Of the compiled arrays: the number of each link's group, and of each pair of links."""
+    """Indices in the compiled arrays: of each link's group, and of each pair of links."""
     groups = robot_groups(robot)
     pairs = compile_robot(robot).pairs[:, :2].tolist()
     return (
@@ -221,14 +228,14 @@ def _arm(robot: Robot) -> Arm:
 
 @once_per_robot
 def _checks(robot: Robot) -> Checks:
-    """What compiled code reads of the checks. Levers are seen from where the chains of the links part: from
-    the nearer link, if both are on one."""
+    """The checks as arrays for compiled code. Motion radii of a pair are seen from the frame where the chains
+    of both links part, which is the nearer link if both are on one chain."""
     groups, pairs = _groups(robot)
-    whole, parts = covered(robot), hulls_of(robot)[1]
+    whole, parts = with_covering_spheres(robot), hulls_of(robot)[1]
     links = [link for link in whole.link_names if link in whole.spheres]
     radii, checks = motion_radii(whole), checks_of(robot)
     kind, where, of_parts, base, common, second = [], [], [], [], [], []
-    levers = np.zeros((len(checks), robot.dof))
+    of_checks = np.zeros((len(checks), robot.dof))
     for k, (link, other) in enumerate(checks):
         kind.append(SCENE if other is None else PAIR)
         known = groups.get(link, -1) if other is None else pairs.get(frozenset((link, other)), -1)
@@ -241,7 +248,7 @@ def _checks(robot: Robot) -> Checks:
             (further, robot.moved_by[high] & ~shared),
         ):
             if joints.any():
-                levers[k, joints] = radii[links.index(one), joints]
+                of_checks[k, joints] = radii[links.index(one), joints]
         base.append(low)
         common.append(int(np.flatnonzero(shared).max(initial=-1)) + 1)
         second.append(int(np.flatnonzero(robot.moved_by[high] & ~shared)[0]) if common[-1] != low else 0)
@@ -254,13 +261,13 @@ def _checks(robot: Robot) -> Checks:
         np.array(base, np.int64),
         np.array(common, np.int64),
         np.array(second, np.int64),
-        levers,
+        of_checks,
     )
 
 
 @once_per_robot
-def covered(robot: Robot) -> Robot:
-    """The robot, with one sphere about the meshes of each link that has meshes but no spheres."""
+def with_covering_spheres(robot: Robot) -> Robot:
+    """The robot, with one sphere around the meshes of each link that has meshes but no spheres."""
     added = {}
     for link, meshes in robot.meshes.items():
         if len(meshes) and not len(robot.spheres.get(link, ())):

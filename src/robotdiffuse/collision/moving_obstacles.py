@@ -1,10 +1,11 @@
-"""The certificate in time: a timed motion is free of obstacles that move, or where and when it first is not.
+"""The motion certificate among moving obstacles: proves a timed motion free of them, or finds the first
+contact.
 
-An interval of time is proved for a link and an obstacle when their clearance in its middle exceeds what the
-link's points (`robots/motion_bounds.py`) and the obstacle's can move in half of it; otherwise it is halved. An
-obstacle of which only the greatest speed is known is taken to be anywhere that it can have got to since time
-0. Clearances are those of the covering spheres (`kernels/moving.py`); where these touch, Coal says those of
-the meshes. Nothing is sampled and hoped for.
+An interval of time is proved for a link and an obstacle if their clearance in its middle exceeds the distance
+that points of the link (`robots/motion_bounds.py`) and of the obstacle can move in half of the interval;
+otherwise it is halved. An obstacle of which only the maximum speed is known may be anywhere that it can have
+reached since time 0. Clearances are those of the covering spheres (`kernels/moving_obstacles.py`); where
+these touch, Coal computes those of the meshes. The result is a proof and does not depend on sampling.
 """
 
 from collections.abc import Sequence
@@ -19,8 +20,8 @@ from numpy import ndarray
 from robotdiffuse.collision.convex_geometry import Solid, solids_of
 from robotdiffuse.collision.kernel_arrays import robot_groups
 from robotdiffuse.collision.kernels import moving_obstacles as kernel
-from robotdiffuse.collision.kernels.moving_obstacles import CAP, Links, Tasks, Tracks
-from robotdiffuse.collision.motions import covered
+from robotdiffuse.collision.kernels.moving_obstacles import CLEARANCE_CAP, Links, Tasks, Tracks
+from robotdiffuse.collision.motions import with_covering_spheres
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.transforms import inverse, quaternion_from_rotation
 from robotdiffuse.robots.motion_bounds import motion_radii
@@ -32,16 +33,16 @@ from robotdiffuse.scenes.shape_transforms import placed
 if TYPE_CHECKING:
     from robotdiffuse.collision.exact_meshes import ExactCollision
 
-FIRST_CONTACT = 1e-3
+CONTACT_TIME_TOLERANCE = 1e-3
 """The first contact is located to within this time [s]."""
-SHORTEST = 1e-7
-"""Intervals are halved down to this [s]; what cannot be proved then counts as contact."""
-EPISODE, EPISODE_SAMPLES = 0.005, 200
-"""Step [s] and number of the times at which the depth of a contact is looked for."""
+MIN_INTERVAL = 1e-7
+"""Intervals are halved down to this length [s]; what is not proved then counts as contact."""
+DEPTH_SAMPLE_TIME, DEPTH_SAMPLES = 0.005, 200
+"""Step [s] and number of the times at which the depth of a contact is computed."""
 
 
 class TimedContact(NamedTuple):
-    """The first contact of a timed motion with an obstacle that moves."""
+    """The first contact of a timed motion with a moving obstacle."""
 
     link: str
     obstacle: str
@@ -52,34 +53,34 @@ class TimedContact(NamedTuple):
 
 
 class TimedSweep(NamedTuple):
-    """What is known of a timed motion."""
+    """The result of certifying a timed motion."""
 
     contact: TimedContact | None
     clearance: float
-    """A lower bound on all clearances to the obstacles [m], at most 1 m; 0 with a contact."""
+    """Lower bound on all clearances to the obstacles [m], at most 1 m; 0 if there is a contact."""
 
 
 class MovingCollision:
-    """Validates timed motions of a robot among obstacles that move. Not safe for several threads at once."""
+    """Certifies timed motions of a robot among moving obstacles. Not thread-safe."""
 
     def __init__(
         self, robot: Robot, moving: Sequence[MovingObstacle], contact: float, tightness: float
     ) -> None:
-        """Meshes nearer than `contact` [m] touch. Intervals are halved until each bound is at least the share
-        `tightness`, in [0, 1), of the least clearance measured."""
+        """Meshes nearer than `contact` [m] count as touching. Intervals are halved until each bound is at
+        least the share `tightness`, in [0, 1), of the smallest clearance measured."""
         self.robot, self.moving, self.contact, self.tightness = robot, tuple(moving), contact, tightness
-        self.link_names, self.links = links_of(robot)
-        self.tracks = tracks_of(self.moving)
+        self.link_names, self.links = compile_links(robot)
+        self.tracks = compile_tracks(self.moving)
 
     def sweep(self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"]) -> TimedSweep:
-        """Validate the motion on straight lines between rows at increasing times."""
+        """Certify the motion on straight lines between rows q at increasing times [s]."""
         times, q = for_kernels(times), for_kernels(q)
-        best, certified = np.array([CAP]), CAP
+        best, certified = np.array([CLEARANCE_CAP]), CLEARANCE_CAP
         every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
         ends = times[[0, -1]]
         tasks, hit = Tasks(ends[:1], ends[1:], every), None
         while len(tasks.start):
-            bound, left = kernel.certify(
+            bound, left = kernel.settle_tasks(
                 self.links, self.tracks, times, q, tasks, self.contact, self.tightness, best
             )
             certified = min(certified, bound)
@@ -90,10 +91,10 @@ class MovingCollision:
                 time = (start + stop) / 2
                 distance = self._distance(link, o, times, q, time)
                 lost = self._lost(link, o, times, q, start, stop)
-                if distance <= self.contact or stop - start < SHORTEST:
+                if distance <= self.contact or stop - start < MIN_INTERVAL:
                     if hit is None or time < hit[0]:
                         hit = time, link, o
-                    if stop - start > 2 * FIRST_CONTACT:
+                    if stop - start > 2 * CONTACT_TIME_TOLERANCE:
                         halves.append((start, time, link, o))
                     continue
                 best[0] = min(best[0], distance)
@@ -106,21 +107,24 @@ class MovingCollision:
             return TimedSweep(self._contact(times, q, *hit), 0.0)
         return TimedSweep(None, float(certified))
 
-    def wider(self, by: Float[ndarray, "obstacles"]) -> "MovingCollision":
-        """The same with each obstacle larger by so much [m], for `covered_free`."""
+    def inflated(self, by: Float[ndarray, "obstacles"]) -> "MovingCollision":
+        """A copy in which each obstacle is inflated by a distance [m], for `first_unproved_time`."""
         other = copy(self)
         other.tracks = self.tracks._replace(rounding=self.tracks.rounding + by)
         return other
 
-    def covered_free(
+    def first_unproved_time(
         self, times: Float[ndarray, "n"], q: Float[ndarray, "n dof"], least: float
     ) -> float | None:
-        """The time [s] of the first place where the covering spheres are not proved to keep `least` [m], None
-        for a motion that is proved. Fast, for searches and loops: what spheres cannot settle is refused."""
+        """The first time [s] at which the covering spheres do not prove a clearance of `least` [m]; None if
+        they prove it all along. It is fast, for searches and control loops, because it never uses the exact
+        meshes."""
         every = np.ones((1, len(self.link_names), len(self.moving)), np.bool_)
         times, q = for_kernels(times), for_kernels(q)
         tasks = Tasks(times[:1], times[-1:], every)
-        left = kernel.certify(self.links, self.tracks, times, q, tasks, least, 0.0, np.array([CAP]))[1]
+        left = kernel.settle_tasks(
+            self.links, self.tracks, times, q, tasks, least, 0.0, np.array([CLEARANCE_CAP])
+        )[1]
         return min((start for start, *_ in left), default=None)
 
     def _tasks(self, halves: list[tuple[float, float, int, int]]) -> Tasks:
@@ -131,34 +135,36 @@ class MovingCollision:
         return Tasks(starts, np.array([half[1] for half in halves]), pairs)
 
     def _distance(self, link: int, o: int, times: ndarray, q: ndarray, time: float) -> float:
-        """Signed distance of the meshes of a link to an obstacle at a time, less what that can have grown."""
+        """Signed distance of a link's meshes to obstacle o at a time [m], less the obstacle's growth until
+        then."""
         obstacle = self.moving[o]
         T_stands_moved = placed(obstacle.shape) @ inverse(obstacle.pose(time))
-        distance = self._exact[o].distance_seen_from(
+        distance = self._exact[o].distance_from_moved_base(
             self.link_names[link], _at(times, q, time), T_stands_moved
         )
         return distance - self.tracks.growth[o] * max(time, 0.0)
 
     def _lost(self, link: int, o: int, times: ndarray, q: ndarray, start: float, stop: float) -> float:
-        """What the link's and the obstacle's points can move from the middle of an interval to an end."""
-        ways = kernel.ways_of(q)
+        """Upper bound on how far the link's and the obstacle's points move from the middle of an interval to
+        its ends, in sum [m]."""
+        ways = kernel.cumulative_motion(q)
         a, m, b = (_at(times, ways, time) for time in (start, (start + stop) / 2, stop))
         speed = kernel.speed_between(self.tracks, o, start, stop) + self.tracks.growth[o]
-        return float(self.links.levers[link] @ np.maximum(m - a, b - m)) + speed * (stop - start) / 2
+        return float(self.links.motion_radii[link] @ np.maximum(m - a, b - m)) + speed * (stop - start) / 2
 
     @cached_property
     def _exact(self) -> "tuple[ExactCollision, ...]":
         from robotdiffuse.collision.exact_meshes import (
-            ExactCollision,  # and Coal, which most motions do not need
+            ExactCollision,  # imports Coal, which most motions do not need
         )
 
         return tuple(ExactCollision(self.robot, Scene([obstacle.shape])) for obstacle in self.moving)
 
     def _contact(self, times: ndarray, q: ndarray, time: float, link: int, o: int) -> TimedContact:
-        """A contact with its depth until link and obstacle come apart."""
+        """A contact with its greatest depth until link and obstacle separate."""
         depth = 0.0
-        for k in range(EPISODE_SAMPLES):
-            at = time + EPISODE * k
+        for k in range(DEPTH_SAMPLES):
+            at = time + DEPTH_SAMPLE_TIME * k
             distance = self._distance(link, o, times, q, at) if at <= times[-1] or k == 0 else np.inf
             if k and distance > self.contact:
                 break
@@ -167,6 +173,7 @@ class MovingCollision:
 
 
 def _at(times: ndarray, rows: ndarray, time: float) -> Float[ndarray, "dof"]:
+    """Rows, interpolated at a time; constant before and after them."""
     if len(times) == 1:
         return rows[0]
     i = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
@@ -175,9 +182,9 @@ def _at(times: ndarray, rows: ndarray, time: float) -> Float[ndarray, "dof"]:
 
 
 @once_per_robot
-def links_of(robot: Robot) -> tuple[tuple[str, ...], Links]:
-    """The moving links with geometry, and what compiled code reads of them."""
-    whole = covered(robot)
+def compile_links(robot: Robot) -> tuple[tuple[str, ...], Links]:
+    """Names of the moving links with geometry, and their arrays for compiled code."""
+    whole = with_covering_spheres(robot)
     names = tuple(link for link in robot_groups(whole) if whole.link_frame(link) > 0)
     rows = [link for link in whole.link_names if link in whole.spheres]
     spheres = []
@@ -204,8 +211,8 @@ def links_of(robot: Robot) -> tuple[tuple[str, ...], Links]:
     return names, links
 
 
-def tracks_of(moving: Sequence[MovingObstacle]) -> Tracks:
-    """What compiled code reads of obstacles; a mesh is the box around it."""
+def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
+    """The arrays of moving obstacles for compiled code; a mesh is represented by the box around it."""
     times, xyz, wxyz, speeds, solids = [], [], [], [], list[Solid]()
     for obstacle in moving:
         at, poses = obstacle.track
@@ -221,7 +228,7 @@ def tracks_of(moving: Sequence[MovingObstacle]) -> Tracks:
         inverse(placed(obstacle.shape)) @ solid.T_base_box
         for obstacle, solid in zip(moving, solids, strict=True)
     ]
-    # of a surface, the box stands along the axes of the base; in the obstacle's own frame it is turned
+    # A surface's box is aligned with the base frame, so it is rotated in the obstacle's own frame.
     extents = [np.abs(T[:3, :3]) @ solid.half for T, solid in zip(boxes, solids, strict=True)]
     return Tracks(
         np.cumsum([0] + [len(at) for at in times]),

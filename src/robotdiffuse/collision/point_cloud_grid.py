@@ -1,4 +1,5 @@
-"""Point clouds and meshes as covering spheres in a grid: what `point_grid.py` looks things up in."""
+"""Covering spheres of point clouds and meshes, and the grid over them that `kernels/point_grid.py`
+queries."""
 
 from typing import NamedTuple
 
@@ -6,25 +7,28 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, Int32
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.point_grid import KEEP, make_grid
+from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, make_grid
 from robotdiffuse.collision.kernels.simd import by_sixteen
 
 MESH_SPACING = 0.02
-"""Triangles of mesh obstacles are divided until no edge is longer [m]; each piece becomes a point."""
+"""Triangles of mesh obstacles are divided until no edge is longer than this [m]; each piece becomes a
+sphere."""
 THINNING = 0.5
 """Edge of the thinning voxels of a point cloud, as a multiple of its point radius."""
 MAX_POINTS = 400_000
-"""Mesh obstacles are divided more coarsely, or their pieces joined, rather than into more points."""
-EXACT = 0.1
+"""Spheres of a mesh obstacle at most, about; larger meshes are divided more coarsely, or their pieces
+merged."""
+EXACT_RANGE = 0.1
 """Clearances to points are exact up to this [m], and lower bounds beyond."""
-KNOWN_VOXELS = 10
+VOXELS_PER_RANGE = 10
+"""Voxels in the range of distances that the grid knows."""
 MAX_VOXELS = 2e6
 """A grid of 8 MB still fits a processor's cache."""
-EMPTY = np.zeros((0, 4))
+NO_SPHERES = np.zeros((0, 4))
 
 
 class PointGrid(NamedTuple):
-    """Fields of SceneArrays."""
+    """The fields of SceneArrays of the same names."""
 
     points: Float32[ndarray, "n 4"]
     point_rows: Float32[ndarray, "rows 64"]
@@ -34,22 +38,23 @@ class PointGrid(NamedTuple):
     grid_frame: Float32[ndarray, "14"]
 
 
-def thin(points: Float[ndarray, "n 3"], radius: float, reach: float) -> Float[ndarray, "m 4"]:
-    """One sphere per occupied voxel, large enough to hold the spheres of all points of the voxel [m].
+def thin_points(points: Float[ndarray, "n 3"], radius: float, reach: float) -> Float[ndarray, "m 4"]:
+    """One sphere per occupied voxel, large enough to contain the spheres of all points of the voxel [m].
 
-    Points farther than `reach` and what is kept beyond it are left out.
+    Points more than POINT_RANGE beyond `reach` [m] are left out.
     """
     with np.errstate(over="ignore"):
-        points = points[np.einsum("ij,ij->i", points, points) <= (reach + KEEP + radius) ** 2]
+        points = points[np.einsum("ij,ij->i", points, points) <= (reach + POINT_RANGE + radius) ** 2]
     return _join(np.column_stack([points, np.full(len(points), radius)]), THINNING * radius)
 
 
 def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]:
-    """One sphere around all spheres with centres in a voxel."""
+    """One sphere per voxel around all spheres with centres in it."""
     if not len(spheres):
-        return EMPTY
+        return NO_SPHERES
     offsets = spheres[:, :3] - spheres[:, :3].min(axis=0)
-    # three indices and a sphere's number fit an integer: one sort of them is faster than a sort of numbers
+    # Three voxel indices and a sphere's index are packed into one integer, which sorts faster than an
+    # argsort.
     bits = len(spheres).bit_length()
     axis = (62 - bits) // 3
     keys = (offsets * (1 / max(voxel, float(offsets.max()) / (2**axis - 1)))).astype(np.int64)
@@ -66,8 +71,8 @@ def _join(spheres: Float[ndarray, "n 4"], voxel: float) -> Float[ndarray, "m 4"]
     return np.column_stack([centres, radii])
 
 
-def cover(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:
-    """Spheres around pieces of the triangles that together hold the surface within `reach` [m]."""
+def cover_triangles(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m 4"]:
+    """Spheres around pieces of the triangles that together cover the surface within `reach` [m]."""
     near = _divide(triangles, reach / 4 if np.isfinite(reach) else np.inf, reach)
     # bisection ends with pieces of about a quarter of the squared spacing
     spacing = max(MESH_SPACING, float(np.sqrt(4 * _area(near) / MAX_POINTS)))
@@ -79,11 +84,12 @@ def cover(triangles: Float[ndarray, "n 3 3"], reach: float) -> Float[ndarray, "m
 
 
 def _divide(triangles: Float[ndarray, "n 3 3"], spacing: float, reach: float) -> Float[ndarray, "m 3 3"]:
-    """Pieces of the triangles near the robot with no edge longer than `spacing`: longest edges are halved."""
+    """Pieces of the triangles near the robot with no edge longer than `spacing` [m], by halving longest
+    edges."""
     done = [np.zeros((0, 3, 3))]
     while len(triangles):
         edges = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=2)
-        near = np.linalg.norm(triangles.mean(axis=1), axis=1) <= reach + KEEP + edges.max(axis=1)
+        near = np.linalg.norm(triangles.mean(axis=1), axis=1) <= reach + POINT_RANGE + edges.max(axis=1)
         triangles, edges = triangles[near], edges[near]
         small = edges.max(axis=1) <= spacing
         done.append(triangles[small])
@@ -104,11 +110,11 @@ def _area(triangles: Float[ndarray, "n 3 3"]) -> float:
 
 
 def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
-    """The grid over covering spheres for a robot with spheres of up to this radius [m]."""
+    """The grid over covering spheres of obstacles, for a robot whose spheres have at most this radius [m]."""
     if not len(cloud):
         return PointGrid(
-            EMPTY.astype(np.float32),
-            by_sixteen(EMPTY, EMPTY),
+            NO_SPHERES.astype(np.float32),
+            by_sixteen(NO_SPHERES, NO_SPHERES),
             np.zeros(2, np.int32),
             np.zeros(0, np.float32),
             np.zeros(0, np.int32),
@@ -116,10 +122,10 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
         )
     cloud = cloud.astype(np.float32)
     radii = cloud[:, 3]
-    known = EXACT + radius + float(radii.max())
+    known = EXACT_RANGE + radius + float(radii.max())
     low = cloud[:, :3].min(axis=0) - np.float32(known)
     extent = (cloud[:, :3].max(axis=0) - low).astype(np.float64) + known
-    voxel = np.float32(max(known / KNOWN_VOXELS, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
+    voxel = np.float32(max(known / VOXELS_PER_RANGE, (extent.prod() / MAX_VOXELS) ** (1 / 3)))
     shape = np.ceil(extent / voxel).astype(np.int32) + 1
     cells = (shape + 1) // 2
     index = ((cloud[:, :3] - low) / voxel).astype(np.int64)
@@ -127,7 +133,7 @@ def build_grid(cloud: Float[ndarray, "n 4"], radius: float) -> PointGrid:
     order = np.argsort(cell * 8 + (index % 2) @ np.array([4, 2, 1]))
     points, index, cell = np.ascontiguousarray(cloud[order]), index[order], cell[order]
     first = np.asarray(np.searchsorted(cell, np.arange(int(np.prod(cells)) + 1)), np.int32)
-    # a sphere as large as the robot's largest is decided within the band
+    # The band is wide enough to decide about the robot's largest sphere.
     band = np.float32(max(radius + float(radii.max()) + 1e-3, 2 * float(voxel)))
     voxels = _flat(index, shape)
     starts = np.flatnonzero(np.diff(voxels, prepend=-1))

@@ -9,12 +9,12 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.distance import CAP
+from robotdiffuse.collision.kernels.distance import CLEARANCE_CAP
 from robotdiffuse.collision.kernels.lane_clearance import make_clearance_workspace, pair_clearances_into
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
-OFF = -CAP
+OFF = -CLEARANCE_CAP
 """The margin of a cost that is not enabled: nothing is ever within it."""
 
 
@@ -49,7 +49,7 @@ def descend(robot, scene, q, lower, upper, steps, rounds):
     gradient = np.empty(dof, np.float32)
     costs = np.zeros(batch, np.float32)
     work = make_clearance_workspace(robot, 1)
-    pairs = np.full((n, len(robot.pairs)), CAP)
+    pairs = np.full((n, len(robot.pairs)), CLEARANCE_CAP)
     pushed = max(steps.margin, steps.self_margin, steps.limit_margin) > OFF
     for b in range(batch):
         for _ in range(rounds):

@@ -20,10 +20,10 @@ from robotdiffuse.core.types import CONVERGED, UNTIL, Path, Status, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.trajectories.speed_limits import (
     DEFAULT,
-    NOTHING,
-    Beside,
+    NO_EXTRA_LIMITS,
+    ExtraLimits,
+    FrameSpeedLimits,
     Jerk,
-    Pace,
     Scaling,
     TimingSettings,
 )
@@ -270,15 +270,15 @@ class PlanningContext:
         )
 
     @property
-    def beside(self) -> Beside:
+    def beside(self) -> ExtraLimits:
         """Limits on timing besides the joint limits: speeds that constraints bound, torques with a
         payload."""
         constraints, pace = self.validator.constraints, None
         if constraints is not None and len(constraints.paced):
-            pace = Pace(constraints.speeds, constraints.most_speeds)
+            pace = FrameSpeedLimits(constraints.speeds, constraints.most_speeds)
         if pace is None and self.validator.dynamics is None:
-            return NOTHING
-        return Beside(pace, self.validator.dynamics)
+            return NO_EXTRA_LIMITS
+        return ExtraLimits(pace, self.validator.dynamics)
 
     def _refuse(self, violation: Violation) -> None:
         self._refused = violation.kind

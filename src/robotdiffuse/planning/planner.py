@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import ClassVar, Generic, TypeVar
 
-from robotdiffuse.collision.motions import finer
+from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Settings
@@ -130,9 +130,9 @@ class Planner(ABC, Generic[PlannerSettings]):
     def load_wanted(self, robot: Robot) -> None:
         """Load what earlier calls had no time to load, and Coal. Programs that make many calls call this
         between them."""
-        from robotdiffuse.collision.exact_meshes import make_ready  # imports Coal
+        from robotdiffuse.collision.exact_meshes import warm_up  # imports Coal
 
-        make_ready(robot)
+        warm_up(robot)
 
     def _load_rarely_needed(self, robot: Robot) -> None:
         """Load what only some calls need."""
@@ -150,7 +150,7 @@ def ever_finer(context: PlanningContext, settings: PlannerSettings) -> Iterator[
     attempt = 0
     while attempt == 0 or context.remaining > 0:
         yield settings, attempt
-        settings = replace(settings, resolution=finer(settings.resolution))  # type: ignore
+        settings = replace(settings, resolution=finer_resolution(settings.resolution))  # type: ignore
         attempt += 1
 
 

@@ -1,1 +1,1 @@
-"""From a verified path to a timed trajectory and to files."""
+"""From a path to a timed trajectory: simplification, rounded corners, speeds within limits, jerk, stops."""

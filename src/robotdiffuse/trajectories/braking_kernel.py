@@ -1,29 +1,30 @@
-"""Compiled speeds along a path from where the arm is on it: on towards the end for a while, then to rest.
+"""Compiled speeds along a path from the arm's place on it: towards the end for a while, then to rest.
 
-In each interval of the grid s̈ is constant, and limits hold at both its ends, whichever part of it is gone
-through. So what was possible in an interval stays possible on the way through it.
+s̈ is constant in each grid interval, and limits hold at both ends of the interval, also where the motion
+covers only a part of it. So an acceleration that was possible at the beginning of an interval stays possible
+in it.
 """
 
 import numpy as np
 from numba import njit
 
-from robotdiffuse.trajectories.timing_kernel import TINY
+from robotdiffuse.trajectories.timing_kernel import NEGLIGIBLE_DERIVATIVE
 
-SHORTEST = 1e-10
-"""Parts of intervals that are left out."""
-STILL = 1e-12
-"""Squared speeds below this are none."""
+MIN_INTERVAL = 1e-10
+"""Shorter parts of grid intervals are skipped."""
+STILL_SPEED_SQUARED = 1e-12
+"""A squared speed below this counts as rest."""
 
 
 @njit(cache=True)
-def _pulls(one, two, grid, i, s, x, most, acceleration):
-    """The least and greatest s̈ in interval i from s on, where ṡ² is x, such that it is at most `most` at its
+def _acceleration_bounds(one, two, grid, i, s, x, most, acceleration):
+    """Bounds of s̈ in interval i from s on, where ṡ² is x, such that ṡ² is at most `most` at the interval's
     end."""
     low, high = -np.inf, (most - x) / (2 * (grid[i + 1] - s))
     for k in range(i, i + 2):
         for j in range(one.shape[1]):
             a = one[k, j] + 2 * (grid[k] - s) * two[k, j]
-            if abs(a) < TINY:
+            if abs(a) < NEGLIGIBLE_DERIVATIVE:
                 continue
             limit, middle = acceleration[j] / abs(a), -two[k, j] * x / a
             low, high = max(low, middle - limit), min(high, middle + limit)
@@ -31,27 +32,28 @@ def _pulls(one, two, grid, i, s, x, most, acceleration):
 
 
 @njit(cache=True)
-def on_then_rest(one, two, grid, most, s, speed, time, acceleration):
-    """Values of s and speeds: as fast as possible towards the end for some time, then braking to rest.
+def advance_then_brake(one, two, grid, most, s, speed, time, acceleration):
+    """Values of s and speeds [n each] of a motion as fast as possible for some time [s], then braking to
+    rest.
 
-    one, two: the path's derivatives at the grid; `most` the greatest ṡ² there from which the end can be
-    reached within the limits.
+    one, two: first and second derivative of the path at the grid, [m, dof]; `most` [m]: the greatest ṡ² from
+    which the end can be reached within the limits; s, speed: where the motion begins; acceleration [dof].
     """
     n = len(grid)
     out = np.empty((2, n + 2))
-    i = max(np.searchsorted(grid, s + SHORTEST, side="right") - 1, 0)
+    i = max(np.searchsorted(grid, s + MIN_INTERVAL, side="right") - 1, 0)
     if i >= n - 1:
         return np.array([s, s]), np.zeros(2)
     x, left, count = speed * speed, time, 0
     out[0, 0], out[1, 0] = s, speed
-    while i < n - 1 and (x >= STILL or left > 0):
-        low, high = _pulls(one, two, grid, i, s, x, most[i + 1], acceleration)
+    while i < n - 1 and (x >= STILL_SPEED_SQUARED or left > 0):
+        low, high = _acceleration_bounds(one, two, grid, i, s, x, most[i + 1], acceleration)
         pull, width = high if left > 0 else low, grid[i + 1] - s
         beyond = max(x + 2 * pull * width, 0.0)
         both = np.sqrt(x) + np.sqrt(beyond)
         lasts = 2 * width / both if both > 0 else np.inf
         if 0 < left < lasts:
-            s = min(s + (np.sqrt(x) + 0.5 * pull * left) * left, grid[i + 1] - SHORTEST)
+            s = min(s + (np.sqrt(x) + 0.5 * pull * left) * left, grid[i + 1] - MIN_INTERVAL)
             x = max((np.sqrt(x) + pull * left) ** 2, 0.0)
             left = 0.0
         elif left <= 0 and x + 2 * pull * width < 0:
@@ -66,8 +68,8 @@ def on_then_rest(one, two, grid, most, s, speed, time, acceleration):
 
 
 @njit(cache=True)
-def after(ahead, speeds, time):
-    """s and speed some time after the beginning; at rest at the end thereafter."""
+def state_after(ahead, speeds, time):
+    """s and speed some time [s] after the beginning; at rest at the end once the motion is over."""
     left = time
     for i in range(len(ahead) - 1):
         width, both = ahead[i + 1] - ahead[i], speeds[i] + speeds[i + 1]

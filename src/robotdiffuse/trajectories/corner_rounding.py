@@ -1,13 +1,13 @@
-"""A polyline with rounded corners: twice continuously differentiable, at a known distance to the polyline."""
+"""Polylines with rounded corners: twice continuously differentiable, at a known distance to the polyline."""
 
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.trajectories.timing_kernel import places
+from robotdiffuse.trajectories.timing_kernel import evaluate
 
-DEVIATION = 3.0 / 16.0
-"""Distance between corner and blend, over half width times the change of direction: b(0)."""
+BLEND_DEVIATION = 3.0 / 16.0
+"""b(0): the distance from corner to blend, divided by the half width times the change of direction."""
 
 
 class BlendedPolyline:
@@ -20,10 +20,8 @@ class BlendedPolyline:
     """
 
     def __init__(self, waypoints: Float[ndarray, "n dof"], half_widths: Float[ndarray, "corners"]) -> None:
-        """Takes at least two waypoints, no two neighbours equal, and a half width for each inner one.
-
-        Half widths must not exceed half of the shorter neighbouring segment.
-        """
+        """`waypoints`: at least two, no two neighbours equal. `half_widths`: one for each inner waypoint, at
+        most half of the shorter neighbouring segment."""
         self.waypoints = waypoints
         steps = waypoints[1:] - waypoints[:-1]
         lengths = np.linalg.norm(steps, axis=1)
@@ -38,32 +36,33 @@ class BlendedPolyline:
 
     @property
     def arrays(self) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-        """What compiled code reads of it."""
+        """The arguments of the compiled functions: waypoints, knots, directions and half widths."""
         return self.waypoints, self.knots, self.directions, self.half_widths
 
     def __call__(self, s: Float[ndarray, "m"], order: int) -> Float[ndarray, "m dof"]:
         """The path (order 0) or its first or second derivative with respect to s."""
-        return places(self.arrays, s, order)
+        return evaluate(self.arrays, s, order)
 
 
 def half_widths(
     waypoints: Float[ndarray, "n dof"], deviations: Float[ndarray, "corners"]
 ) -> Float[ndarray, "corners"]:
-    """The widest blends that leave the polyline by no more than the deviations and do not overlap."""
+    """Half widths of the widest blends that leave the polyline by at most the deviations and do not
+    overlap."""
     steps = waypoints[1:] - waypoints[:-1]
     lengths = np.linalg.norm(steps, axis=1)
     directions = steps / lengths[:, None]
     turn = np.linalg.norm(directions[1:] - directions[:-1], axis=1)
     room = 0.5 * np.minimum(lengths[:-1], lengths[1:])
-    return np.minimum(room, deviations / np.maximum(DEVIATION * turn, 1e-12))
+    return np.minimum(room, deviations / np.maximum(BLEND_DEVIATION * turn, 1e-12))
 
 
 def corner_middle(path: Float[ndarray, "n dof"], row: int, deviation: float) -> Float[ndarray, "dof"]:
-    """The middle of the rounded corner at an inner row: the mean of both ways from it, as far as they go."""
+    """The middle of the rounded corner at an inner row, for a deviation [rad, joint-space L2]."""
     e, f = path[row] - path[row - 1], path[row + 1] - path[row]
     lengths = np.linalg.norm(e), np.linalg.norm(f)
     if min(lengths) == 0:
         return path[row]
     turn = f / lengths[1] - e / lengths[0]
     width = half_widths(path[row - 1 : row + 2], np.array([deviation]))[0]
-    return path[row] + DEVIATION * width * turn
+    return path[row] + BLEND_DEVIATION * width * turn

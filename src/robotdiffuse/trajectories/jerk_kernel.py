@@ -1,8 +1,8 @@
-"""Compiled smoothing of timed motions, so that their jerk is limited.
+"""Compiled moving averages of timed motions, which limit their jerk.
 
-A motion q(t) from rest to rest becomes its mean over the last T seconds, which ends T later. Velocities and
-accelerations are means too, so that they keep their limits; the jerk (a(t) - a(t - T)) / T is at most
-2 a_max / T, also as a difference quotient over any time. On a straight line the mean stays on the line.
+A motion q(t) from rest to rest is replaced by its mean over the last T seconds, which ends T later.
+Velocities and accelerations are averaged too, so they keep their limits. The jerk (a(t) - a(t - T)) / T is at
+most 2 a_max / T, also as a difference quotient over any time. On a straight line the mean stays on the line.
 """
 
 import numpy as np
@@ -10,12 +10,15 @@ from numba import njit
 
 
 @njit(cache=True)
-def smoothed(positions, velocities, accelerations, step, window, every):
-    """Times [n], positions, velocities and accelerations [n, dof] of the means over `window` steps, of rows
-    of a motion from rest to rest that are `step` [s] apart: every so many of them, and the last."""
+def moving_average(positions, velocities, accelerations, step, window, every):
+    """Times [n], positions, velocities and accelerations [n, dof] of the moving average over `window` steps.
+
+    The arguments are the rows of a motion from rest to rest, `step` [s] apart. Returned are every `every`-th
+    row and the last.
+    """
     rows, dof = positions.shape
     last = rows - 1 + window
-    # integrals of the positions, from the first one (Hermite's formula)
+    # integrals of the positions relative to the first one (Hermite's formula)
     area = np.zeros((rows, dof))
     for i in range(1, rows):
         for j in range(dof):
@@ -30,7 +33,7 @@ def smoothed(positions, velocities, accelerations, step, window, every):
         times[k] = at * step
         now, before = min(at, rows - 1), min(max(at - window, 0), rows - 1)
         for j in range(dof):
-            # after its end the motion stays where it is
+            # after its end the motion stands still
             beyond = (at - now) * (positions[rows - 1, j] - positions[0, j]) * step
             total = area[now, j] + beyond - area[before, j]
             q[k, j] = positions[0, j] + total / (window * step)

@@ -1,8 +1,8 @@
-"""Simplification of paths: waypoints left out, corners smoothed, straight lines between places of a path.
+"""Compiled simplification of paths: removing waypoints, smoothing corners, shortcuts.
 
-R. Geraerts and M. Overmars, "Creating high-quality paths for motion planning", IJRR 2007, for shortcuts;
-corners are smoothed by the subdivision of B-splines as in W. Thomason, Z. Kingston and L. Kavraki, "Motions
-in Microseconds via Vectorized Sampling-Based Planning", ICRA 2024, and in OMPL's path simplifier.
+Shortcuts follow R. Geraerts and M. Overmars, "Creating high-quality paths for motion planning", IJRR 2007.
+Corners are smoothed by B-spline subdivision as in W. Thomason, Z. Kingston and L. Kavraki, "Motions in
+Microseconds via Vectorized Sampling-Based Planning", ICRA 2024, and in OMPL's path simplifier.
 """
 
 import numpy as np
@@ -13,28 +13,27 @@ from robotdiffuse.collision.kernels.lane_collision import W, make_workspace
 from robotdiffuse.collision.kernels.motions import distance, motion_free, path_length
 
 _ONE, _HALF = np.float32(1.0), np.float32(0.5)
-SMOOTHINGS = 5
-"""Subdivisions of a path between two looks for waypoints that can be left out."""
-LEAST_MOVE = np.float32(0.005)
-"""A corner that smoothing would move less than this stays, and tightening makes no shorter segments [rad]."""
-PAYS = np.float32(1e-3)
-"""A round that takes off a smaller share of the length is the last."""
-LEAVE_OUT, PULL = np.float32(0.1), np.float32(0.35)
-"""Of the changes that tighten a path: the share that leaves a waypoint out, and with that which pulls it
-straight towards its neighbours' chord. The others move it at random besides."""
-FARTHEST, NEARER = np.float32(0.3), np.float32(5.0)
-"""Of random moves of a waypoint: the longest, in each joint [rad], and the logarithm of how much shorter the
-shortest are."""
+MAX_SUBDIVISIONS = 5
+"""Subdivisions in a round of corner smoothing; then waypoints that can be skipped are removed again."""
+MIN_MOVE = np.float32(0.005)
+"""Smoothing leaves a corner that it would move by less; tightening makes no shorter segments [rad]."""
+MIN_GAIN = np.float32(1e-3)
+"""Simplification ends after a round that shortens the path by a smaller share of its length."""
+REMOVE_SHARE, PULL_SHARE = np.float32(0.1), np.float32(0.35)
+"""Tightening removes a waypoint in REMOVE_SHARE of its attempts, and between REMOVE_SHARE and PULL_SHARE
+pulls one straight towards its neighbours' chord. All others pull and also move it at random."""
+MAX_RANDOM_MOVE, RANDOM_MOVE_LOG_RANGE = np.float32(0.3), np.float32(5.0)
+"""Longest random move of a waypoint, in each joint [rad], and the natural logarithm of the ratio of the
+longest to the shortest."""
 
 
 @njit(cache=True, nogil=True)
 def simplify(space, path, rounds):
-    """A path between the same ends that is free and no longer.
+    """A path [n, dof] with the same start and goal that is free and no longer.
 
-    In each of the rounds waypoints that straight lines can skip are left out, corners are smoothed, and
-    skipped again.
+    Waypoints that a straight line can skip are removed; each round then smooths corners and removes again.
     """
-    work, block, a, _ = _room(space, path)
+    work, block, a, _ = _make_scratch(space, path)
     points = _skipped(space, path, block, work)
     length = path_length(points)
     for _ in range(rounds):
@@ -42,11 +41,11 @@ def simplify(space, path, rounds):
             return points
         smooth = _skipped(space, _smoothed(space, points, a, block, work), block, work)
         shorter = path_length(smooth)
-        # halves of segments were not checked again, and their checks fall elsewhere
+        # Smoothing did not check the halves of segments, whose checks fall on other configurations.
         if shorter >= length or not _free(space, smooth, block, work):
             break
         points = smooth
-        if shorter > length * (_ONE - PAYS):
+        if shorter > length * (_ONE - MIN_GAIN):
             break
         length = shorter
     return points
@@ -54,10 +53,12 @@ def simplify(space, path, rounds):
 
 @njit(cache=True, nogil=True)
 def shortcut(space, path, tries, state):
-    """A path between the same ends that is free and no longer: waypoints that straight lines can skip are
-    left out, then come `tries` attempts, in turn a random shortcut between places on different segments and a
-    move of a waypoint into the chord of its neighbours."""
-    work, block, a, b = _room(space, path)
+    """A path [n, dof] with the same start and goal that is free and no longer.
+
+    Waypoints that a straight line can skip are removed. `tries` attempts follow, which alternate between a
+    random shortcut between two segments and a move of a waypoint towards the chord of its neighbours.
+    """
+    work, block, a, b = _make_scratch(space, path)
     points = _skipped(space, path, block, work)
     if tries == 0 or len(points) <= 2:
         return points
@@ -66,31 +67,31 @@ def shortcut(space, path, tries, state):
 
 @njit(cache=True, nogil=True)
 def tighten(space, path, tries, state):
-    """A path between the same ends that is free and no longer, near a given one that is free: after so many
-    attempts to leave out a waypoint drawn at random, or to move it.
+    """A path [n, dof] with the same start and goal that is free and no longer, near a given free one.
 
-    Shortcuts and smoothing end a little above the shortest path of the same way round. Cutting corners gets
-    there, but each corner more makes the motion slower.
+    Each of `tries` attempts removes or moves a random waypoint. Shortcuts and smoothing end a little above
+    the shortest path of the same homotopy class; tightening comes closer without new corners, each of which
+    would slow the motion down.
     """
-    work, block, a, _ = _room(space, path)
+    work, block, a, _ = _make_scratch(space, path)
     points, n = path.copy(), len(path)
     for _ in range(tries):
         if n <= 2:
             break
         i = 1 + min(int(random(state) * np.float32(n - 2)), n - 3)
         change = random(state)
-        if change < LEAVE_OUT:
+        if change < REMOVE_SHARE:
             if motion_free(space, points[i - 1], points[i + 1], block, work):
                 points[i : n - 1] = points[i + 1 : n].copy()
                 n -= 1
         else:
-            _move(space, points, i, change >= PULL, a, block, work, state)
+            _move(space, points, i, change >= PULL_SHARE, a, block, work, state)
     return points[:n].copy()
 
 
 @njit(cache=True)
-def _room(space, path):
-    """What the checks of motions need, and two configurations."""
+def _make_scratch(space, path):
+    """Scratch memory of the motion checks, and two configurations."""
     dof = path.shape[1]
     work, block = make_workspace(space.robot, space.scene), np.empty((dof, W), np.float32)
     return work, block, np.empty(dof, np.float32), np.empty(dof, np.float32)
@@ -106,7 +107,7 @@ def _free(space, path, block, work):
 
 @njit(cache=True)
 def _skipped(space, path, block, work):
-    """The path less the waypoints that straight lines can skip, farthest first."""
+    """The path without the waypoints that straight lines can skip; the farthest reachable one comes next."""
     out = np.empty(path.shape, np.float32)
     n, i = 0, 0
     while True:
@@ -124,10 +125,9 @@ def _skipped(space, path, block, work):
 
 @njit(cache=True)
 def _smoothed(space, path, trial, block, work):
-    """The path with the middles of its segments as waypoints, and its corners drawn towards them,
-    repeatedly."""
+    """The path after repeated subdivision: segment middles become waypoints, corners move towards them."""
     points, dof = path, path.shape[1]
-    for _ in range(SMOOTHINGS):
+    for _ in range(MAX_SUBDIVISIONS):
         finer = np.empty((2 * len(points) - 1, dof), np.float32)
         for i in range(len(points)):
             finer[2 * i] = points[i]
@@ -140,7 +140,7 @@ def _smoothed(space, path, trial, block, work):
                 chord = _HALF * (finer[i - 1, j] + finer[i + 1, j])
                 trial[j] = _HALF * (finer[i, j] + chord)
                 moved += (trial[j] - finer[i, j]) ** 2
-            if moved < LEAST_MOVE * LEAST_MOVE:
+            if moved < MIN_MOVE * MIN_MOVE:
                 continue
             if motion_free(space, finer[i - 1], trial, block, work) and motion_free(
                 space, trial, finer[i + 1], block, work
@@ -170,7 +170,7 @@ def _shortcuts(space, path, tries, a, b, block, work, state):
             s, t = t, s
         i = _place_at(points, n, s, a)
         k = _place_at(points, n, t, b)
-        # the remnants of the cut segments are checked anew: their checks fall elsewhere than before
+        # The rests of both cut segments are checked again: their checks fall on other configurations.
         if (
             i == k
             or not motion_free(space, a, b, block, work)
@@ -195,7 +195,7 @@ def _shortcuts(space, path, tries, a, b, block, work, state):
 
 @allocation_free()
 def _place_at(points, n, length, out):
-    """Writes the place at a length along the path; returns the index of its segment."""
+    """Writes the configuration at a length along the path to `out`; returns the index of its segment."""
     for i in range(n - 1):
         d = distance(points[i], points[i + 1])
         if length <= d or i == n - 2:
@@ -209,7 +209,7 @@ def _place_at(points, n, length, out):
 
 @njit(cache=True)
 def _pull_in(space, points, n, trial, block, work, state):
-    """Moves a random inner waypoint towards the chord of its neighbours as far as stays free (halving)."""
+    """Moves a random inner waypoint towards the chord of its neighbours, by less after each failed check."""
     i = 1 + int(random(state) * np.float32(n - 2))
     i = min(i, n - 2)
     before, after = points[i - 1], points[i + 1]
@@ -228,13 +228,13 @@ def _pull_in(space, points, n, trial, block, work, state):
 
 @njit(cache=True)
 def _move(space, points, i, anywhere, trial, block, work, state):
-    """Moves the i-th waypoint towards the chord of its neighbours, and at random if it may go anywhere, where
-    that is free and shorter."""
+    """Moves waypoint i towards the chord of its neighbours, and at random with `anywhere`, if that is free
+    and shorter."""
     before, at, after = points[i - 1], points[i], points[i + 1]
     d1, d2 = distance(before, at), distance(at, after)
     share = d1 / max(d1 + d2, np.float32(1e-9))
     pull = random(state) ** 2
-    far = FARTHEST * np.exp(-NEARER * random(state)) if anywhere else np.float32(0.0)
+    far = MAX_RANDOM_MOVE * np.exp(-RANDOM_MOVE_LOG_RANGE * random(state)) if anywhere else np.float32(0.0)
     for j in range(points.shape[1]):
         chord = before[j] + share * (after[j] - before[j])
         aside = far * (np.float32(2.0) * random(state) - _ONE)
@@ -242,7 +242,7 @@ def _move(space, points, i, anywhere, trial, block, work, state):
     new1, new2 = distance(before, trial), distance(trial, after)
     if (
         new1 + new2 < d1 + d2
-        and min(new1, new2) >= LEAST_MOVE
+        and min(new1, new2) >= MIN_MOVE
         and motion_free(space, before, trial, block, work)
         and motion_free(space, trial, after, block, work)
     ):

@@ -1,31 +1,34 @@
-"""Compiled timing: places of a blended polyline, the fastest speeds along it, and the rows of a trajectory.
+"""Compiled timing: evaluates rounded polylines, finds the fastest speeds along them, and samples
+trajectories.
 
 The speeds are those of time-optimal path parameterization by reachability analysis (H. Pham and Q.-C. Pham,
-"A new approach to time-optimal path parameterization based on reachability analysis", T-RO 2018): with x = ṡ²
+"A new approach to time-optimal path parameterization based on reachability analysis", T-RO 2018). With x = ṡ²
 and u = s̈ constant in each grid interval, a backward pass finds the greatest x from which the end can be
-reached within all limits, a forward pass then takes the greatest u each time. Limits hold at both ends of an
-interval.
+reached within all limits; a forward pass then takes the greatest u in each interval. Limits hold at both ends
+of an interval.
 """
 
 import numpy as np
 from numba import njit
 
-PARTS = 16
-"""Places in a grid interval where rates are looked at; at 4, a reversal was 1.8 % too fast between them."""
-BETWEEN, ROUNDING = 1.0002, 1 + 1e-9
-"""Spared of limits on curves, since rates between those places were up to 0.025 % greater, and elsewhere."""
-TINY = 1e-7
-"""Derivatives by s, which are of length one on lines, count as zero below this."""
-NEGLIGIBLE = 1e-8
-"""Share of an acceleration limit below which the next speed has no part in an acceleration."""
-LEAST_SHARE = 0.01
-"""What ṡ² at a grid point has at least of the one before and of the most that is possible there: where q' of
-a joint changes its sign, the limits would let a motion be so fast that only a stop can follow."""
+SAMPLES_PER_INTERVAL = 16
+"""Parts of a grid interval at whose ends `slowdown` checks limits; with 4, a reversal was 1.8 % too fast."""
+CURVE_MARGIN, ROUNDING_MARGIN = 1.0002, 1 + 1e-9
+"""Factors on rates before they are compared with limits: on curves, where rates between the checked places
+were up to 0.025 % greater, and on straight lines."""
+NEGLIGIBLE_DERIVATIVE = 1e-7
+"""Smaller components of the first derivative by s, whose norm is one on straight lines, count as zero."""
+NEGLIGIBLE_SHARE = 1e-8
+"""If the next speed contributes less than this share of an acceleration limit, its contribution is
+ignored."""
+MIN_SPEED_RATIO = 0.01
+"""Each ṡ² is at least this share of the previous one and of the greatest possible one. Where a joint's q'
+changes sign, the limits would otherwise allow a speed that only a stop can follow."""
 
 
 @njit(cache=True)
-def place(waypoints, knots, directions, half_widths, s, order, out):
-    """The path (order 0) or its first or second derivative at s, to out[dof]; see `blending`."""
+def evaluate_at(waypoints, knots, directions, half_widths, s, order, out):
+    """Writes the path (order 0) or its first or second derivative at s to out[dof]; see `BlendedPolyline`."""
     segments = len(directions)
     low, high = 0, segments
     while high - low > 1:
@@ -66,32 +69,32 @@ def place(waypoints, knots, directions, half_widths, s, order, out):
 
 
 @njit(cache=True)
-def places(line, s, order):
-    """[m, dof] for the rows of s; `line` is (waypoints, knots, directions, half_widths)."""
+def evaluate(line, s, order):
+    """`evaluate_at` for every value of s, [m, dof]; `line` is (waypoints, knots, directions, half_widths)."""
     waypoints, knots, directions, half_widths = line
     out = np.empty((len(s), waypoints.shape[1]))
     for i in range(len(s)):
-        place(waypoints, knots, directions, half_widths, s[i], order, out[i])
+        evaluate_at(waypoints, knots, directions, half_widths, s[i], order, out[i])
     return out
 
 
 @njit(cache=True)
 def _bounds_of_next(first, second, i, width, x, most, weakest, strongest):
-    """The least and greatest next x from x in interval i, as lines over x: values at 0 and slopes, since x
-    may be so large that the values there cancel. Last, the greatest x within the limits that do not depend
-    on the next x. `most` is the greatest next x.
+    """Bounds of the next x after x in interval i, as linear functions of x; `most` is the greatest next x.
 
-    With u = (y - x) / (2 width), the acceleration of a joint is alpha x + beta y at both ends.
+    Returns value at 0 and slope of the lower bound, the same of the upper bound (at x itself the two parts
+    may cancel), and the greatest x that those limits allow which do not depend on the next x. With u = (y -
+    x) / (2 width), the acceleration of a joint is alpha x + beta y at both ends of the interval.
     """
     high, high_slope = most, 0.0
-    low, low_slope = (0.0, LEAST_SHARE) if x < most else (LEAST_SHARE * most, 0.0)
+    low, low_slope = (0.0, MIN_SPEED_RATIO) if x < most else (MIN_SPEED_RATIO * most, 0.0)
     greatest = np.inf
     for j in range(first.shape[1]):
         for k in range(2):
             pull, curve = first[i + k, j] / (2 * width), second[i + k, j]
             alpha, beta = (-pull, pull + curve) if k else (curve - pull, pull)
             weak, strong = weakest[i + k, j], strongest[i + k, j]
-            if abs(beta) * most <= NEGLIGIBLE * min(strong, -weak):
+            if abs(beta) * most <= NEGLIGIBLE_SHARE * min(strong, -weak):
                 if alpha != 0:
                     greatest = min(greatest, (strong if alpha > 0 else weak) / alpha)
                 continue
@@ -107,12 +110,14 @@ def _bounds_of_next(first, second, i, width, x, most, weakest, strongest):
 
 @njit(cache=True)
 def controllable(first, second, grid, velocity, weakest, strongest):
-    """The greatest ṡ² at each value of the grid s[m] from which the end can be reached at rest within the
-    limits, without a stop before it, from q'[m, dof] and q''[m, dof] there: velocities [dof], least and
-    greatest accelerations [m, dof]. It is above 0 but at the end."""
+    """The greatest ṡ² at each grid point from which the end can be reached at rest without a stop before it.
+
+    first, second: q' and q'' at the grid points, [m, dof]; grid: values of s, [m]; velocity: limits [dof];
+    weakest, strongest: lowest and highest accelerations [m, dof]. The result is positive except at the end.
+    """
     n, dof = first.shape
     x = np.empty(n)
-    for i in range(n):  # what limits of velocity allow
+    for i in range(n):  # velocity limits
         most = np.inf
         for j in range(dof):
             if first[i, j] != 0:
@@ -135,43 +140,44 @@ def controllable(first, second, grid, velocity, weakest, strongest):
 
 
 @njit(cache=True)
-def fastest(first, second, grid, velocity, weakest, strongest, begins=0.0):
-    """ṡ [m] at each value of the grid s[m], `begins` at the first and 0 at the last, from what `controllable`
-    takes; above 0 between them. NaN where the end cannot be reached from so fast a beginning."""
+def fastest_speeds(first, second, grid, velocity, weakest, strongest, start_speed=0.0):
+    """ṡ at each grid point: `start_speed` at the first, 0 at the last, positive between; arguments as of
+    `controllable`. All NaN if the end cannot be reached from the start speed."""
     n = len(grid)
     x = controllable(first, second, grid, velocity, weakest, strongest)
     speeds = np.zeros(n)
-    now = begins * begins
-    if now > x[0] * (1 + TINY):
+    now = start_speed * start_speed
+    if now > x[0] * (1 + NEGLIGIBLE_DERIVATIVE):
         speeds[:] = np.nan
         return speeds
     for i in range(n - 1):
         speeds[i] = np.sqrt(now)
         width = grid[i + 1] - grid[i]
         high, slope = _bounds_of_next(first, second, i, width, now, x[i + 1], weakest, strongest)[2:4]
-        # from x[i] at least so much is possible, and in proportion from less
-        least = LEAST_SHARE * now * min(1.0, x[i + 1] / x[i])
+        # at least this much is possible from x[i], and proportionally less from a smaller x
+        least = MIN_SPEED_RATIO * now * min(1.0, x[i + 1] / x[i])
         now = min(max(high + slope * now, least), x[i + 1])
     return speeds
 
 
 @njit(cache=True)
 def slowdown(line, grid, speeds, velocity, acceleration):
-    """How many times slower the motion must be (at least 1) to keep the limits between grid points too."""
+    """The factor, at least 1, by which the motion must be slowed to keep the limits between grid points
+    too."""
     waypoints, knots, directions, half_widths = line
     dof, worst = waypoints.shape[1], 1.0
     first, second = np.empty(dof), np.empty(dof)
     for i in range(len(grid) - 1):
         width = grid[i + 1] - grid[i]
         pull = (speeds[i + 1] ** 2 - speeds[i] ** 2) / (2 * width)
-        # along a straight part, rates are greatest at its ends
-        place(waypoints, knots, directions, half_widths, grid[i] + 0.5 * width, 2, second)
+        # on a straight part, rates are greatest at its ends
+        evaluate_at(waypoints, knots, directions, half_widths, grid[i] + 0.5 * width, 2, second)
         curved = np.abs(second).max() > 0
-        spare = BETWEEN if curved else ROUNDING
-        for part in range(0, PARTS + 1, 1 if curved else PARTS):
-            at = part / PARTS * width
-            place(waypoints, knots, directions, half_widths, grid[i] + at, 1, first)
-            place(waypoints, knots, directions, half_widths, grid[i] + at, 2, second)
+        spare = CURVE_MARGIN if curved else ROUNDING_MARGIN
+        for part in range(0, SAMPLES_PER_INTERVAL + 1, 1 if curved else SAMPLES_PER_INTERVAL):
+            at = part / SAMPLES_PER_INTERVAL * width
+            evaluate_at(waypoints, knots, directions, half_widths, grid[i] + at, 1, first)
+            evaluate_at(waypoints, knots, directions, half_widths, grid[i] + at, 2, second)
             squared = max(speeds[i] ** 2 + 2 * pull * at, 0.0)
             speed = np.sqrt(squared)
             for j in range(dof):
@@ -182,10 +188,11 @@ def slowdown(line, grid, speeds, velocity, acceleration):
 
 
 @njit(cache=True)
-def sampled(line, grid, speeds, sample_time):
+def sample_rows(line, grid, speeds, sample_time):
     """Times [n], positions, velocities and accelerations [n, dof] of the motion with these speeds.
 
-    Times are multiples of the sample time, then the duration, no nearer than a tenth of the sample time.
+    Times are multiples of the sample time, followed by the duration, at least a tenth of the sample time
+    later.
     """
     waypoints, knots, directions, half_widths = line
     ends = np.zeros(len(grid))
@@ -205,9 +212,9 @@ def sampled(line, grid, speeds, sample_time):
         ago = times[k] - ends[i]
         s = min(grid[i] + (speeds[i] + 0.5 * pull * ago) * ago, knots[-1])
         speed = speeds[i] + pull * ago
-        place(waypoints, knots, directions, half_widths, s, 0, q[k])
-        place(waypoints, knots, directions, half_widths, s, 1, first)
-        place(waypoints, knots, directions, half_widths, s, 2, second)
+        evaluate_at(waypoints, knots, directions, half_widths, s, 0, q[k])
+        evaluate_at(waypoints, knots, directions, half_widths, s, 1, first)
+        evaluate_at(waypoints, knots, directions, half_widths, s, 2, second)
         for j in range(dof):
             velocities[k, j] = first[j] * speed
             accelerations[k, j] = first[j] * pull + second[j] * speed * speed

@@ -1,15 +1,16 @@
-"""Rates of a trajectory: what its positions over its times amount to, and whether it says so itself.
+"""Rates of a trajectory: those that follow from its positions and times, and whether its own rates agree.
 
-Of a motion from rest to rest whose acceleration never exceeds A, the mean velocity of each step is within its
-velocity limit, and each second difference quotient, the arm standing before the first and after the last
-row, is a mean of its accelerations and thus at most A. Velocities v0 and v1 at both ends of a step of h
-seconds leave its length within h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4, the extremes being full
-acceleration and then full braking. So no limit refuses what an arm can do within it. Whether rates agree is
-asked with twice the greatest acceleration that the motion has or says in place of A, where that is less.
+In a motion from rest to rest whose acceleration never exceeds A, the mean velocity of each step is within its
+velocity limit. Each second difference quotient is a mean of its accelerations and thus at most A, if the arm
+is taken to stand still before the first and after the last row. With velocities v0 and v1 at both ends of a
+step of h seconds, the length of the step is within h (v0 + v1) / 2 ± (A h² - (v1 - v0)² / A) / 4; the
+extremes are full acceleration followed by full braking and vice versa. So these tests reject nothing that an
+arm can do within its limits. The test of agreement takes for A twice the greatest acceleration in the motion,
+computed or written, if that is less.
 
-Positions are known to a resolution only, which over a step of nanoseconds hides any velocity. So where rows
-are closer than a millisecond, all this is asked from each row to each later one too, with the resolution of
-these two alone.
+Positions are known only to a resolution, which over a step of nanoseconds hides any velocity. Where rows are
+closer than a millisecond, the tests are therefore repeated from each row to later ones, with the resolution
+of these two rows alone.
 """
 
 from collections.abc import Callable, Iterator
@@ -23,28 +24,31 @@ from numpy import ndarray
 from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.robot import Robot
 
-WINDOWS = (1e-3, 4e-3, 16e-3)
-"""Where rows are closer than the first of these [s], mean accelerations are asked for over times of at least
-each; over shorter ones, the resolution of positions hides any."""
-SHORTEST = 1e-12
-"""Shorter times count as this one [s], so that rates over them are finite."""
+AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
+"""Where rows are closer than the first of these [s], mean accelerations are tested over windows of at least
+each length; over shorter ones, the resolution of positions would hide them."""
+MIN_TIME = 1e-12
+"""Shorter times are taken as this [s], so that rates over them are finite."""
 
 
 @dataclass(frozen=True)
 class RateTolerances:
+    """Tolerances of `rate_violations`."""
+
     slack: float
-    """Share by which limits may be exceeded, and share of a velocity limit that counts as none."""
+    """Share by which limits may be exceeded, and share of a velocity limit that counts as rest."""
     agreement: float
-    """Share of a joint's greatest acceleration by which one may lie outside of the means beside its row."""
+    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the mean
+    accelerations before and after the row."""
     jump: float
-    """Times the velocity limit from which a step is a jump."""
+    """A step faster than this times the velocity limit is a jump."""
     resolution: float
-    """Positions are taken as known to this [rad] or [m]."""
+    """Accuracy of positions [rad] or [m]."""
 
 
 @dataclass(frozen=True)
-class WrongRate:
-    """The first of its kind."""
+class RateViolation:
+    """The first violation of its kind along the trajectory."""
 
     kind: str
     """rest, jump, velocity, acceleration or rates."""
@@ -53,21 +57,22 @@ class WrongRate:
     joint: str
     message: str
     excess: float
-    """Beyond what is allowed, in the rate's unit."""
+    """Amount beyond the allowed value, in the rate's unit."""
 
 
-def wrong_rates(
+def rate_violations(
     robot: Robot,
     trajectory: Trajectory,
     tolerances: RateTolerances,
     start_velocity: Float[ndarray, "dof"] | None = None,
-) -> list[WrongRate]:
-    """What is wrong with the rates of finite rows at increasing times; the first of each kind. The motion is
-    to begin at rest, or at `start_velocity`.
+) -> list[RateViolation]:
+    """The first violation of each kind in the rates of a trajectory, whose rows are finite and times
+    increase.
 
-    A limit of 0 stands for one that the robot does not give: there the rates need only agree.
+    The motion must begin at `start_velocity` [dof], by default at rest, and end at rest. A limit of 0 means
+    that the robot gives none: then the rates must only agree with each other.
     """
-    found: dict[str, WrongRate] = {}
+    found: dict[str, RateViolation] = {}
     with np.errstate(over="ignore", invalid="ignore"):
         begins = np.zeros(robot.dof) if start_velocity is None else start_velocity
         checks = list(_checks(robot, trajectory, tolerances, begins))
@@ -82,13 +87,16 @@ def wrong_rates(
         if check.kind not in found or time < found[check.kind].time:
             name, rate = robot.joint_names[j], abs(float(check.rates[i, j]))
             message = f"{name} at {time:.3f} s: its {check.what} is {rate:.6g}, {check.right(i, j)}"
-            found[check.kind] = WrongRate(check.kind, time, name, message, float(beyond[i, j]))
+            found[check.kind] = RateViolation(check.kind, time, name, message, float(beyond[i, j]))
     return list(found.values())
 
 
-def between_rows(trajectory: Trajectory, chord: float) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
-    """Times and positions of a trajectory, with further rows on the cubics through its rows' positions and
-    velocities, so that straight lines between rows leave those by no more than `chord` [rad] or [m]."""
+def sample_cubics(
+    trajectory: Trajectory, chord: float
+) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
+    """Times [m] and positions [m, dof] of a trajectory, with added rows on the cubics through its rows'
+    positions and velocities, such that straight lines between rows leave the cubics by at most `chord` [rad]
+    or [m]."""
     times, q, v = trajectory.times, trajectory.positions, trajectory.velocities
     step = np.diff(times)[:, None]
     mean = (q[1:] - q[:-1]) / step
@@ -108,17 +116,18 @@ def between_rows(trajectory: Trajectory, chord: float) -> tuple[Float[ndarray, "
 
 
 class _Check(NamedTuple):
-    """Rows are those of the trajectory, from its first."""
+    """One test of the rates; row i belongs to row i of the trajectory."""
 
     kind: str
     what: str
+    """The rate in words."""
     rates: Float[ndarray, "n dof"]
     off: Float[ndarray, "n dof"]
-    """How far the rates are off, ..."""
+    """Deviation of the rates."""
     allowed: Float[ndarray, "#n dof"]
-    """... and how far they may be."""
+    """Allowed deviation."""
     right: Callable[[int, int], str]
-    """What would be right, by row and joint."""
+    """The expected value in words, by row and joint."""
 
 
 def _checks(
@@ -128,9 +137,9 @@ def _checks(
     step = np.diff(trajectory.times)[:, None]
     mean, change = (q[1:] - q[:-1]) / step, (v[1:] - v[:-1]) / step
     blur = 2 * tolerances.resolution / step
-    """Of the mean velocities, as positions are not known better."""
+    """Uncertainty of the mean velocities, from the resolution of positions."""
     share = 1 + tolerances.slack
-    nothing = tolerances.slack * _known(robot.velocity, v, mean)
+    nothing = tolerances.slack * _limits_or_peaks(robot.velocity, v, mean)
 
     def limited(kind: str, what: str, rates: ndarray, limit: ndarray, allowed: ndarray) -> _Check:
         known = allowed if (limit > 0).all() else np.where(limit > 0, allowed, np.inf)
@@ -157,86 +166,89 @@ def _checks(
     yield limited("acceleration", "mean acceleration by its velocities", change, most, share * most)
     yield limited("acceleration", "acceleration", a, most, share * most)
 
-    # Rows may miss the peaks of what accelerates the motion, but not by half.
-    own = np.maximum(_greatest(a, second, change), tolerances.slack * robot.acceleration)
+    # Rows may miss the peaks of the acceleration, but not by half.
+    own = np.maximum(_peak(a, second, change), tolerances.slack * robot.acceleration)
     strongest = np.where(most > 0, np.minimum(share * most, 2 * own), 2 * own)
     spent = np.divide(change**2, strongest, out=np.zeros_like(change), where=strongest > 0)
     possible = np.maximum(strongest - spent, 0.0) * step / 4 + nothing
-    """Between mean velocities and those that the rows say."""
+    """Allowed difference between mean velocities and the means of the rows' velocities."""
     yield _Check(
         "rates",
         onwards,
         mean,
         np.abs(mean - (v[1:] + v[:-1]) / 2),
         possible + blur,
-        lambda i, j: f"the velocities that these rows say are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
+        lambda i, j: f"but the velocities of these rows are {v[i, j]:.6g} and {v[i + 1, j]:.6g}",
     )
     beside = _padded(change[:1], change, change[-1:])
     low, high = np.minimum(beside[1:], beside[:-1]), np.maximum(beside[1:], beside[:-1])
     outside = np.maximum(low - a, a - high)
     if begins.any():
-        outside[0] = 0.0  # nothing is known of the motion before, which may have ended in any acceleration
+        outside[0] = 0.0  # the motion before is unknown and may have ended in any acceleration
     yield _Check(
         "rates",
         "acceleration",
         a,
         outside,
         tolerances.agreement * np.where(most > 0, np.minimum(most, own), own),
-        lambda i, j: f"by its velocities between {low[i, j]:.6g} and {high[i, j]:.6g}",
+        lambda i, j: f"but its velocities give {low[i, j]:.6g} to {high[i, j]:.6g}",
     )
 
-    if step.min(initial=np.inf) >= WINDOWS[0]:
+    if step.min(initial=np.inf) >= AVERAGING_WINDOWS[0]:
         return
     times, resolution = trajectory.times, tolerances.resolution
     onwards = "mean velocity from an earlier row to here"
     most = robot.velocity
-    first, span = _since(times, q, (times - times[0])[:, None] * share * most)
-    moved = _changes(q, first) / span
+    first, span = _worst_earlier_row(times, q, (times - times[0])[:, None] * share * most)
+    moved = _change_since(q, first) / span
     yield limited("velocity", onwards, moved, most, share * most + 2 * resolution / span)
 
-    said, room = _summed(step * (v[1:] + v[:-1]) / 2), _summed(step * possible)
-    first, span = _since(times, q - said, room)
-    moved, told = _changes(q, first) / span, _changes(said, first) / span
+    said, room = _cumulative(step * (v[1:] + v[:-1]) / 2), _cumulative(step * possible)
+    first, span = _worst_earlier_row(times, q - said, room)
+    moved, told = _change_since(q, first) / span, _change_since(said, first) / span
     yield _Check(
         "rates",
         onwards,
         moved,
         np.abs(moved - told),
-        (_changes(room, first) + 2 * resolution) / span,
-        lambda i, j: f"the one that its velocities amount to is {told[i, j]:.6g}",
+        (_change_since(room, first) + 2 * resolution) / span,
+        lambda i, j: f"but its velocities give {told[i, j]:.6g}",
     )
 
     most = robot.acceleration
-    for window in WINDOWS:
+    for window in AVERAGING_WINDOWS:
         second, unsure = _second_differences(trajectory, begins, window, resolution, nothing)
         what = f"mean acceleration by its positions over {1e3 * window:g} ms and more"
         yield limited("acceleration", what, second, most, share * most + unsure)
 
 
-def _summed(steps: Float[ndarray, "m dof"]) -> Float[ndarray, "n dof"]:
-    """By row."""
+def _cumulative(steps: Float[ndarray, "m dof"]) -> Float[ndarray, "n dof"]:
+    """Sums of all steps before each row."""
     return np.concatenate([np.zeros((1, steps.shape[1])), np.cumsum(steps, axis=0)])
 
 
-def _since(
+def _worst_earlier_row(
     times: Float[ndarray, "n"], way: Float[ndarray, "n dof"], allowed: Float[ndarray, "n dof"]
 ) -> tuple[Int[ndarray, "n dof"], Float[ndarray, "n dof"]]:
-    """For each row the earlier one since which a joint's way has changed most beyond what `allowed` has grown
-    by, in either direction, and the time since then [s]; itself where there is none."""
+    """For each row and joint the earlier row with the largest excess, and the time since then [s].
+
+    The excess is the change of `way` since that row, in either direction, minus the growth of `allowed`. The
+    first row refers to itself.
+    """
     rows, beyond = np.arange(len(way))[:, None], np.full(way.shape, -np.inf)
     first = np.broadcast_to(rows, way.shape)
     for signed in (way, -way):
         room = signed - allowed
         least = np.minimum.accumulate(room, axis=0)
         at = np.maximum.accumulate(np.where(room <= least, rows, 0), axis=0)
-        # not the row itself
+        # shifted by one row to exclude the row itself
         least, at = np.concatenate([room[:1], least[:-1]]), np.concatenate([first[:1], at[:-1]])
         first = np.where(room - least > beyond, at, first)
         beyond = np.maximum(beyond, room - least)
-    return first, np.maximum(times[:, None] - times[first], SHORTEST)
+    return first, np.maximum(times[:, None] - times[first], MIN_TIME)
 
 
-def _changes(rows: Float[ndarray, "n dof"], first: Int[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
+def _change_since(rows: Float[ndarray, "n dof"], first: Int[ndarray, "n dof"]) -> Float[ndarray, "n dof"]:
     return rows - np.take_along_axis(rows, first, axis=0)
 
 
@@ -247,8 +259,9 @@ def _second_differences(
     resolution: float,
     nothing: Float[ndarray, "dof"],
 ) -> tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"]]:
-    """Mean accelerations by positions, about each row, from and to the first rows at least `window` [s] away,
-    and how unsure they are; before and after the motion the arm moves as it begins, and stands."""
+    """Mean accelerations about each row, from positions at the nearest rows at least `window` [s] away, and
+    their uncertainty. Before the motion the arm moves at its start velocity, and afterwards it stands
+    still."""
     times, q = trajectory.times, trajectory.positions
     clock = np.concatenate([times[:1] - window, times, times[-1:] + window])
     rows = _padded(q[:1] - window * begins, q, q[-1:])
@@ -265,10 +278,10 @@ def _padded(before: ndarray, rows: ndarray, after: ndarray) -> ndarray:
     return np.concatenate([before, rows, after])
 
 
-def _known(limit: Float[ndarray, "dof"], *rates: ndarray) -> Float[ndarray, "dof"]:
-    """The limits; the greatest of the rates where there is none."""
-    return np.where(limit > 0, limit, _greatest(*rates))
+def _limits_or_peaks(limit: Float[ndarray, "dof"], *rates: ndarray) -> Float[ndarray, "dof"]:
+    """The limits, or the greatest rate of a joint without a limit."""
+    return np.where(limit > 0, limit, _peak(*rates))
 
 
-def _greatest(*rates: ndarray) -> Float[ndarray, "dof"]:
+def _peak(*rates: ndarray) -> Float[ndarray, "dof"]:
     return np.abs(np.concatenate(rates)).max(axis=0, initial=0.0)

@@ -1,4 +1,4 @@
-"""What counts as right: the validator's settings, and how far a configuration is off a goal."""
+"""The validator's settings, and the error of a configuration with respect to a goal."""
 
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -16,11 +16,10 @@ from robotdiffuse.robots.robot import Robot
 
 @dataclass(frozen=True)
 class VerifySettings(Settings, name="verify"):
-    """What counts as a violation."""
+    """Tolerances of the validator."""
 
     contact: Positive = 1e-4
-    """Meshes closer than this [m] count as touching; at or above it, clearances are certified, the smaller it
-    is, the longer it takes."""
+    """Meshes closer than this count as touching [m]. A smaller value takes longer to certify."""
     limit_slack: NotNegative = 1e-6
     """Joint limits may be exceeded by this [rad] or [m]."""
     start_tolerance: NotNegative = 1e-6
@@ -32,53 +31,58 @@ class VerifySettings(Settings, name="verify"):
     goal_angle: NotNegative = float(np.radians(15))
     """Largest angle from the orientation of a goal pose [rad] (the paper's 15 degrees)."""
     goal_slack: NotNegative = 1e-5
-    """Tolerances that a pose states may be exceeded by this [m] or [rad]."""
+    """The tolerances in a pose goal may be exceeded by this [m] or [rad]."""
     rest: NotNegative = 1e-6
-    """A motion stands still where no joint is faster than this [rad/s] or [m/s]."""
+    """The arm is at rest where no joint is faster than this [rad/s] or [m/s]."""
     rate_slack: NotNegative = 0.01
-    """Share by which a trajectory may exceed velocity, acceleration and effort limits; also the share of a
-    velocity limit by which the velocities that it says may be off, and at which it is at rest."""
+    """Share by which a trajectory may exceed velocity, acceleration and effort limits. Also the share of a
+    velocity limit by which its velocities may disagree with its positions, and below which it starts and ends
+    at rest."""
     rate_agreement: NotNegative = 0.5
-    """Share of the greatest acceleration of the joint by which one that a trajectory says may lie outside of
-    the mean ones before and after its row."""
+    """Share of a joint's greatest acceleration by which a row's acceleration may leave the range of the mean
+    accelerations before and after the row."""
     jump: Positive = 1.5
-    """A step of a trajectory longer than this times what the velocity limit allows in its time is a jump."""
+    """A step of a trajectory is a jump if its mean velocity exceeds this times the velocity limit."""
     chord: Positive = 1e-3
-    """Between rows a trajectory is validated on straight lines, unless the cubic through their positions and
-    velocities, as controllers follow it, leaves them by more than this [rad] or [m]: then along the cubic."""
+    """Between rows a trajectory is validated on straight lines. Where the cubic through the rows' positions
+    and velocities, which controllers follow, leaves them by more than this [rad] or [m], rows on the cubic
+    are added."""
     constraint_chord: Positive = 1e-6
-    """Path constraints are validated along that cubic always: on straight lines that leave it by no more than
-    this [rad] or [m], which is taken from their tolerances."""
+    """The same for path constraints. This distance is subtracted from their tolerances."""
     reversal_angle: NotNegative = float(np.radians(150))
-    """A turn in joint space by more than this [rad] is a sharp reversal ..."""
+    """A change of direction in joint space by more than this [rad] is a sharp reversal."""
     reversal_step: NotNegative = 0.05
-    """... if the straight moves before and after it are both at least this long [rad, joint-space L2]."""
+    """Only reversals between straight moves of at least this length count [rad, joint-space L2]."""
     reversals: Natural = 3
-    """More sharp reversals than this are twitching."""
+    """A motion with more sharp reversals than this twitches."""
     tightness: Annotated[float, Bound(above=0.0, below=1.0)] = 0.5
-    """Each clearance of a `Report` is at least this share of the least one that was measured, in (0, 1)."""
+    """The certified clearances of a `Report` are at least this share of the smallest measured one, in (0,
+    1)."""
 
 
 DEFAULT = VerifySettings()
-LOOKS = 0.25
-"""Share of a blend between places at which a motion is looked at [rad, joint-space L2]."""
+BLEND_SAMPLE_SHARE = 0.25
+"""A blend is tested at configurations at most this share of its radius apart [joint-space L2]."""
 
 
 class GoalError(NamedTuple):
-    """How far a configuration is off a goal."""
+    """Why a configuration is not at a goal."""
 
     message: str
     subject: str | None
+    """The frame of a pose goal."""
     excess: float
+    """Largest joint error [rad] or [m], or the position error of a pose [m]."""
 
 
 def goal_error(
     robot: Robot, goal: Goal, q: Float[ndarray, "dof"], settings: VerifySettings = DEFAULT, blend: float = 0.0
 ) -> GoalError | None:
-    """How far a configuration is off a goal, of several the nearest by its own measure; None at the goal.
+    """The error of a configuration with respect to a goal; None at the goal. Of several goals, the smallest
+    error.
 
-    `blend`: how far off it may be: from a configuration in joint space [rad, L2], from the position of a pose
-    or the box that it may be in [m].
+    `blend`: radius within which the goal counts as reached: around a configuration in joint space [rad, L2],
+    around the position of a pose, or the box of its tolerances [m].
     """
     if isinstance(goal, AnyGoal):
         errors = [goal_error(robot, one, q, settings, blend) for one in goal.goals]
@@ -114,7 +118,7 @@ def goal_error(
     return GoalError(message, goal.frame, distance)
 
 
-def passes(
+def first_place_within(
     robot: Robot,
     goal: Goal,
     q: Float[ndarray, "n dof"],
@@ -122,20 +126,26 @@ def passes(
     settings: VerifySettings = DEFAULT,
     after: float = 0.0,
 ) -> float | None:
-    """Where the way through configurations, from a place on, first comes within `blend` of a goal: a row plus
-    the share of the way to the next. None if it is not seen to at places `LOOKS` of the blend apart."""
-    places, way = looked_at(q, LOOKS * blend, after)
+    """The first place after `after` where a path through configurations comes within `blend` of a goal.
+
+    A place is a row plus the share of the way to the next. None if no sample of the path comes so near;
+    samples are BLEND_SAMPLE_SHARE of the blend apart.
+    """
+    places, way = sample_path(q, BLEND_SAMPLE_SHARE * blend, after)
     for i in np.flatnonzero(_near(robot, goal, way, blend, settings)):
         if goal_error(robot, goal, way[i], settings, blend) is None:
             return float(places[i])
     return None
 
 
-def looked_at(
+def sample_path(
     q: Float[ndarray, "n dof"], step: float, after: float = 0.0
 ) -> tuple[Float[ndarray, "m"], Float[ndarray, "m dof"]]:
-    """Places at most a step [rad, joint-space L2] apart on the way through configurations, from a place on:
-    rows plus shares of the way to the next; and the configurations there."""
+    """Places after `after` at most a step apart [rad, joint-space L2] on a path, and the configurations
+    there.
+
+    A place is a row plus the share of the way to the next.
+    """
     steps = np.linalg.norm(np.diff(q, axis=0), axis=1)
     counts = np.maximum(np.ceil(steps / step), 1).astype(int)
     shares = [np.arange(count) / count for count in counts]
@@ -147,7 +157,7 @@ def looked_at(
 def _near(
     robot: Robot, goal: Goal, q: Float[ndarray, "n dof"], blend: float, settings: VerifySettings
 ) -> Bool[ndarray, "n"]:
-    """Which configurations may be within `blend` of a goal, by position alone."""
+    """Marks configurations that may be within `blend` of a goal, by position alone."""
     if isinstance(goal, AnyGoal):
         return np.any([_near(robot, one, q, blend, settings) for one in goal.goals], axis=0)
     if isinstance(goal, PosesGoal):
@@ -168,7 +178,7 @@ def _within(values: ndarray, tolerance: ndarray, slack: float) -> bool:
 
 
 def _turned(rotation: ndarray, tolerance: ndarray, slack: float) -> bool:
-    """Whether roll, pitch and yaw are within the tolerance, by either of the two ways to give a rotation."""
+    """Whether roll, pitch and yaw are within the tolerance, in either of their two representations."""
     roll, pitch, yaw = rpy_from_rotation(rotation)
     other = np.array([roll + np.pi, np.pi - pitch, yaw + np.pi])
     ways = np.array([roll, pitch, yaw]), (other + np.pi) % (2 * np.pi) - np.pi

@@ -1,8 +1,8 @@
-"""Torques along motions: the first that is beyond its limit; between looks it is proved that none is.
+"""Torques along motions: finds the first one beyond its limit, or proves that there is none.
 
-A motion is pieces on which positions are cubic, or straight, and what they amount to is smooth. A piece is
-looked at at its ends. Where the bend of its torques (see robots/torque_bounds.py) leaves room for more than a
-joint's limit in between, it is halved.
+A motion consists of pieces with cubic or straight positions and smooth torques. Torques are computed at both
+ends of a piece. Where the bound on their second derivative (see robots/torque_bounds.py) allows a torque
+beyond its limit in between, the piece is halved.
 """
 
 from collections.abc import Callable
@@ -16,42 +16,45 @@ from robotdiffuse.core.types import Trajectory
 from robotdiffuse.robots.dynamics import Dynamics
 from robotdiffuse.robots.torque_bounds import Stretches
 
-RESOLUTION = 1e-3
-"""Share of a limit to which a torque between two looks is told from one beyond it."""
-MOST_OPEN = 100_000
-"""Stretches that are halved at a time; of more, as of motions that wind on and on, nothing is shown."""
-FINE = 1 / 64
-"""Of a piece, to which the place is found where a torque comes to be beyond."""
+TORQUE_RESOLUTION = 1e-3
+"""Halving ends where a torque is known up to this share of its limit; if it may exceed the limit, it counts
+so."""
+MAX_OPEN_PIECES = 100_000
+"""Open pieces at most; if there are more, as in motions with very many turns, they count as beyond the
+limit."""
+PLACE_RESOLUTION = 1 / 64
+"""The place where a torque first exceeds its limit is located to this share of a piece."""
 States = tuple[Float[ndarray, "n dof"], Float[ndarray, "n dof"], Float[ndarray, "n dof"]]
 """Positions, velocities and accelerations."""
 
 
 class Pieces(NamedTuple):
-    """Of a motion, from row to row."""
+    """The pieces of a motion, from each row to the next."""
 
     states: Callable[[Int[ndarray, "n"], Float[ndarray, "n"]], States]
-    """At shares of pieces."""
+    """States by piece and share of the piece."""
     along: Stretches
-    """Derivatives by the share."""
+    """Bounds along each piece, with derivatives by the share."""
 
 
-class Beyond(NamedTuple):
-    """The first torque that is beyond its limit, or not shown to be within."""
+class TorqueExcess(NamedTuple):
+    """The first torque that exceeds its limit, or is not proved to be within it."""
 
     place: float
     """Row plus the share of the way to the next."""
     joint: int
     torque: float
+    """[N m] or [N]"""
     excess: float
-    """Greatest of that joint along the motion; unit of the torque."""
+    """Largest excess of that joint along the motion [N m] or [N]."""
 
 
-def pieces_of(trajectory: Trajectory) -> Pieces:
-    """Between the rows of a trajectory at increasing times: cubics through positions and velocities, lines
-    between the accelerations that it says."""
+def trajectory_pieces(trajectory: Trajectory) -> Pieces:
+    """Pieces of a trajectory, whose times increase: cubics through positions and velocities, and
+    accelerations interpolated linearly."""
     q, v, a = trajectory.positions, trajectory.velocities, trajectory.accelerations
     if len(q) == 1:
-        return pieces_held(q)
+        return static_pieces(q)
     h = np.diff(trajectory.times)[:, None]
     mean, change = np.diff(q, axis=0) / h, np.diff(a, axis=0)
     first, last = v[:-1] - mean, v[1:] - mean
@@ -62,7 +65,7 @@ def pieces_of(trajectory: Trajectory) -> Pieces:
         speeds = mean[piece] + (1 - u) * (1 - 3 * u) * b - u * (2 - 3 * u) * e
         return there, speeds, a[piece] + u * change[piece]
 
-    # by the share: the velocity is a parabola, which leaves its chord by an eighth of its second derivative
+    # The velocity is a parabola in the share, which leaves its chord by an eighth of its second derivative.
     third = 6 * np.abs(first + last)
     second = np.maximum(np.abs(4 * first + 2 * last), np.abs(2 * first + 4 * last))
     most = np.maximum(np.abs(v[:-1]), np.abs(v[1:])) + third / 8
@@ -71,8 +74,8 @@ def pieces_of(trajectory: Trajectory) -> Pieces:
     return Pieces(states, Stretches(_farthest(q) + h * most / 2, h * speed, speed, pull))
 
 
-def pieces_held(q: Float[ndarray, "n dof"]) -> Pieces:
-    """Between configurations that are held, on straight lines."""
+def static_pieces(q: Float[ndarray, "n dof"]) -> Pieces:
+    """Pieces of a path on straight lines, at rest everywhere."""
     q = np.repeat(q, 2, axis=0) if len(q) == 1 else q
     step = np.diff(q, axis=0)
     still = np.zeros((3, *step.shape))
@@ -90,8 +93,9 @@ def _farthest(q: Float[ndarray, "n dof"]) -> Float[ndarray, "m dof"]:
     return np.maximum(np.abs(q[:-1]), np.abs(q[1:]))
 
 
-def first_beyond(dynamics: Dynamics, pieces: Pieces, slack: float) -> Beyond | None:
-    """The first torque that exceeds its limit by more than a share; None if it is proved that none does."""
+def first_excess(dynamics: Dynamics, pieces: Pieces, slack: float) -> TorqueExcess | None:
+    """The first torque that exceeds its limit by more than a share `slack`; None if it is proved that none
+    does."""
     allowed, bends = dynamics.limits * (1 + slack), dynamics.bends(pieces.along)
     count = len(bends)
     piece, low, high = np.arange(count), np.zeros(count), np.ones(count)
@@ -108,13 +112,13 @@ def first_beyond(dynamics: Dynamics, pieces: Pieces, slack: float) -> Beyond | N
         most = np.maximum(at_low, at_high)
         open_ = most + bulge > allowed
         begun, goes_on = (at_low > allowed).any(axis=1), (at_high > allowed).any(axis=1)
-        unsure = np.minimum(bulge, RESOLUTION * dynamics.limits)
-        last = bulge <= unsure if len(piece) <= MOST_OPEN else np.ones_like(open_)
+        unsure = np.minimum(bulge, TORQUE_RESOLUTION * dynamics.limits)
+        last = bulge <= unsure if len(piece) <= MAX_OPEN_PIECES else np.ones_like(open_)
         over, lost = begun | goes_on, (open_ & last).any(axis=1)
         wrong = np.flatnonzero(over | lost)
         places.append(piece[wrong] + np.where(over & ~begun, high, low)[wrong])
         torques.append(np.where(most > allowed, most, most + unsure)[wrong])
-        coarse = over & (begun != goes_on) & (high - low > FINE)
+        coarse = over & (begun != goes_on) & (high - low > PLACE_RESOLUTION)
         halved = open_.any(axis=1) & (coarse | ~(over | lost))
         piece, low, high = piece[halved], low[halved], high[halved]
         middle = (low + high) / 2
@@ -127,4 +131,4 @@ def first_beyond(dynamics: Dynamics, pieces: Pieces, slack: float) -> Beyond | N
         return None
     i = int(place.argmin())
     j = int(beyond[i].argmax())
-    return Beyond(float(place[i]), j, float(beyond[i, j] + allowed[j]), float(beyond[:, j].max()))
+    return TorqueExcess(float(place[i]), j, float(beyond[i, j] + allowed[j]), float(beyond[:, j].max()))

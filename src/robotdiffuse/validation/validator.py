@@ -1,8 +1,7 @@
-"""The validator: is a motion free of collision, within limits, and from the start to the goal?
+"""The validator: whether a motion is free of collision, within limits, and leads from the start to the goal.
 
-Collision between waypoints is settled by a certificate, not by sampling: see collision/motions.py. The rates
-of a trajectory are those of its positions over its times, whatever it says of itself: see rates.py. The validator
-knows nothing of planners.
+Freedom from collision between waypoints is certified, not sampled: see collision/motions.py. The rates of a
+trajectory are computed from its positions and times: see rates.py. The validator does not depend on planners.
 """
 
 from dataclasses import dataclass
@@ -20,27 +19,27 @@ from robotdiffuse.core.errors import InputError, check_type, joined, shown
 from robotdiffuse.core.types import ROWS, Path, Trajectory
 from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.dynamics import Dynamics
-from robotdiffuse.validation.rates import RateTolerances, between_rows, wrong_rates
-from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, goal_error, passes
-from robotdiffuse.validation.torques import Pieces, first_beyond, pieces_held, pieces_of
+from robotdiffuse.validation.rates import RateTolerances, rate_violations, sample_cubics
+from robotdiffuse.validation.tolerances import DEFAULT, VerifySettings, first_place_within, goal_error
+from robotdiffuse.validation.torques import Pieces, first_excess, static_pieces, trajectory_pieces
 
 if TYPE_CHECKING:  # what most problems do not need is imported where one does
     from robotdiffuse.collision.moving_obstacles import MovingCollision, TimedContact
     from robotdiffuse.problems.compiled_constraints import PathConstraints
 
-LONGEST = 1e5
-"""Motion that is validated [s], about a day."""
+MAX_DURATION = 1e5
+"""Longest motion that is validated, about a day [s]."""
 
 
 @dataclass(frozen=True)
 class Violation:
-    """The first thing along the motion that is wrong."""
+    """A requirement that a motion violates."""
 
     kind: str
     """not_finite, start, limits, scene_collision, self_collision, constraint, torque, twitch, waypoint or
     goal; for trajectories also time, rest, velocity, acceleration, jump, rates and speed."""
     time: float
-    """Where: for a path, waypoint index plus fraction of the segment; for a trajectory, seconds."""
+    """Its place: for a path, waypoint index plus fraction of the segment; for a trajectory, time [s]."""
     message: str
     """One line."""
     subject: str | None = None
@@ -48,24 +47,24 @@ class Violation:
     other: str | None = None
     """The obstacle, the other link or the kind of constraint."""
     excess: float | None = None
-    """By how much: the greatest depth until the contact ends [m], the greatest value of a constraint until it
-    is kept; beyond the limit, or off the goal, in its unit."""
+    """Amount of the violation: the greatest depth until the contact ends [m], the greatest value of a
+    constraint until it is kept again, or the excess over a limit or error at the goal in its unit."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """The verdict."""
+    """The result of a validation."""
 
     valid: bool
     violation: Violation | None
-    """None if and only if the motion is valid."""
+    """The first violation; None if and only if the motion is valid."""
     scene_clearance: float | None
-    """No point of a moving link comes nearer to an obstacle than this [m]: a lower bound over the whole
-    motion, at most 1 m. None for an invalid motion."""
+    """Certified lower bound on the distance of all moving links to all obstacles over the whole motion [m],
+    at most 1 m. None for an invalid motion."""
     self_clearance: float | None
-    """The same to the links that it is checked against."""
+    """The same between links that are checked against each other [m]."""
     found: tuple[Violation, ...] = ()
-    """All that was seen to be wrong, the first of its kind; see `violations` for every contact."""
+    """All violations that were found, the first of each kind; `violations` also finds every contact."""
 
     @property
     def min_clearance(self) -> float | None:
@@ -76,20 +75,26 @@ class Report:
 
 
 def verify(problem: Problem, path: Path, settings: VerifySettings = DEFAULT) -> Report:
-    """Validate a path for a problem. It has no times, so obstacles that move are left to `verify_trajectory`.
-    Raises InputError if its joints are not those of the robot."""
+    """Validate a path for a problem, with respect to everything but moving obstacles, since a path has no
+    times.
+
+    Raises InputError if the path's joints are not those of the robot, or its shape is wrong.
+    """
     return _verifier(problem, settings).path(path)
 
 
 def verify_trajectory(problem: Problem, trajectory: Trajectory, settings: VerifySettings = DEFAULT) -> Report:
-    """Validate a trajectory with its rates and times, and among obstacles that move from its first row to its
-    last. Its velocities and accelerations must be those of its positions, from rest, or the problem's start
-    velocity, to rest; for what is between the rows see `VerifySettings.chord`."""
+    """Validate a trajectory for a problem, with its rates and times, and among moving obstacles.
+
+    Its velocities and accelerations must agree with its positions. It must begin at rest, or at the problem's
+    start velocity, and end at rest. `VerifySettings.chord` says how it is validated between its rows. Raises
+    InputError if its joints are not those of the robot, or its shapes are wrong.
+    """
     return _verifier(problem, settings).trajectory(trajectory)
 
 
 def check_motion(what: str, motion: object, kinds: tuple[type, ...]) -> None:
-    """InputError for anything but a motion of one of these kinds."""
+    """Raise InputError unless `motion` is a motion of one of these kinds, with arrays of numbers."""
     known = {Path: "a Path, e.g. result.path", Trajectory: "a Trajectory, e.g. result.trajectory"}
     check_type(what, motion, kinds, ", or ".join(known[kind] for kind in kinds))
     check_type(f"{what}.joint_names", motion.joint_names, (tuple, list), "a tuple of names")  # type: ignore
@@ -100,14 +105,14 @@ def check_motion(what: str, motion: object, kinds: tuple[type, ...]) -> None:
 
 
 def _verifier(problem: object, settings: object) -> "Verifier":
-    """That of a problem; InputError for what is none."""
+    """The Verifier of a problem; raises InputError if it is not a Problem."""
     check_problem(problem)
     check_type("settings", settings, VerifySettings, "VerifySettings")
     return verifier(problem, settings)  # type: ignore[arg-type]
 
 
 class Verifier:
-    """Validates motions for one problem; what the robot and the scene need is prepared once."""
+    """Validates motions for one problem; data of the robot and the scene is prepared once."""
 
     def __init__(self, problem: Problem, settings: VerifySettings = DEFAULT) -> None:
         self.problem, self.settings, self.robot = problem, settings, problem.robot
@@ -119,7 +124,7 @@ class Verifier:
         found = []
         if self.dynamics is not None and within(path.positions):
             clock = np.arange(len(path.positions), dtype=float)
-            found = self._torques(clock, pieces_held(path.positions), " to hold the payload")
+            found = self._torques(clock, static_pieces(path.positions), " to hold the payload")
         return self._report(path.positions, None, found)
 
     def trajectory(self, trajectory: Trajectory) -> Report:
@@ -140,31 +145,33 @@ class Verifier:
             at = float(trajectory.times[backwards[0] + 1])
             message = f"times do not increase from row {backwards[0]} to row {backwards[0] + 1}"
             return Report(False, Violation("time", at, message), None, None)
-        if trajectory.duration - trajectory.times[0] > LONGEST:
-            message = f"the motion takes {trajectory.duration:.6g} s; at most {LONGEST:g} s can be validated"
+        if trajectory.duration - trajectory.times[0] > MAX_DURATION:
+            message = (
+                f"the motion takes {trajectory.duration:.6g} s; at most {MAX_DURATION:g} s can be validated"
+            )
             return Report(False, Violation("time", float(trajectory.times[0]), message), None, None)
         if not within(trajectory.positions):
             return self._report(trajectory.positions, trajectory.times, [])
         found = [
             Violation(wrong.kind, wrong.time, wrong.message, wrong.joint, None, wrong.excess)
-            for wrong in wrong_rates(
+            for wrong in rate_violations(
                 self.robot, trajectory, self._rate_tolerances, self.problem.start_velocity
             )
         ]
         rows = trajectory.times, trajectory.positions
-        times, positions = rows if found else between_rows(trajectory, self.settings.chord)
+        times, positions = rows if found else sample_cubics(trajectory, self.settings.chord)
         still = np.abs(trajectory.velocities).max(axis=1) <= self.settings.rest
         along = None
         if not found and self.dynamics is not None:
-            found += self._torques(trajectory.times, pieces_of(trajectory), ", with the payload")
+            found += self._torques(trajectory.times, trajectory_pieces(trajectory), ", with the payload")
         if self.constraints is not None:
             found += self._too_fast(trajectory)
-            along = between_rows(trajectory, self.settings.constraint_chord) if not found else None
+            along = sample_cubics(trajectory, self.settings.constraint_chord) if not found else None
         return self._report(positions, times, found, np.isin(times, trajectory.times[still]), along)
 
     def collision_free(self, path: Path) -> bool:
-        """Whether a path is certified free of collision and keeps path constraints; neither its ends nor
-        limits are looked at."""
+        """Whether a path is certified free of collision and keeps the path constraints. Start, goal and
+        limits are not checked."""
         self._check_shape(path.joint_names, path.positions)
         if self.constraints is not None and self.constraints.first(path.positions) is not None:
             return False
@@ -187,10 +194,11 @@ class Verifier:
         at_rest: ndarray | None = None,
         along: tuple[ndarray, ndarray] | None = None,
     ) -> Report:
-        """The verdict on waypoints; `found` are violations known already. The earliest one is reported.
+        """The report on waypoints, with the earliest violation; `found` are violations that are already
+        known.
 
-        `at_rest`: at which rows a timed motion stands still. `along`: times and positions of one for path
-        constraints.
+        `times`: None for a path. `at_rest`: marks the rows at which a trajectory is at rest. `along`: times
+        and positions at which path constraints are tested, by default the waypoints.
         """
         bad = np.flatnonzero(~(np.abs(q) <= MAX_COORDINATE).all(axis=1))
         if len(bad):
@@ -213,7 +221,7 @@ class Verifier:
                 sweep.contact, float(np.interp(sweep.contact.at, np.arange(len(clock)), clock))
             )
         ends = (self._waypoints(q, clock, at_rest), self._goal(q[-1], float(clock[-1])))
-        hit = None if moving is None or moving.contact is None else _hit(moving.contact)
+        hit = None if moving is None or moving.contact is None else _moving_contact_violation(moving.contact)
         every = [v for v in (first, collision, hit, *ends) if v is not None]
         violation = min(every, key=lambda v: v.time, default=None)
         valid = violation is None
@@ -248,7 +256,7 @@ class Verifier:
     def _constrained(
         self, q: ndarray, clock: ndarray, along: tuple[ndarray, ndarray] | None
     ) -> Violation | None:
-        """Where the motion is first not proved to keep the path constraints."""
+        """The first place where the motion is not proved to keep the path constraints."""
         if self.constraints is None:
             return None
         chord = 0.0 if along is None else self.settings.constraint_chord
@@ -261,7 +269,7 @@ class Verifier:
         return Violation("constraint", at, wrong.message, one.frame, one.kind, wrong.excess)
 
     def _too_fast(self, trajectory: Trajectory) -> list[Violation]:
-        """Where a frame is first faster than its constraint allows."""
+        """The first place where a frame is faster than its constraint allows."""
         assert self.constraints is not None
         speeds = self.constraints.speeds(trajectory.positions, trajectory.velocities)
         excess = speeds - self.constraints.most_speeds * (1 + self.settings.rate_slack)
@@ -275,9 +283,10 @@ class Verifier:
         return [Violation("speed", at, message, one.frame, one.kind, float(excess[:, k].max()))]
 
     def _torques(self, clock: ndarray, pieces: Pieces, what: str) -> list[Violation]:
-        """Where a joint's torque is first not proved to be within its effort limit, with the payload."""
+        """The first place where a joint's torque with the payload is not proved to be within its effort
+        limit."""
         assert self.dynamics is not None
-        beyond = first_beyond(self.dynamics, pieces, self.settings.rate_slack)
+        beyond = first_excess(self.dynamics, pieces, self.settings.rate_slack)
         if beyond is None:
             return []
         at, name = (
@@ -288,11 +297,12 @@ class Verifier:
         return [Violation("torque", at, message, name, None, beyond.excess)]
 
     def _twitch(self, q: ndarray, clock: ndarray) -> Violation | None:
-        """More sharp reversals than allowed, counted on waypoints at least `reversal_step` apart."""
+        """A violation if the motion has too many sharp reversals, counted on waypoints `reversal_step`
+        apart."""
         settings = self.settings
         if not len(q) > settings.reversals + 2:
             return None
-        kept = _apart(for_kernels(q), settings.reversal_step)
+        kept = _spaced_rows(for_kernels(q), settings.reversal_step)
         steps = np.diff(q[kept], axis=0)
         steps /= np.linalg.norm(steps, axis=1, keepdims=True)
         cosines = (steps[1:] * steps[:-1]).sum(axis=1)
@@ -312,12 +322,12 @@ class Verifier:
         return Violation("goal", time, f"the motion ends {off.message}", off.subject, None, off.excess)
 
     def _waypoints(self, q: ndarray, clock: ndarray, at_rest: ndarray | None) -> Violation | None:
-        """The first waypoint at which the motion does not stop, or that it does not pass within its blend,
-        after those before it."""
+        """The first of the problem's waypoints at which the motion does not stop, or that it does not pass
+        within its blend, after the waypoints before it."""
         problem, after = self.problem, 0.0
         for k, (goal, blend) in enumerate(zip(problem.waypoints, problem.blend, strict=True)):
             if blend:
-                place = passes(self.robot, goal, q, blend, self.settings, after)
+                place = first_place_within(self.robot, goal, q, blend, self.settings, after)
             else:
                 stops = np.arange(len(q)) if at_rest is None else np.flatnonzero(at_rest)
                 late = stops[stops >= after]
@@ -332,7 +342,7 @@ class Verifier:
 
     @cached_property
     def constraints(self) -> "PathConstraints | None":
-        """The problem's path constraints made ready; None if it has none."""
+        """The problem's path constraints, compiled; None if it has none."""
         if not self.problem.constraints:
             return None
         from robotdiffuse.problems.compiled_constraints import PathConstraints
@@ -341,7 +351,7 @@ class Verifier:
 
     @cached_property
     def dynamics(self) -> Dynamics | None:
-        """Of the robot with the problem's payload; None if it has none."""
+        """The dynamics of the robot with the problem's payload; None without a payload."""
         payload = self.problem.payload
         return None if payload is None else Dynamics(self.robot, payload, self.problem.T_world_base)
 
@@ -366,8 +376,9 @@ class Verifier:
 
 
 @njit(cache=True)
-def _apart(q, step):
-    """Indices of rows of q[n, dof] that are each at least `step` from the one before, with the first."""
+def _spaced_rows(q, step):
+    """Indices of rows of q[n, dof] such that each is at least `step` from the one before, beginning with row
+    0."""
     kept, count = np.zeros(len(q), np.int64), 1
     for i in range(1, len(q)):
         total = 0.0
@@ -381,18 +392,19 @@ def _apart(q, step):
 
 @lru_cache(maxsize=8)
 def verifier(problem: Problem, settings: VerifySettings = DEFAULT) -> Verifier:
-    """The Verifier of a problem; the last few are kept, so that many paths of one problem are validated fast."""
+    """The Verifier of a problem. The last few are cached, so that many paths of one problem are validated
+    fast."""
     return Verifier(problem, settings)
 
 
-def _hit(contact: "TimedContact") -> Violation:
+def _moving_contact_violation(contact: "TimedContact") -> Violation:
     link, other, time = contact.link, contact.obstacle, contact.time
     message = f"{describe_contact(link, other, contact.depth, False)} at {time:.3f} s"
     return Violation("scene_collision", time, message, link, other, contact.depth)
 
 
 def collision_violation(contact: Contact, time: float) -> Violation:
-    """A contact as a violation at a time."""
+    """The violation for a contact at a time."""
     (link, pair), other = contact.check, contact.other
     kind = "scene_collision" if pair is None else "self_collision"
     message = describe_contact(link, other, contact.depth, pair is not None)

@@ -1,11 +1,11 @@
-"""All that is wrong with a motion, where the validator names what comes first."""
+"""All violations of a motion, where the validator reports the first one."""
 
 import numpy as np
 
 from robotdiffuse.collision.contacts import contacts
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
-from robotdiffuse.validation.rates import between_rows
+from robotdiffuse.validation.rates import sample_cubics
 from robotdiffuse.validation.validator import (
     DEFAULT,
     Report,
@@ -15,16 +15,17 @@ from robotdiffuse.validation.validator import (
     verifier,
 )
 
-RATES = ("rest", "rates", "velocity", "acceleration", "jump")
-CONTACTS = ("scene_collision", "self_collision")
+RATE_KINDS = ("rest", "rates", "velocity", "acceleration", "jump")
+CONTACT_KINDS = ("scene_collision", "self_collision")
 
 
 def violations(
     problem: Problem, motion: Path | Trajectory, settings: VerifySettings = DEFAULT
 ) -> tuple[Violation, ...]:
-    """Everything that is wrong with a motion, in order; none if it is valid.
+    """All violations of a motion in order; empty if it is valid.
 
-    Of contacts each, from where it begins; joint limits for each joint; of all else the first of its kind.
+    They include every contact, at the place where it begins, joint limits once for each joint, and the first
+    of every other kind.
     """
     validator = verifier(problem, settings)
     timed = isinstance(motion, Trajectory)
@@ -32,11 +33,13 @@ def violations(
     if report.valid or (report.violation is not None and report.violation.kind in ("not_finite", "time")):
         return () if report.violation is None else (report.violation,)
     still = {*(shape.name for shape in problem.scene.shapes), *problem.robot.link_names}
-    found = [w for w in report.found if w.kind != "limits" and not (w.kind in CONTACTS and w.other in still)]
+    found = [
+        w for w in report.found if w.kind != "limits" and not (w.kind in CONTACT_KINDS and w.other in still)
+    ]
     q, clock = motion.positions, np.arange(len(motion.positions), dtype=float)
     if timed:
-        rates = any(wrong.kind in RATES for wrong in found)
-        clock, q = (motion.times, q) if rates else between_rows(motion, settings.chord)
+        rates = any(wrong.kind in RATE_KINDS for wrong in found)
+        clock, q = (motion.times, q) if rates else sample_cubics(motion, settings.chord)
     for contact in contacts(problem.robot, problem.scene, q, settings.contact):
         found.append(collision_violation(contact, float(np.interp(contact.at, np.arange(len(q)), clock))))
     found += _limits(problem, q, clock, settings)

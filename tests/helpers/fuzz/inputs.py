@@ -374,7 +374,7 @@ def _certificate_record() -> dict[str, Any]:
 
 
 def _certificate(rng: np.random.Generator, folder: FilePath) -> Callable[[], object]:
-    from robotdiffuse.certificates.proof import load_certificate
+    from robotdiffuse.certificates.certificate import load_certificate
 
     file = folder / "certificate.json"
     file.write_bytes(text_of(rng, _certificate_record(), ".json"))

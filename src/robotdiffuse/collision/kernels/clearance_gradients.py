@@ -1,4 +1,4 @@
-"""Compiled clearances of links together with the gradient of how far the arm is too close to obstacles."""
+"""Compiled clearances of links, with the gradient of the arm's violation of a margin to obstacles."""
 
 import numpy as np
 from numba import njit
@@ -13,16 +13,17 @@ from robotdiffuse.collision.kernels.lane_clearance import (
 
 @njit(cache=True)
 def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearances, gradients):
-    """For the rows of q[n, dof]: clearances[n, groups] of the moving groups, and gradients[n, dof].
+    """Writes clearances[n, groups] of the moving groups and gradients[n, dof] for the rows of q[n, dof].
 
-    The gradients are those of sqrt(2 cost), the root of the sum of h^2 over the spheres with
-    h = max(0, S - D), with the cost of `cost_gradient_at` towards the scene alone and S the margin. The root
-    makes them of one size, that of a sphere's lever, from the first touch of the margin to deep in an
-    obstacle; those of the cost itself differ by a thousandfold.
+    The gradients are those of sqrt(2 cost), with the cost of `cost_gradient_at` towards the scene alone: the
+    root of the sum of h^2 over the spheres with h = max(0, S - D), S being the margin and D the signed
+    distance. Because of the root, gradients have the size of a sphere's distance from the joint axes, from
+    the edge of the margin to deep inside an obstacle. Gradients of the cost itself vary by a factor of a
+    thousand.
     """
     clearances_into(robot, scene, q, limit, work, clearances)
     scratch = make_cost_workspace(q.shape[1])
-    pairs = np.zeros(len(robot.pairs), np.float32)  # at a margin of 0: no cost
+    pairs = np.zeros(len(robot.pairs), np.float32)  # with a self margin of 0 they cost nothing
     gradients[:] = np.float32(0.0)
     for i in range(len(q)):
         if clearances[i].min() < margin:
@@ -33,7 +34,8 @@ def clearances_and_gradients_into(robot, scene, q, limit, margin, work, clearanc
 
 @njit(cache=True, nogil=True)
 def clearances_and_gradients(robot, scene, q, limit, margin):
-    """[n, moving groups] clearances to the scene, at most `limit`, and [n, dof] gradients; see above."""
+    """Clearances [n, moving groups] to the scene, at most `limit`, and gradients [n, dof]; see
+    `clearances_and_gradients_into`."""
     moving = len(robot.frame) - np.searchsorted(robot.frame, 1)
     clearances, gradients = np.empty((len(q), moving), np.float32), np.empty(q.shape, np.float32)
     work = make_clearance_workspace(robot, count_obstacles(scene))

@@ -1,8 +1,9 @@
-"""The compiled collision cost of a configuration and its gradient: what guidance and refinement descend.
+"""The compiled collision cost of a configuration and its gradient, which guidance and refinement descend.
 
-From coarse to fine: the obstacles whose boxes the bounding sphere of 16 of a link's spheres reaches, their
-distances from the 16 at once; then, one by one, the spheres that are within the margin. What pushes on a link
-adds up to a force and a moment, which act on the joints before it.
+The computation goes from coarse to fine: first the obstacles whose boxes are within reach of the bounding
+sphere of 16 of a link's spheres, then their distances to these 16 at once, then, one by one, the spheres
+within the margin. The gradients of a link's spheres add up to a force and a moment (a wrench), which act on
+the joints before the link.
 """
 
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from numba import njit
 from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.distance import frames_of, placed, solid_distance
 from robotdiffuse.collision.kernels.point_grid import near_point, points_lower_bound
-from robotdiffuse.collision.kernels.simd import W, first_lane, greatest, lane, least, load, magnitude, root
+from robotdiffuse.collision.kernels.simd import W, absolute, first_lane, lane, load, maximum, minimum, sqrt
 
 _ZERO, _HALF, _ONE = np.float32(0.0), np.float32(0.5), np.float32(1.0)
 _TINY = np.float32(1e-9)
@@ -21,25 +22,25 @@ _TINY = np.float32(1e-9)
 
 @allocation_free(forceinline=True)
 def _signed_distances(x, y, z, solid):
-    """Of points in 16 lanes to an obstacle."""
+    """Signed distances of points in 16 lanes to an obstacle."""
     dx, dy, dz = x - solid[0], y - solid[1], z - solid[2]
     u = dx * solid[3] + dy * solid[4] + dz * solid[5]
     v = dx * solid[6] + dy * solid[7] + dz * solid[8]
-    w = magnitude(dx * solid[9] + dy * solid[10] + dz * solid[11]) - solid[14]
+    w = absolute(dx * solid[9] + dy * solid[10] + dz * solid[11]) - solid[14]
     if solid[16] > _ZERO:
-        u = root(u * u + v * v) - solid[12]
-        inside = least(greatest(u, w), _ZERO)
+        u = sqrt(u * u + v * v) - solid[12]
+        inside = minimum(maximum(u, w), _ZERO)
         v = u * _ZERO
     else:
-        u, v = magnitude(u) - solid[12], magnitude(v) - solid[13]
-        inside = least(greatest(greatest(u, v), w), _ZERO)
-    u, v, w = greatest(u, _ZERO), greatest(v, _ZERO), greatest(w, _ZERO)
-    return root(u * u + v * v + w * w) + inside - solid[15]
+        u, v = absolute(u) - solid[12], absolute(v) - solid[13]
+        inside = minimum(maximum(maximum(u, v), w), _ZERO)
+    u, v, w = maximum(u, _ZERO), maximum(v, _ZERO), maximum(w, _ZERO)
+    return sqrt(u * u + v * v + w * w) + inside - solid[15]
 
 
 @allocation_free(forceinline=True)
 def _push(wrench, x, y, z, fx, fy, fz):
-    """Adds a force at a place, and its moment about the base's origin."""
+    """Adds a force at a point, and its moment about the base's origin, to a wrench."""
     wrench[0] += fx
     wrench[1] += fy
     wrench[2] += fz
@@ -50,7 +51,7 @@ def _push(wrench, x, y, z, fx, fy, fz):
 
 @allocation_free(forceinline=True)
 def _pull(robot, frames, frame, wrench, grad):
-    """Takes what a wrench on a frame does to the joints before it from grad."""
+    """Subtracts the effect of a wrench on a frame on the joints before it from `grad`."""
     while frame > 0:
         j = frame - 1
         axis, frame = frames[j + 1], parent_of(robot.parents, j)
@@ -70,20 +71,20 @@ def _pull(robot, frames, frame, wrench, grad):
 
 @allocation_free(forceinline=True)
 def _close(around, part, x, y, z, reach):
-    """Which of 16 obstacles have boxes around them within reach of a point."""
-    dx = greatest(greatest(load(around, part, 0) - x, x - load(around, part, 3)), _ZERO)
-    dy = greatest(greatest(load(around, part, 1) - y, y - load(around, part, 4)), _ZERO)
-    dz = greatest(greatest(load(around, part, 2) - z, z - load(around, part, 5)), _ZERO)
+    """Mask of those of 16 obstacles whose bounding boxes are within reach of a point."""
+    dx = maximum(maximum(load(around, part, 0) - x, x - load(around, part, 3)), _ZERO)
+    dy = maximum(maximum(load(around, part, 1) - y, y - load(around, part, 4)), _ZERO)
+    dz = maximum(maximum(load(around, part, 2) - z, z - load(around, part, 5)), _ZERO)
     return dx * dx + dy * dy + dz * dz < reach * reach
 
 
 @allocation_free(forceinline=True)
 def _row_cost(robot, scene, row, frame, margin, nearest, wrench):
-    """Cost of a row of spheres towards the scene, whose pushes are added to the wrench."""
-    cost, around, bound = _ZERO, scene.around, robot.row_bounds[row]
+    """Cost of a row of spheres towards the scene; adds their forces to the wrench."""
+    cost, around, bound = _ZERO, scene.solid_boxes, robot.row_bounds[row]
     u, v, w = placed(frame, bound[0], bound[1], bound[2])
     reach, any_close = bound[3] + margin, 0
-    if reach <= _ZERO:  # the cost is off
+    if reach <= _ZERO:  # a margin this negative turns the cost off
         return cost
     for part in range(len(around)):
         any_close |= _close(around, part, u, v, w, reach)
@@ -103,7 +104,7 @@ def _row_cost(robot, scene, row, frame, margin, nearest, wrench):
             close &= close - 1
             d = _signed_distances(x, y, z, scene.solids[k])
             nearer = d < best
-            best = least(best, d)
+            best = minimum(best, d)
             pushed |= nearer
             while nearer:
                 nearest[first_lane(nearer)] = k
@@ -135,9 +136,9 @@ class CostWorkspace(NamedTuple):
     frames: np.ndarray
     """[dof + 1, 12]"""
     nearest: np.ndarray
-    """[16] the obstacle that is nearest to each sphere of a row."""
+    """[16] index of the obstacle that is nearest to each sphere of a row."""
     wrench: np.ndarray
-    """[2, 6] what pushes on a link, and on another."""
+    """[2, 6] forces and moments on one link and on another."""
 
 
 @njit(cache=True)
@@ -152,10 +153,10 @@ def make_cost_workspace(dof):
 def cost_gradient_at(robot, scene, q, pairs, margin, self_margin, work, grad):
     """Collision cost of a configuration and its gradient (added to `grad`).
 
-    The cost is the paper's hinge h, squared: the sum over the spheres of (S - D)^2 / 2 for D < S, with D
-    the signed distance and S the margin [m]; and the same between the links of the checked pairs.
-    `pairs` are the clearances of the pairs here (`lane_clearance.pair_clearances_into`), as far as they are
-    below the self margin. A margin that nothing can be within turns its part off.
+    The cost is the paper's hinge loss, squared: the sum over the spheres of (S - D)^2 / 2 for D < S, with D
+    the signed distance and S the margin [m], plus the same between the links of the checked pairs. `pairs`
+    are the clearances of the pairs at q (`lane_clearance.pair_clearances_into`), at most the self margin. A
+    sufficiently negative margin turns its part of the cost off.
     """
     frames_of(robot, q, work.frames)
     frames, wrench, other = work.frames, work.wrench[0], work.wrench[1]

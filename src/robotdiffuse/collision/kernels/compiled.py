@@ -1,5 +1,5 @@
-"""What compiled code shares: the decorator of functions that allocate nothing, random numbers, and the time
-that compiling took."""
+"""Shared by compiled code: a decorator for functions that do not allocate, random numbers, and compile
+time."""
 
 import sys
 import time
@@ -15,21 +15,22 @@ from numpy import ndarray
 
 
 def _without_scipy(module: str) -> None:
-    """Import a module of Numba that imports SciPy only to choose how `np.convolve` multiplies."""
+    """Import a module of Numba without SciPy, which it imports only to choose an algorithm for
+    `np.convolve`."""
     blas = "scipy.linalg.cython_blas"
     if blas not in sys.modules:
-        sys.modules[blas] = None  # pyright: ignore[reportArgumentType]  (which no import finds)
+        sys.modules[blas] = None  # pyright: ignore[reportArgumentType]  (makes the import fail)
         try:
             import_module(module)
         finally:
             del sys.modules[blas]
 
 
-_without_scipy("numba.np.arraymath")  # a ninth of what a plan by search takes from start to end
+_without_scipy("numba.np.arraymath")  # SciPy would take a ninth of the time of a plan by search
 
 
 class _CompileTimer(event.Listener):
-    """Adds up the outermost compilations; one thread compiles at a time, the others wait for it."""
+    """Adds up the time of outermost compilations; only one thread compiles at a time."""
 
     def __init__(self) -> None:
         self.seconds, self._depth, self._began = 0.0, 0, 0.0
@@ -50,17 +51,17 @@ event.register("numba:compile", _timer)
 
 
 def compile_seconds() -> float:
-    """Time that this process has spent on compiling so far [s]; code that is loaded from disk counts none."""
+    """Time that this process has spent compiling so far [s], without loading compiled code from disk."""
     return _timer.seconds
 
 
 def allocation_free(
     fastmath: bool = False, inline: str = "never", forceinline: bool = False
 ) -> Callable[[Callable], Any]:
-    """Compile without Numba's reference counting.
+    """A decorator that compiles a function without Numba's reference counting.
 
-    Counting the references of the arrays that go into every call takes two thirds of the collision kernel's
-    time. Such a function must not allocate, nor assign an array to a slice.
+    Counting references to the arrays in every call would take two thirds of the collision kernel's time. Such
+    a function must not allocate memory, nor assign an array to a slice.
     """
     options: dict[str, Any] = {"fastmath": fastmath, "inline": inline, "forceinline": forceinline}
     options |= {"cache": True, "_nrt": False}
@@ -68,8 +69,8 @@ def allocation_free(
 
 
 def parent_of(parents, j):
-    """The frame that joint j hangs from. Code for chains, which have None, is compiled apart, so that they
-    lose nothing to trees."""
+    """The parent frame of joint j. `parents` is None for a chain; code for chains is compiled separately, so
+    that support for trees costs them nothing."""
     return j if parents is None else parents[j]
 
 
@@ -79,13 +80,13 @@ def _parent_of(parents, j):
 
 
 def random_state(seed: int, attempt: int = 0) -> ndarray:
-    """State of the compiled random numbers, well mixed."""
+    """State [1] of the compiled random number generator, from a seed and an attempt."""
     return np.random.SeedSequence([seed, attempt]).generate_state(1, np.uint64) | np.uint64(1)
 
 
 @allocation_free()
 def random(state):
-    """Uniform in [0, 1) from the state uint64[1] (xorshift64*, S. Vigna 2016)."""
+    """A uniform random float32 in [0, 1); advances the state uint64[1] (xorshift64*, S. Vigna 2016)."""
     x = state[0]
     x ^= x >> np.uint64(12)
     x ^= x << np.uint64(25)

@@ -1,9 +1,10 @@
 """Compiled lower bounds of the distances between convex meshes and shapes along short motions.
 
-A plane that separates two convex bodies proves them apart, whatever found it. The best plane in the middle of
-a motion is looked for by the algorithm of Gilbert, Johnson and Keerthi (GJK, 1988), from the one that was
-found last; what is proved is read off the plane alone: all vertices of the one body stay on their side of the
-other by so much while they move by t v + r (see `swept_spheres.py`), t in [-1, 1]. In float64.
+A plane that separates two convex bodies proves that they do not touch, whatever algorithm found it. The
+algorithm of Gilbert, Johnson and Keerthi (GJK, 1988) finds the best plane in the middle of a motion, starting
+from the one that was found last. The bound follows from the plane alone: the distance that remains between
+all vertices of one body and the other body while they move by t v + r (see `swept_spheres.py`), t in [-1, 1].
+All computations are in float64.
 """
 
 from typing import NamedTuple
@@ -14,31 +15,31 @@ from numba import njit
 from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
 
-MOST_STEPS = 32
-"""Of GJK; mostly it takes three to eight."""
-CLOSE_ENOUGH = 0.02
-"""GJK ends when the distance is known up to this share ..."""
-CLOSER = 1e-7
+MAX_GJK_STEPS = 32
+"""Iterations of GJK at most; usually it takes three to eight."""
+GJK_RELATIVE_TOLERANCE = 0.02
+"""GJK ends when the distance is known up to this share, ..."""
+GJK_ABSOLUTE_TOLERANCE = 1e-7
 """... or up to this [m]."""
 
 
 class Hulls(NamedTuple):
-    """Convex parts of a robot's links: the hull of vertices, rounded."""
+    """Convex parts of a robot's links: convex hulls, each inflated by a radius."""
 
     vertices: np.ndarray
     """[3, vertices] in the coordinates of the part's frame."""
     first: np.ndarray
     """[parts + 1] first vertex of each part."""
     frame: np.ndarray
-    """[parts]"""
+    """[parts] index of the frame that each part is fixed to."""
     balls: np.ndarray
     """[parts, 4] centre and radius of a ball around all of the part."""
     rounding: np.ndarray
-    """[parts]"""
+    """[parts] radius by which the hull is inflated."""
 
 
 class Solids(NamedTuple):
-    """Obstacles: the sum of a box, a disc around the box's z axis and a ball."""
+    """Obstacles, each the Minkowski sum of a box, a disc around the box's z axis and a ball."""
 
     rotation: np.ndarray
     """[n, 3, 3] R_box_base"""
@@ -51,24 +52,25 @@ class Solids(NamedTuple):
     rounding: np.ndarray
     """[n] radius of the ball."""
     bounds: np.ndarray
-    """[n] whether it only bounds a surface or a cloud of points, of which just that is known."""
+    """[n] whether the sum only bounds a surface or point cloud, whose exact distance only Coal computes."""
 
 
 class Posture(NamedTuple):
-    """Scratch memory for one motion: the robot in its middle, and what GJK needs."""
+    """Scratch memory for one motion: the robot in its middle, and the memory of GJK."""
 
     frames: np.ndarray
     """[dof + 1, 3, 4]"""
     twists: np.ndarray
     """[dof + 1, 6] as in `swept_spheres.py`."""
     planes: np.ndarray
-    """[parts, solids + parts, 3] normals of the planes found last, towards the first; zero at first."""
+    """[parts, solids + parts, 3] normals of the planes that were found last, towards the first part;
+    initially zero."""
     simplex: np.ndarray
     """[4, 3]"""
     edges: np.ndarray
     """[3, 3]"""
     points: np.ndarray
-    """[3, 3] a normal, and the two bodies' vertices that reach furthest against each other."""
+    """[3, 3] a normal, and the support points of the two bodies along it."""
 
 
 @njit(cache=True)
@@ -86,8 +88,10 @@ def make_posture(hulls, solids, dof):
 
 @njit(cache=True)
 def pose(offsets, parents, slides, q, dq, posture):
-    """The frames at q and their twists along dq; offsets[dof, 4, 4] and parents[dof] as of `Robot`, the
-    latter None of a chain."""
+    """Writes the frames at q and their twists along dq to `posture`.
+
+    offsets[dof, 4, 4] and parents[dof] are those of `Robot`; parents is None for a chain.
+    """
     for j in range(len(q)):
         parent = parent_of(parents, j)
         child, before, twist = posture.frames[j + 1], posture.twists[parent], posture.twists[j + 1]
@@ -102,8 +106,8 @@ def pose(offsets, parents, slides, q, dq, posture):
 
 @njit(cache=True)
 def part_speed(hulls, p, base, posture):
-    """No point of a part moves further than this from the middle to an end, seen from a frame [m]; but for
-    the remainder."""
+    """Upper bound on how far any point of a part moves from the middle to an end, seen from frame `base` [m],
+    without the remainder."""
     frame, ball = hulls.frame[p], hulls.balls[p]
     twist, other, T = posture.twists[frame], posture.twists[base], posture.frames[frame]
     a, b, c = twist[0] - other[0], twist[1] - other[1], twist[2] - other[2]
@@ -116,7 +120,7 @@ def part_speed(hulls, p, base, posture):
 
 @njit(cache=True)
 def ball_to_solid(hulls, p, solids, o, posture):
-    """A lower bound of the distance of a part to an obstacle in the middle, from ball and box."""
+    """Lower bound of the distance of a part to an obstacle in the middle, from the part's ball [m]."""
     T, ball = posture.frames[hulls.frame[p]], hulls.balls[p]
     x, y, z = placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)
     gap = point_to_box(x, y, z, solids.rotation[o], solids.middle[o], solids.half[o], solids.disc[o])
@@ -125,7 +129,7 @@ def ball_to_solid(hulls, p, solids, o, posture):
 
 @njit(cache=True)
 def ball_to_ball(hulls, p, q, posture):
-    """The same for two parts."""
+    """Lower bound of the distance of two parts in the middle, from their balls [m]."""
     S, T, total = posture.frames[hulls.frame[p]], posture.frames[hulls.frame[q]], 0.0
     a, b = hulls.balls[p], hulls.balls[q]
     for r in range(3):
@@ -135,7 +139,7 @@ def ball_to_ball(hulls, p, q, posture):
 
 @njit(cache=True, fastmath=True)
 def _least(vertices, first, last, x, y, z, offset, u, v, w, speed):
-    """Least of a - |b| over vertices, with a and b linear functions of the place."""
+    """Minimum of a - |b| over vertices, where a and b are linear functions of the vertex; plus `offset`."""
     least = np.inf
     for i in range(first, last):
         a = vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z
@@ -146,7 +150,7 @@ def _least(vertices, first, last, x, y, z, offset, u, v, w, speed):
 
 @njit(cache=True)
 def _furthest(vertices, first, last, x, y, z):
-    """The vertex that reaches furthest in a direction."""
+    """Index of the vertex that is furthest in a direction."""
     best, at = -np.inf, first
     for i in range(first, last):
         a = vertices[0, i] * x + vertices[1, i] * y + vertices[2, i] * z
@@ -157,7 +161,7 @@ def _furthest(vertices, first, last, x, y, z):
 
 @njit(cache=True)
 def _support_of_part(hulls, p, posture, sign, row):
-    """The vertex of a part that reaches furthest along sign * points[0], to points[row]."""
+    """Writes the vertex of a part that is furthest along sign * points[0] to points[row]."""
     T, points = posture.frames[hulls.frame[p]], posture.points
     x, y, z = sign * points[0, 0], sign * points[0, 1], sign * points[0, 2]
     i = _furthest(
@@ -174,7 +178,8 @@ def _support_of_part(hulls, p, posture, sign, row):
 
 @njit(cache=True)
 def _support_of_solid(solids, o, posture, row):
-    """The place on an obstacle, but for its rounding, that reaches furthest along points[0]."""
+    """Writes the point of an obstacle, without its rounding, that is furthest along points[0] to
+    points[row]."""
     R, points = solids.rotation[o], posture.points
     x, y, z = points[0, 0], points[0, 1], points[0, 2]
     a = R[0, 0] * x + R[0, 1] * y + R[0, 2] * z
@@ -190,7 +195,7 @@ def _support_of_solid(solids, o, posture, row):
 
 @njit(cache=True)
 def _least_along(hulls, p, base, sign, posture):
-    """Least height of a part along sign * points[0], at the two ends of the motion but for the remainder,
+    """Minimum height of a part along sign * points[0] at the two ends of the motion, without the remainder,
     with velocities seen from frame `base`."""
     n, T = posture.points[0], posture.frames[hulls.frame[p]]
     twist, seen = posture.twists[hulls.frame[p]], posture.twists[base]
@@ -213,9 +218,11 @@ def _least_along(hulls, p, base, sign, posture):
 
 @njit(cache=True)
 def separation(hulls, p, solids, other, base, posture):
-    """By how much the plane with the unit normal points[0] parts two bodies: in the middle, and along the
-    motion but for the remainder, seen from frame `base`. `other` below 0 stands for part -1 - other, which
-    moves too if its frame is not `base`."""
+    """Widths of the gap between two bodies along the unit normal points[0] [m].
+
+    The first is that in the middle, the second the minimum along the motion, without the remainder, seen from
+    frame `base`. A negative `other` stands for part -1 - other, which moves too if its frame is not `base`.
+    """
     x, y, z = posture.points[0, 0], posture.points[0, 1], posture.points[0, 2]
     frame = hulls.frame[p]
     T, twist, seen = posture.frames[frame], posture.twists[frame], posture.twists[base]
@@ -251,7 +258,7 @@ def separation(hulls, p, solids, other, base, posture):
         start, stop = _least_along(hulls, p, base, 1.0, posture)
         other_start, other_stop = _least_along(hulls, -1 - other, base, -1.0, posture)
         return middle - reach - 1e-9, min(start + other_start, stop + other_stop) - 1e-9
-    # a normal of length 1 + e errs by e times the extent; that is what float64 leaves
+    # 1e-9 covers the rounding of the normal's length, whose error is multiplied by the extent of the bodies
     return middle - reach - 1e-9, along - reach - 1e-9
 
 
@@ -262,7 +269,7 @@ def _dot(a, b):
 
 @njit(cache=True)
 def _holds_origin(e, new):
-    """Whether the tetrahedron of `new` and `new` + e[0], e[1], e[2] holds the origin."""
+    """Whether the tetrahedron of `new` and `new` + e[0], e[1], e[2] contains the origin."""
     inside = 1.0
     for k in range(3):
         a, b = e[(k + 1) % 3], e[(k + 2) % 3]
@@ -279,8 +286,12 @@ def _holds_origin(e, new):
 
 @njit(cache=True)
 def _nearest(simplex, count, edges, nearest):
-    """The point of a simplex nearest to the origin, which is known to need the last vertex. The simplex
-    becomes the smallest face that holds it; returns its number of vertices, 0 if the origin is inside."""
+    """Writes the point of a simplex nearest to the origin to `nearest`; it is known to depend on the last
+    vertex.
+
+    The simplex is reduced to the smallest face that contains the point. Returns the number of its vertices,
+    or 0 if the origin is inside.
+    """
     new = simplex[count - 1]
     least, kept = _dot(new, new), 0
     for r in range(3):
@@ -320,13 +331,13 @@ def _nearest(simplex, count, edges, nearest):
 
 @njit(cache=True)
 def find_plane(hulls, p, solids, other, posture):
-    """Turns the normal points[0], which is a guess, into that of the plane that parts two bodies best in the
-    middle of the motion; False if they touch, or nearly."""
+    """Replaces the normal points[0], an initial guess, by that of the plane with the widest gap between two
+    bodies in the middle of the motion. False if they touch, or nearly."""
     points, simplex = posture.points, posture.simplex
     rounding = hulls.rounding[p] + (solids.rounding[other] if other >= 0 else hulls.rounding[-1 - other])
     best, gap, count = -np.inf, np.inf, 0
     n0, n1, n2 = points[0, 0], points[0, 1], points[0, 2]
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_GJK_STEPS):
         _support_of_part(hulls, p, posture, -1.0, 1)
         if other >= 0:
             _support_of_solid(solids, other, posture, 2)
@@ -340,11 +351,14 @@ def find_plane(hulls, p, solids, other, posture):
             n0, n1, n2 = points[0, 0], points[0, 1], points[0, 2]
         count = _nearest(simplex, count + 1, posture.edges, points[0])
         before, gap = gap, np.sqrt(_dot(points[0], points[0]))
-        if count == 0 or gap - rounding < CLOSER:
+        if count == 0 or gap - rounding < GJK_ABSOLUTE_TOLERANCE:
             return False
         for r in range(3):
             points[0, r] /= gap
-        if gap - best <= max(CLOSE_ENOUGH * (gap - rounding), CLOSER) or gap >= before:
+        if (
+            gap - best <= max(GJK_RELATIVE_TOLERANCE * (gap - rounding), GJK_ABSOLUTE_TOLERANCE)
+            or gap >= before
+        ):
             break
     points[0, 0], points[0, 1], points[0, 2] = n0, n1, n2
     return best > rounding
@@ -352,9 +366,12 @@ def find_plane(hulls, p, solids, other, posture):
 
 @njit(cache=True)
 def best_plane(hulls, p, solids, other, base, enough, plane, posture):
-    """A plane that parts two bodies: how far apart they are in the middle, and along the motion but for the
-    remainder, and whether GJK had to look for it, so that the first is their distance. That is done if along
-    `plane`, which was found last and is replaced, they are not parted by `enough`."""
+    """Gaps between two bodies by a separating plane, and whether GJK computed it.
+
+    The gaps are those in the middle and along the motion, without the remainder; if GJK computed the plane,
+    the first is the distance. GJK runs only if `plane`, the one that was found last, shows less than `enough`
+    along the motion; then it replaces `plane`.
+    """
     n = posture.points[0]
     known = False
     for r in range(3):

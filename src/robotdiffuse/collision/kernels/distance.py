@@ -1,7 +1,7 @@
-"""Compiled signed distances of the covering spheres, and gradients: one configuration after the other.
+"""Compiled signed distances of points to obstacles, with gradients, and the frames of single configurations.
 
-The yes-or-no check is in `lanes.py`; these serve where the amount of clearance matters: the validator, guidance,
-refinement, and the clearances that the denoiser sees.
+The yes-or-no check is in `lane_collision.py`. These functions serve where the amount of clearance matters, as
+in guidance and refinement.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.point_grid import near_point
 
-CAP = np.float32(1.0)
+CLEARANCE_CAP = np.float32(1.0)
 """Clearances beyond this [m] are reported as this."""
 _ONE = np.float32(1.0)
 _ZERO = np.float32(0.0)
@@ -18,7 +18,7 @@ _TINY = np.float32(1e-9)
 
 @allocation_free(fastmath=True)
 def frames_of(robot, q, frames):
-    """Fills frames[dof + 1, 12] (rotation row-major, translation); frame 0 is the base."""
+    """Writes frames[dof + 1, 12] (rotation row-major, translation) at q; frame 0 is the base."""
     frames[0, :] = _ZERO
     frames[0, 0] = frames[0, 4] = frames[0, 8] = _ONE
     for j in range(len(q)):
@@ -39,7 +39,7 @@ def frames_of(robot, q, frames):
 
 @allocation_free(fastmath=True)
 def placed(frame, x, y, z):
-    """Position of a point of a frame."""
+    """Position of a point of a frame in the base frame."""
     return (
         frame[0] * x + frame[1] * y + frame[2] * z + frame[9],
         frame[3] * x + frame[4] * y + frame[5] * z + frame[10],
@@ -55,7 +55,7 @@ def solid_distance(solid, x, y, z):
     v = dx * solid[6] + dy * solid[7] + dz * solid[8]
     w = dx * solid[9] + dy * solid[10] + dz * solid[11]
     a, b, c = abs(u) - solid[12], abs(v) - solid[13], abs(w) - solid[14]
-    # outwards in the first two axes: round solids have but one such direction
+    # outward directions along the first two axes; a cylinder has a single radial one
     ou, ov, pu, pv = np.copysign(_ONE, u), _ZERO, _ZERO, np.copysign(_ONE, v)
     if solid[16] > _ZERO:
         r = np.sqrt(u * u + v * v) + _TINY
@@ -83,9 +83,9 @@ def solid_distance(solid, x, y, z):
 
 @allocation_free(inline="always")
 def scene_distance(scene, x, y, z, limit):
-    """Signed distance of a point to the nearest obstacle if below `limit` (else `limit`), and its gradient.
+    """Signed distance of a point to the nearest obstacle, at most `limit`, and its gradient.
 
-    To point clouds up to a few millimetres too much.
+    Distances to point clouds may be too large by a few millimetres.
     """
     best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
     for k in range(len(scene.solids)):

@@ -1,4 +1,5 @@
-"""Compiled kinematics in float64: the next frame of a chain, places in a frame, and points beside boxes."""
+"""Compiled kinematics in float64: frames along a chain, points of a frame, and distances of points to
+boxes."""
 
 import numpy as np
 from numba import njit
@@ -6,7 +7,8 @@ from numba import njit
 
 @njit(cache=True)
 def step(parent, offset, slides, q, child):
-    """The frame beyond a joint at q [rad or m]: T_base_child from T_base_parent and T_parent_joint[4, 4]."""
+    """Writes the frame behind a joint at q [rad or m]: T_base_child from T_base_parent and T_parent_joint[4,
+    4]."""
     c, s, slide = (1.0, 0.0, q) if slides else (np.cos(q), np.sin(q), 0.0)
     for r in range(3):
         x = parent[r, 0] * offset[0, 0] + parent[r, 1] * offset[1, 0] + parent[r, 2] * offset[2, 0]
@@ -19,14 +21,14 @@ def step(parent, offset, slides, q, child):
 
 @njit(cache=True)
 def placed(T, p, r):
-    """Coordinate r of the point p of a frame."""
+    """Coordinate r in the base frame of the point p of frame T."""
     return T[r, 0] * p[0] + T[r, 1] * p[1] + T[r, 2] * p[2] + T[r, 3]
 
 
 @njit(cache=True)
 def point_to_box(x, y, z, rotation, middle, half, disc):
-    """Lower bound of the distance [m] from a point to a box, R_box_base[3, 3], whose half edges are longer by
-    the radius of a disc around its z axis; negative within."""
+    """Lower bound of the signed distance [m] from a point to a box with rotation R_box_base[3, 3], whose
+    first two half edges are increased by the radius of a disc; negative inside."""
     outside, deepest = 0.0, -np.inf
     x, y, z = x - middle[0], y - middle[1], z - middle[2]
     for r in range(3):

@@ -1,4 +1,5 @@
-"""Compiled clearances of links to the scene, 16 configurations at once; see `lanes.py` for the form."""
+"""Compiled clearances of links to the scene and to each other, 16 configurations at once; see
+`lane_collision.py`."""
 
 from typing import NamedTuple
 
@@ -7,9 +8,9 @@ from numba import njit
 
 from robotdiffuse.collision.kernels.collision_cost import cost_gradient_at, make_cost_workspace
 from robotdiffuse.collision.kernels.compiled import allocation_free
-from robotdiffuse.collision.kernels.lane_collision import W, open_lanes, place, place_frames
-from robotdiffuse.collision.kernels.point_grid import KEEP, points_distance, points_lower_bound
-from robotdiffuse.collision.kernels.simd import load, lowest
+from robotdiffuse.collision.kernels.lane_collision import W, lanes_that_may_touch, place, place_frames
+from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, points_distance, points_lower_bound
+from robotdiffuse.collision.kernels.simd import load, reduce_min
 
 _ZERO = np.float32(0.0)
 
@@ -18,8 +19,8 @@ _ZERO = np.float32(0.0)
 def _to_spheres(at, s, obstacles, near, n, mark, out):
     """Signed distances of a point in 16 lanes to obstacles.
 
-    With `mark`, to row n + k of `out` for every obstacle k; otherwise `out[0]` becomes the least of itself
-    and the distances to the obstacles with near[n + k].
+    With `mark`, writes them to row n + k of `out` for every obstacle k. Else lowers `out[0]` to the distances
+    to the obstacles with near[n + k].
     """
     for k in range(len(obstacles)):
         if not (mark or near[n + k]):
@@ -34,6 +35,7 @@ def _to_spheres(at, s, obstacles, near, n, mark, out):
 
 @allocation_free(fastmath=True)
 def _to_boxes(at, s, obstacles, near, n, mark, out):
+    """The same for boxes."""
     for k in range(len(obstacles)):
         if not (mark or near[n + k]):
             continue
@@ -56,7 +58,7 @@ def _to_boxes(at, s, obstacles, near, n, mark, out):
 
 @allocation_free(fastmath=True)
 def _to_round(at, s, obstacles, flat_ends, near, n, mark, out):
-    """Cylinders (`flat_ends`) or capsules."""
+    """The same for cylinders (`flat_ends`) or capsules."""
     for k in range(len(obstacles)):
         if not (mark or near[n + k]):
             continue
@@ -84,21 +86,23 @@ def _to_round(at, s, obstacles, flat_ends, near, n, mark, out):
 
 @allocation_free()
 def _bound_points(at, s, scene, radius, row, out):
-    """Lower bounds for a sphere's centre, to a row of `out`."""
+    """Writes lower bounds of the distances of a sphere's centre to the points to a row of `out`."""
     for i in range(W):
         d = points_lower_bound(scene, at[s, i], at[s, W + i], at[s, 2 * W + i])
-        out[row, i] = min(d, KEEP + radius)
+        out[row, i] = min(d, POINT_RANGE + radius)
 
 
 @allocation_free()
 def _to_points(at, s, scene, radius, out):
+    """Lowers `out[0]` to the distances of a sphere's centre to the points."""
     for i in range(W):
-        limit = min(out[0, i], KEEP + radius)
+        limit = min(out[0, i], POINT_RANGE + radius)
         out[0, i] = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit)
 
 
 @allocation_free(inline="always")
 def to_scene(at, s, scene, radius, near, mark, out):
+    """Distances to all obstacles; see `_to_spheres`."""
     n = 0
     _to_spheres(at, s, scene.spheres, near, n, mark, out)
     n += len(scene.spheres)
@@ -117,7 +121,7 @@ def to_scene(at, s, scene, radius, near, mark, out):
 
 @allocation_free(fastmath=True)
 def _nearer(a, s, b, t, radii, best):
-    """How many lanes have spheres s of a and t of b nearer to each other than best[0]."""
+    """Number of lanes in which the distance of sphere s of a and t of b is below best[0]."""
     total = 0
     for i in range(W):
         dx, dy, dz = a[s, i] - b[t, i], a[s, W + i] - b[t, W + i], a[s, 2 * W + i] - b[t, 2 * W + i]
@@ -127,7 +131,7 @@ def _nearer(a, s, b, t, radii, best):
 
 @allocation_free(fastmath=True)
 def _keep_least(a, s, b, first, last, spheres, radius, best):
-    """Lowers best[0] to the distances of sphere s of a to the spheres from `first` to `last` of b."""
+    """Lowers best[0] to the distances of sphere s of a to the spheres `first` to `last` of b."""
     for t in range(first, last):
         radii = radius + spheres[t, 3]
         for i in range(W):
@@ -153,12 +157,13 @@ class ClearanceWorkspace(NamedTuple):
     positions: np.ndarray
     """[spheres, 3 * W]"""
     placed: np.ndarray
-    """[groups] whether the group's positions are those of this block."""
+    """[groups] whether the group's positions have been computed for this block."""
 
 
 @njit(cache=True)
 def make_clearance_workspace(robot, obstacles):
-    """Scratch memory for one thread and at most so many obstacles (all point clouds count as one)."""
+    """Scratch memory for one thread and at most so many obstacles; all point clouds and meshes count as
+    one."""
     frames = np.zeros((len(robot.offsets) + 1, 12 * W), np.float32)
     for k in (0, 4, 8):
         frames[0, k * W : (k + 1) * W] = 1.0
@@ -176,7 +181,7 @@ def make_clearance_workspace(robot, obstacles):
 
 @allocation_free()
 def count_obstacles(scene):
-    """Rows that `make_clearance_workspace` needs."""
+    """Number of obstacles for `make_clearance_workspace`."""
     return len(scene.spheres) + len(scene.boxes) + len(scene.cylinders) + len(scene.capsules) + 1
 
 
@@ -184,8 +189,9 @@ def count_obstacles(scene):
 def _mark_near(solids, obstacles, radius, limit, near, bounds, least):
     """Marks the obstacles that can be nearest to a group in any lane, from distances of its bounding sphere.
 
-    An obstacle at d from the centre is at least d - radius and at most d + radius away from the group. Of the
-    points, which come after the solid ones, `bounds` holds but a lower bound.
+    An obstacle at distance d from the centre is at least d - radius and at most d + radius away from the
+    group. For the points, which come after the solid obstacles, `bounds` holds only a lower bound. Returns
+    the number of marks.
     """
     for i in range(W):
         least[0, i] = limit
@@ -203,14 +209,15 @@ def _mark_near(solids, obstacles, radius, limit, near, bounds, least):
 
 
 @allocation_free(fastmath=True)
-def _write(least, radius, best):
+def _lower_to(least, radius, best):
+    """Lowers best[0] to the distances of centres less the radius."""
     for i in range(W):
         best[0, i] = min(best[0, i], least[0, i] - radius)
 
 
 @allocation_free()
 def group_clearance(robot, scene, g, limit, work, best):
-    """Signed distances of a group to the scene, at most `limit`, in 16 lanes: best[1, 16].
+    """Writes signed distances of a group to the scene, at most `limit`, in 16 lanes to best[1, 16].
 
     The frames and centres of `work` must be those of the configurations (`place_frames`).
     """
@@ -223,18 +230,19 @@ def group_clearance(robot, scene, g, limit, work, best):
     if _mark_near(solids, obstacles, radius, limit, work.near, work.bounds, work.least) > 0:
         for s in range(robot.first[g], robot.first[g + 1]):
             place(work.frames, robot.frame[g], robot.spheres, s, work.position, 0)
-            # what the spheres before have found limits what is looked for
+            # distances beyond those of previous spheres do not matter
             for i in range(W):
                 work.least[0, i] = best[0, i] + robot.spheres[s, 3]
             to_scene(work.position, 0, scene, robot.spheres[s, 3], work.near, False, work.least)
-            _write(work.least, robot.spheres[s, 3], best)
+            _lower_to(work.least, robot.spheres[s, 3], best)
 
 
 @allocation_free()
 def block_clearances(robot, scene, first, q, limit, work, best, out):
-    """Signed distances to the scene, at most `limit`, of the groups from `first` on: out[groups, 16].
+    """Writes signed distances to the scene, at most `limit`, of the groups from `first` on to out[groups,
+    16].
 
-    q: [dof, 16]. `best` is scratch, [1, 16].
+    q: [dof, 16]. `best` is scratch memory, [1, 16].
     """
     place_frames(robot, q, work.frames, work.centres)
     for g in range(first, len(robot.frame)):
@@ -253,10 +261,10 @@ def _place_group(robot, g, work):
 
 @allocation_free()
 def pair_clearance(robot, p, limit, work, best):
-    """Distances between the links of a checked pair, at most `limit`, in 16 lanes: best[1, 16].
+    """Writes distances between the links of a checked pair, at most `limit`, in 16 lanes to best[1, 16].
 
-    The frames and centres of `work` must be those of the configurations, `placed` says which groups'
-    positions.
+    The frames and centres of `work` must be those of the configurations; `placed` marks the groups whose
+    positions are.
     """
     a, b = robot.pairs[p, 0], robot.pairs[p, 1]
     centres, positions = work.centres, work.positions
@@ -274,17 +282,19 @@ def pair_clearance(robot, p, limit, work, best):
 
 @allocation_free()
 def block_pair_clearances(robot, q, limit, work, out):
-    """Distances between the links of the checked pairs, at most `limit`, of q[dof, 16]: out[pairs, 16].
+    """Writes distances between the links of the checked pairs at q[dof, 16], at most `limit`, to out[pairs,
+    16].
 
-    Where spheres touch, but the pair's table says that the links are apart, nothing is known: `limit`.
+    Where spheres touch although the pair's table excludes contact, the distance is unknown and `limit` is
+    written.
     """
     place_frames(robot, q, work.frames, work.centres)
     work.placed[:] = False
     for p in range(len(robot.pairs)):
         pair_clearance(robot, p, limit, work, work.least)
         table, bit, known = robot.pairs[p, 2], robot.pairs[p, 3], 0
-        if table >= 0 and lowest(load(work.least, 0, 0)) <= _ZERO:
-            known = ~open_lanes(robot, table, bit, q)
+        if table >= 0 and reduce_min(load(work.least, 0, 0)) <= _ZERO:
+            known = ~lanes_that_may_touch(robot, table, bit, q)
         for i in range(W):
             apart = work.least[0, i] <= _ZERO and known >> i & 1
             out[p, i] = limit if apart else work.least[0, i]
@@ -292,7 +302,7 @@ def block_pair_clearances(robot, q, limit, work, out):
 
 @njit(cache=True)
 def pair_clearances_into(robot, q, limit, work, out):
-    """Clearances of the checked pairs for the rows of q[n, dof], into out[n, pairs]."""
+    """Writes clearances of the checked pairs for the rows of q[n, dof] to out[n, pairs]."""
     n, dof = q.shape
     block, found = np.empty((dof, W), np.float32), np.empty((out.shape[1], W), np.float32)
     for start in range(0, n, W):
@@ -308,7 +318,7 @@ def pair_clearances_into(robot, q, limit, work, out):
 
 @njit(cache=True, nogil=True)
 def pair_clearances(robot, q, limit):
-    """[n, pairs] distances between checked pairs of links, at most `limit`."""
+    """Distances [n, pairs] between the checked pairs of links at q[n, dof], at most `limit`."""
     out = np.empty((len(q), len(robot.pairs)), np.float32)
     pair_clearances_into(robot, q, limit, make_clearance_workspace(robot, 1), out)
     return out
@@ -316,7 +326,7 @@ def pair_clearances(robot, q, limit):
 
 @njit(cache=True)
 def clearances_into(robot, scene, q, limit, work, out):
-    """Clearances of the moving groups for the rows of q[n, dof], into out[n, groups]."""
+    """Writes clearances of the moving groups for the rows of q[n, dof] to out[n, groups]."""
     n, dof = q.shape
     first = len(robot.frame) - out.shape[1]
     block, found = np.empty((dof, W), np.float32), np.empty((out.shape[1], W), np.float32)
@@ -334,7 +344,7 @@ def clearances_into(robot, scene, q, limit, work, out):
 
 @njit(cache=True, nogil=True)
 def link_clearances(robot, scene, q, limit):
-    """[n, moving groups] signed distances to the scene, at most `limit`."""
+    """Signed distances [n, moving groups] to the scene at q[n, dof], at most `limit`."""
     moving = len(robot.frame) - np.searchsorted(robot.frame, 1)
     out = np.empty((len(q), moving), np.float32)
     work = make_clearance_workspace(robot, count_obstacles(scene))

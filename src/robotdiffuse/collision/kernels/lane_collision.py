@@ -1,9 +1,10 @@
-"""The compiled collision check: 16 configurations at once, yes or no.
+"""The compiled collision check of 16 configurations at once.
 
-From coarse to fine, with lanes over whatever there are many of. Frames and bounding spheres: over the 16
-configurations. Which obstacles a link can meet in any of them: over 16 obstacles, by boxes around them. In
-which configurations the bounding sphere does touch one of those: over the configurations. Whether the link
-does, in those configurations, one after the other: over its spheres.
+It goes from coarse to fine, and SIMD lanes stand for different things at each step:
+frames and bounding spheres are computed with a lane per configuration;
+the obstacles that a link may touch in any configuration, from their bounding boxes, with a lane per obstacle;
+the configurations in which the bounding sphere touches such an obstacle, with a lane per configuration;
+and whether the link itself does, for one configuration after the other, with a lane per sphere.
 """
 
 from typing import NamedTuple
@@ -15,28 +16,28 @@ from robotdiffuse.collision.kernels.compiled import allocation_free, parent_of
 from robotdiffuse.collision.kernels.point_grid import far_from_points, near_points, touch_points
 from robotdiffuse.collision.kernels.simd import (
     W,
+    absolute,
+    copysign,
     first_lane,
+    floor,
     gather,
-    greatest,
-    highest,
     lanes_array,
-    lanes_with,
-    least,
+    lanes_with_bit,
     load,
-    lowest,
-    magnitude,
-    root,
+    maximum,
+    minimum,
+    reduce_max,
+    reduce_min,
+    sqrt,
     store,
-    whole,
-    with_sign,
 )
 
 _INV_TAU = np.float32(0.15915494309189535)
 _QUARTER = np.float32(0.25)
 _HALF = np.float32(0.5)
-HEAD, SIDE = 6, 130
-"""Numbers before the cells, and cells along each side, of a table of `near_pairs.py`."""
-ALL = (1 << W) - 1
+TABLE_HEADER, TABLE_SIDE = 6, 130
+"""Numbers before the cells, and cells along each side, in a table of `sphere_pair_tables.py`."""
+ALL_LANES = (1 << W) - 1
 """The mask of all lanes."""
 _ZERO = np.float32(0.0)
 # sin(2 pi u) for |u| <= 1/4: Taylor coefficients, error below 6e-8
@@ -50,18 +51,20 @@ _S11 = np.float32(-15.094642576822984)
 
 @allocation_free(forceinline=True)
 def _sine_of_turn(u):
+    """sin(2 pi u) for |u| <= 1/4."""
     v = u * u
     return u * (_S1 + v * (_S3 + v * (_S5 + v * (_S7 + v * (_S9 + v * _S11)))))
 
 
 @allocation_free(forceinline=True)
 def _turn(frames, parent, j, offset, q):
-    """Frame behind a revolute joint, in 16 lanes: frames[j + 1] = frames[parent] @ offset @ Rz(q)."""
+    """Writes the frame behind a revolute joint in 16 lanes: frames[j + 1] = frames[parent] @ offset @
+    Rz(q)."""
     turns = load(q, j, 0) * _INV_TAU
-    turns = turns - whole(turns + _HALF)
-    far = magnitude(turns)
+    turns = turns - floor(turns + _HALF)
+    far = absolute(turns)
     c = _sine_of_turn(_QUARTER - far)
-    s = with_sign(_sine_of_turn(_QUARTER - magnitude(far - _QUARTER)), turns)
+    s = copysign(_sine_of_turn(_QUARTER - absolute(far - _QUARTER)), turns)
     for k in range(3):
         r0, r1 = load(frames, parent, 3 * k), load(frames, parent, 3 * k + 1)
         r2 = load(frames, parent, 3 * k + 2)
@@ -77,7 +80,8 @@ def _turn(frames, parent, j, offset, q):
 
 @allocation_free(forceinline=True)
 def _slide(frames, parent, j, offset, q):
-    """Frame behind a prismatic joint, in 16 lanes: frames[j + 1] = frames[parent] @ offset @ Tz(q)."""
+    """Writes the frame behind a prismatic joint in 16 lanes: frames[j + 1] = frames[parent] @ offset @
+    Tz(q)."""
     for k in range(3):
         r0, r1 = load(frames, parent, 3 * k), load(frames, parent, 3 * k + 1)
         r2 = load(frames, parent, 3 * k + 2)
@@ -102,7 +106,7 @@ def _centres_of(frames, f, spheres, s):
 
 @allocation_free(forceinline=True)
 def place(frames, f, spheres, s, positions, p):
-    """Positions of a sphere's centre in 16 lanes, to row p."""
+    """Writes the positions of a sphere's centre in 16 lanes to row p of `positions`."""
     x, y, z = _centres_of(frames, f, spheres, s)
     store(positions, p, 0, x)
     store(positions, p, 1, y)
@@ -111,7 +115,8 @@ def place(frames, f, spheres, s, positions, p):
 
 @allocation_free(forceinline=True)
 def place_frames(robot, q, frames, centres):
-    """Frames of 16 configurations, and the centres of the bounding spheres of all groups."""
+    """Writes the frames of 16 configurations q[dof, 16], and the centres of the bounding spheres of all
+    groups."""
     for j in range(len(robot.offsets)):
         if robot.offsets[j, 12] > _ZERO:
             _slide(frames, parent_of(robot.parents, j), j, robot.offsets[j], q)
@@ -122,7 +127,7 @@ def place_frames(robot, q, frames, centres):
 
 
 class Workspace(NamedTuple):
-    """Scratch memory of `block_hits`, so that it allocates nothing."""
+    """Scratch memory of `block_hits`, which does not allocate."""
 
     frames: np.ndarray
     """[dof + 1, 12 * W]"""
@@ -143,24 +148,24 @@ def make_workspace(robot, scene):
 
 @allocation_free(forceinline=True)
 def _touching(x, y, z, radius, solids, k):
-    """The lanes whose sphere touches an obstacle."""
+    """Mask of the lanes whose sphere touches obstacle k."""
     dx, dy, dz = x - solids[k, 0], y - solids[k, 1], z - solids[k, 2]
     u = dx * solids[k, 3] + dy * solids[k, 4] + dz * solids[k, 5]
     v = dx * solids[k, 6] + dy * solids[k, 7] + dz * solids[k, 8]
     w = dx * solids[k, 9] + dy * solids[k, 10] + dz * solids[k, 11]
-    w = greatest(magnitude(w) - solids[k, 14], _ZERO)
+    w = maximum(absolute(w) - solids[k, 14], _ZERO)
     reach = radius + solids[k, 15]
     if solids[k, 16] > _ZERO:
-        r = greatest(root(u * u + v * v) - solids[k, 12], _ZERO)
+        r = maximum(sqrt(u * u + v * v) - solids[k, 12], _ZERO)
         return r * r + w * w < reach * reach
-    u = greatest(magnitude(u) - solids[k, 12], _ZERO)
-    v = greatest(magnitude(v) - solids[k, 13], _ZERO)
+    u = maximum(absolute(u) - solids[k, 12], _ZERO)
+    v = maximum(absolute(v) - solids[k, 13], _ZERO)
     return u * u + v * v + w * w < reach * reach
 
 
 @allocation_free(forceinline=True)
 def _coordinate(frames, f, i, k, x, y, z):
-    """Number k of the position of a point, or of points in lanes, of frame f in lane i."""
+    """Coordinate k of a point of frame f, or of points in lanes, in configuration (lane) i."""
     return (
         x * frames[f, 3 * k * W + i]
         + y * frames[f, (3 * k + 1) * W + i]
@@ -171,7 +176,7 @@ def _coordinate(frames, f, i, k, x, y, z):
 
 @allocation_free(forceinline=True)
 def _place_row(robot, row, frames, f, i):
-    """Positions of a row of spheres in lane i of the configurations."""
+    """Positions of a row of spheres in configuration (lane) i."""
     x, y, z = load(robot.rows, row, 0), load(robot.rows, row, 1), load(robot.rows, row, 2)
     return (
         _coordinate(frames, f, i, 0, x, y, z),
@@ -182,17 +187,17 @@ def _place_row(robot, row, frames, f, i):
 
 @allocation_free(forceinline=True)
 def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
-    """Those of the lanes `near` in which a group touches an obstacle."""
+    """Those of the lanes `near` in which a group touches obstacle k."""
     hits, f = 0, robot.frame[g]
     first, last = robot.first_row[g], robot.first_row[g + 1]
     for row in range(first, last):
-        open_lanes = near & ~hits
+        lanes_that_may_touch = near & ~hits
         if last - first > 1:
             x, y, z = _centres_of(frames, f, robot.row_bounds, row)
-            open_lanes &= _touching(x, y, z, robot.row_bounds[row, 3] + padding, solids, k)
-        while open_lanes:
-            i = first_lane(open_lanes)
-            open_lanes &= open_lanes - 1
+            lanes_that_may_touch &= _touching(x, y, z, robot.row_bounds[row, 3] + padding, solids, k)
+        while lanes_that_may_touch:
+            i = first_lane(lanes_that_may_touch)
+            lanes_that_may_touch &= lanes_that_may_touch - 1
             x, y, z = _place_row(robot, row, frames, f, i)
             if _touching(x, y, z, load(robot.rows, row, 3) + padding, solids, k) != 0:
                 hits |= 1 << i
@@ -203,17 +208,17 @@ def _touching_group(robot, g, frames, near, padding, solids, k, stop_at_first):
 
 @allocation_free(forceinline=True)
 def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
-    """Those of the lanes `near` in which a group touches a point."""
+    """Those of the lanes `near` in which a group touches a point of the scene."""
     hits, f = 0, robot.frame[g]
     first, last = robot.first_row[g], robot.first_row[g + 1]
     for row in range(first, last):
-        open_lanes = near & ~hits
+        lanes_that_may_touch = near & ~hits
         if last - first > 1:
             x, y, z = _centres_of(frames, f, robot.row_bounds, row)
-            open_lanes &= near_points(x, y, z, robot.row_bounds[row, 3] + padding, scene)
-        while open_lanes:
-            i = first_lane(open_lanes)
-            open_lanes &= open_lanes - 1
+            lanes_that_may_touch &= near_points(x, y, z, robot.row_bounds[row, 3] + padding, scene)
+        while lanes_that_may_touch:
+            i = first_lane(lanes_that_may_touch)
+            lanes_that_may_touch &= lanes_that_may_touch - 1
             x, y, z = _place_row(robot, row, frames, f, i)
             if touch_points(x, y, z, load(robot.rows, row, 3) + padding, scene):
                 hits |= 1 << i
@@ -224,7 +229,7 @@ def _touching_points(robot, g, frames, near, padding, scene, stop_at_first):
 
 @allocation_free(forceinline=True)
 def _touching_balls(x, y, z, radius, u, v, w, other):
-    """The lanes in which two spheres touch each other."""
+    """Mask of the lanes in which two spheres touch each other."""
     dx, dy, dz, reach = x - u, y - v, z - w, radius + other
     return dx * dx + dy * dy + dz * dz < reach * reach
 
@@ -241,11 +246,11 @@ def _touching_each_other(robot, a, b, near, stop_at_first, work):
             continue
         for other in range(robot.first_row[b], robot.first_row[b + 1]):
             u, v, w = _centres_of(frames, robot.frame[b], bounds, other)
-            open_lanes = near_row & ~hits
-            open_lanes &= _touching_balls(x, y, z, bounds[row, 3], u, v, w, bounds[other, 3])
-            while open_lanes:
-                i = first_lane(open_lanes)
-                open_lanes &= open_lanes - 1
+            lanes_that_may_touch = near_row & ~hits
+            lanes_that_may_touch &= _touching_balls(x, y, z, bounds[row, 3], u, v, w, bounds[other, 3])
+            while lanes_that_may_touch:
+                i = first_lane(lanes_that_may_touch)
+                lanes_that_may_touch &= lanes_that_may_touch - 1
                 if _rows_touch(robot, row, robot.frame[a], other, robot.frame[b], i, work):
                     hits |= 1 << i
                     if stop_at_first:
@@ -255,7 +260,7 @@ def _touching_each_other(robot, a, b, near, stop_at_first, work):
 
 @allocation_free(forceinline=True)
 def _rows_touch(robot, row, f, other, g, i, work):
-    """Whether a row of spheres of frame f touches another of frame g in lane i."""
+    """Whether a row of spheres of frame f touches another one of frame g in lane i."""
     x, y, z = _place_row(robot, row, work.frames, f, i)
     u, v, w = _place_row(robot, other, work.frames, g, i)
     radius, placed = load(robot.rows, row, 3), work.row
@@ -271,18 +276,26 @@ def _rows_touch(robot, row, f, other, g, i, work):
 
 @allocation_free(forceinline=True)
 def _hits_scene(robot, scene, padding, stop_at_first, work):
+    """Mask of the lanes in which the robot touches the scene."""
     hits = 0
-    frames, around, solids = work.frames, scene.around, scene.solids
+    frames, around, solids = work.frames, scene.solid_boxes, scene.solids
     for g in range(len(robot.frame)):
         if robot.frame[g] == 0:
             continue
         x, y, z = load(work.centres, g, 0), load(work.centres, g, 1), load(work.centres, g, 2)
-        x0, x1, y0, y1, z0, z1 = lowest(x), highest(x), lowest(y), highest(y), lowest(z), highest(z)
+        x0, x1, y0, y1, z0, z1 = (
+            reduce_min(x),
+            reduce_max(x),
+            reduce_min(y),
+            reduce_max(y),
+            reduce_min(z),
+            reduce_max(z),
+        )
         reach = robot.bounds[g, 3] + padding
         for row in range(len(around)):
-            dx = greatest(greatest(load(around, row, 0) - x1, x0 - load(around, row, 3)), _ZERO)
-            dy = greatest(greatest(load(around, row, 1) - y1, y0 - load(around, row, 4)), _ZERO)
-            dz = greatest(greatest(load(around, row, 2) - z1, z0 - load(around, row, 5)), _ZERO)
+            dx = maximum(maximum(load(around, row, 0) - x1, x0 - load(around, row, 3)), _ZERO)
+            dy = maximum(maximum(load(around, row, 1) - y1, y0 - load(around, row, 4)), _ZERO)
+            dz = maximum(maximum(load(around, row, 2) - z1, z0 - load(around, row, 5)), _ZERO)
             close = dx * dx + dy * dy + dz * dz < reach * reach
             while close:
                 k = row * W + first_lane(close)
@@ -298,25 +311,25 @@ def _hits_scene(robot, scene, padding, stop_at_first, work):
                 hits |= _touching_points(robot, g, frames, near, padding, scene, stop_at_first)
                 if stop_at_first and hits:
                     return hits
-        if hits == ALL:
+        if hits == ALL_LANES:
             return hits
     return hits
 
 
 @allocation_free(forceinline=True)
-def open_lanes(robot, table, bit, q):
-    """The lanes in which a pair may touch by its table; see `near_pairs.py`."""
-    row = robot.near[table]
+def lanes_that_may_touch(robot, table, bit, q):
+    """Mask of the lanes in which a pair may touch according to its table; see `sphere_pair_tables.py`."""
+    row = robot.pair_tables[table]
     first, second = load(q, np.int32(row[0]), 0), load(q, np.int32(row[3]), 0)
-    i = least(greatest((first - row[1]) * row[2], _ZERO), np.float32(SIDE - 1))
-    j = least(greatest((second - row[4]) * row[5], _ZERO), np.float32(SIDE - 1))
-    cells = gather(row, whole(i) * np.float32(SIDE) + whole(j) + np.float32(HEAD))
-    return lanes_with(cells, bit)
+    i = minimum(maximum((first - row[1]) * row[2], _ZERO), np.float32(TABLE_SIDE - 1))
+    j = minimum(maximum((second - row[4]) * row[5], _ZERO), np.float32(TABLE_SIDE - 1))
+    cells = gather(row, floor(i) * np.float32(TABLE_SIDE) + floor(j) + np.float32(TABLE_HEADER))
+    return lanes_with_bit(cells, bit)
 
 
 @allocation_free(forceinline=True)
 def _hits_itself(robot, q, hits, stop_at_first, work):
-    """`hits` and the lanes in which a checked pair of links touches."""
+    """`hits`, with the lanes added in which a checked pair of links touches."""
     centres, bounds = work.centres, robot.bounds
     for p in range(len(robot.pairs)):
         a, b, table, bit = robot.pairs[p, 0], robot.pairs[p, 1], robot.pairs[p, 2], robot.pairs[p, 3]
@@ -324,7 +337,7 @@ def _hits_itself(robot, q, hits, stop_at_first, work):
         u, v, w = load(centres, b, 0), load(centres, b, 1), load(centres, b, 2)
         near = _touching_balls(x, y, z, bounds[a, 3], u, v, w, bounds[b, 3]) & ~hits
         if table >= 0:
-            near &= open_lanes(robot, table, bit, q)
+            near &= lanes_that_may_touch(robot, table, bit, q)
         if near:
             hits |= _touching_each_other(robot, a, b, near, stop_at_first, work)
             if stop_at_first and hits:
@@ -334,13 +347,14 @@ def _hits_itself(robot, q, hits, stop_at_first, work):
 
 @allocation_free()
 def block_hits(robot, scene, q, padding, stop_at_first, work):
-    """The configurations of q[dof, 16] that collide: bit i tells of column i.
+    """Mask of the configurations of q[dof, 16] that collide: bit i belongs to column i.
 
-    `padding` [m] is added to the radii towards the scene. With `stop_at_first` one that collides is enough.
+    `padding` [m] is added to the radii for checks against the scene. With `stop_at_first` the check ends at
+    the first configuration that collides.
     """
     place_frames(robot, q, work.frames, work.centres)
     hits = _hits_scene(robot, scene, padding, stop_at_first, work)
-    if hits == ALL or (stop_at_first and hits):
+    if hits == ALL_LANES or (stop_at_first and hits):
         return hits
     return _hits_itself(robot, q, hits, stop_at_first, work)
 

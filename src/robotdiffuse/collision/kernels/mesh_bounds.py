@@ -1,5 +1,4 @@
-"""Compiled lower bounds of distances between meshes, by the balls around them and the boxes around
-obstacles."""
+"""Compiled lower bounds of distances between meshes, from balls around them and boxes around obstacles."""
 
 import numpy as np
 from numba import njit
@@ -10,8 +9,8 @@ from robotdiffuse.collision.kernels.frames import placed, point_to_box, step
 
 @njit(cache=True)
 def forward(offsets, parents, slides, q):
-    """T_base_frame [n, dof + 1, 4, 4] of q[n, dof], in float64; offsets[dof, 4, 4], parents[dof] or None of a
-    chain, slides[dof]."""
+    """T_base_frame [n, dof + 1, 4, 4] at q[n, dof] in float64, from offsets[dof, 4, 4], parents[dof] (None
+    for a chain) and slides[dof], which marks prismatic joints."""
     n, dof = q.shape
     frames = np.zeros((n, dof + 1, 4, 4))
     for i in range(n):
@@ -25,8 +24,11 @@ def forward(offsets, parents, slides, q):
 
 @njit(cache=True)
 def scene_bounds(frames, frame, centers, radii, boxes):
-    """[n, pieces * obstacles] for pieces of a link, balls in its frame, and `boxes`: R_box_base [o, 3, 3],
-    centres [o, 3], half sizes [o, 3] and roundings [o]."""
+    """Lower bounds [n, pieces * obstacles] of the distances of a link's pieces to obstacles [m].
+
+    Pieces are given by balls in frame `frame`, obstacles by `boxes`: R_box_base [o, 3, 3], centres [o, 3],
+    half sizes [o, 3] and roundings [o].
+    """
     rotation, middle, half, rounding = boxes
     obstacles = len(middle)
     out = np.empty((len(frames), len(radii) * obstacles))
@@ -42,7 +44,8 @@ def scene_bounds(frames, frame, centers, radii, boxes):
 
 @njit(cache=True)
 def pair_bounds(frames, frame, centers, radii, other_frame, other_centers, other_radii):
-    """[n, pieces * others] for pieces of two links."""
+    """Lower bounds [n, pieces * others] of the distances between the pieces of two links, given by balls
+    [m]."""
     others = len(other_radii)
     out = np.empty((len(frames), len(radii) * others))
     for i in range(len(frames)):

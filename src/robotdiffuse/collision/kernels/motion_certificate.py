@@ -1,8 +1,9 @@
-"""The compiled part of the validator's certificate; see `collision/motions.py`.
+"""The compiled part of the motion certificate; see `collision/motions.py`.
 
 A check is a link against the scene, or a pair of links. A piece of a motion is settled for a check when the
-lower bound of its clearance along the piece leaves a margin: `tightness` of the least clearance measured of
-its kind. Bounds come from the covering spheres, and from the convex meshes where those are too coarse.
+lower bound of the clearance along the piece is at least the share `tightness` of the smallest measured
+clearance of its kind. Bounds come from the covering spheres, and from the convex meshes where the spheres are
+too coarse.
 
 A piece reaches from its middle q to both ends. Any of its configurations is q + d with |d_j| <= D_j, and for
 some t in [-1, 1] |d_j - t dq_j| <= e_j; on a straight line e is zero. Twice differentiating a point's place
@@ -10,8 +11,9 @@ p by joints j <= k gives at most the distance L_k of the point from the axis of 
 
     p(q + d) = p(q) + t v + r,   v = J(q) dq,   |r| <= sum_k L_k (e_k + D_k (D_k / 2 + sum_{j<k} D_j)).
 
-Of two links on one chain, the further is seen from the nearer, so only the joints between them count. Of two
-on different arms, both are seen from where the arms part: the remainders of both add up.
+For two links on one chain, motion is seen from the nearer link, so only the joints between them count. For
+two links on different arms, motion is seen from the frame where the arms part, and the remainders of both
+links add up.
 """
 
 from typing import NamedTuple
@@ -28,19 +30,19 @@ from robotdiffuse.collision.kernels.swept_spheres import (
     place_motions,
 )
 
-CAP = 1.0
-"""Clearances are not looked for beyond this [m]."""
+CLEARANCE_CAP = 1.0
+"""Larger clearances are not computed [m]."""
 FLOAT32_SLACK = 1e-5
-"""What rounding may add to the clearances of the compiled kernel [m]."""
-HULLS_BELOW = 0.01
-"""Sphere clearance [m] below which the convex meshes are looked at rather than the piece split further: the
-spheres stick out by about as much."""
-SURFACES_BELOW = 0.002
-"""The same for distances that only Coal knows, which take fifty times as long [m]."""
-MOST_PIECES = 4
-"""A piece is split into at most this many at a time."""
-STRAIGHT = 0.995
-"""First pieces end at waypoints where the cosine of the turn is below this."""
+"""Upper bound of the rounding error in the clearances of the float32 kernels [m]."""
+CONVEX_PARTS_BELOW = 0.01
+"""Sphere clearance below which the convex meshes are used before a piece is split further: the spheres stick
+out by about as much [m]."""
+COAL_BELOW = 0.002
+"""The same for distances that only Coal computes, which take fifty times as long [m]."""
+MAX_SPLIT = 4
+"""A piece is split into at most this many parts at a time."""
+STRAIGHT_COSINE = 0.995
+"""Initial pieces end at waypoints where the cosine of the change of direction is below this."""
 SCENE, PAIR = 0, 1
 
 
@@ -50,33 +52,34 @@ class Arm(NamedTuple):
     spheres: tuple
     """RobotArrays"""
     hulls: tuple
+    """`convex_bounds.Hulls`"""
     offsets: np.ndarray
     """[dof, 4, 4] `Robot.frame_offsets`"""
     parents: np.ndarray | None
-    """[dof] `Robot.parents`; None of a chain."""
+    """[dof] `Robot.parents`; None for a chain."""
     slides: np.ndarray
     """[dof] whether the joint is prismatic."""
 
 
 class Checks(NamedTuple):
-    """What is checked, those against the scene first."""
+    """The checks, those against the scene first."""
 
     kind: np.ndarray
     """[checks] SCENE or PAIR."""
     where: np.ndarray
-    """[checks] the group of spheres, or the pair of groups; -1 where the spheres do not know it."""
+    """[checks] index of the group of spheres, or of the pair of groups; -1 where there are no spheres."""
     parts: np.ndarray
-    """[checks, 4] from which part of the hulls on, up to which; and of the link that is further from the base
-    in a pair: those of the nearer one."""
+    """[checks, 4] range of the link's convex parts, of a pair those of the link further from the base; and
+    range of the other link's parts."""
     base: np.ndarray
     """[checks] the frame of what the link is checked against: the base, or that of the nearer link."""
     common: np.ndarray
-    """[checks] the frame that motion is seen from: `base`, or where the arms of two links part."""
+    """[checks] the frame from which motion is seen: `base`, or the one where the arms of two links part."""
     second: np.ndarray
-    """[checks] of links on two arms, the first joint of the second arm; else 0."""
-    levers: np.ndarray
-    """[checks, dof] motion bound of the link, or of either of two, seen from there, per unit of joint
-    motion."""
+    """[checks] for links on two arms, the first joint of the second arm; else 0."""
+    motion_radii: np.ndarray
+    """[checks, dof] bound on the motion of any point of the link, or of either link of a pair, per unit of
+    joint motion, seen from `common`."""
 
 
 class Motion(NamedTuple):
@@ -84,70 +87,72 @@ class Motion(NamedTuple):
 
     q: np.ndarray
     """[n, dof]"""
-    way: np.ndarray
-    """[n] motion bound of the arm up to each waypoint [m]; places on the motion are given by it."""
+    travel: np.ndarray
+    """[n] bound on the motion of any point of the arm up to each waypoint [m]. Places on the motion are
+    values of it."""
 
 
 class Pieces(NamedTuple):
     """Pieces of a motion in order."""
 
     start: np.ndarray
+    """[n] place where each begins."""
     stop: np.ndarray
     undecided: np.ndarray
-    """[n, checks]"""
+    """[n, checks] whether the check is still open."""
 
 
 class Round(NamedTuple):
-    """Pieces that are left open, with what is known of each check."""
+    """Open pieces with the bounds of each check."""
 
     pieces: Pieces
     clearance: np.ndarray
-    """[n, checks] lower bounds in the middles [m]; infinite where settled."""
+    """[n, checks] lower bounds of the clearance in the middles [m]; infinite where settled."""
     lower: np.ndarray
-    """[n, checks] lower bounds along the pieces [m]."""
+    """[n, checks] lower bounds of the clearance along the pieces [m]."""
     rest: np.ndarray
-    """[n, checks] what the remainder takes away of them [m]."""
+    """[n, checks] the remainder |r|, which `lower` contains [m]."""
     travel: np.ndarray
-    """[n, checks] where only Coal can tell: how far the link moves from the middle to an end at most [m];
+    """[n, checks] where only Coal can decide: bound on the motion of the link from the middle to an end [m];
     else negative."""
 
 
 @njit(cache=True)
-def way_along(q, levers):
-    """[n] motion bounds from the first waypoint of q[n, dof] to each, of the link that moves most."""
-    way = np.zeros(len(q))
+def travel_along(q, motion_radii):
+    """`Motion.travel` [n] of the waypoints q[n, dof]: each step counts the link that moves most."""
+    travel = np.zeros(len(q))
     for i in range(1, len(q)):
         most = 0.0
-        for c in range(len(levers)):
+        for c in range(len(motion_radii)):
             total = 0.0
             for j in range(q.shape[1]):
-                total += levers[c, j] * abs(q[i, j] - q[i - 1, j])
+                total += motion_radii[c, j] * abs(q[i, j] - q[i - 1, j])
             most = max(most, total)
-        way[i] = way[i - 1] + most
-    return way
+        travel[i] = travel[i - 1] + most
+    return travel
 
 
 @njit(cache=True)
-def segment_at(way, at):
-    """The last waypoint that is not beyond a place, and the share of the way from there to the next."""
-    low = min(max(np.searchsorted(way, at, side="right") - 1, 0), max(len(way) - 2, 0))
-    if low + 1 >= len(way) or way[low + 1] <= way[low]:
+def segment_at(travel, at):
+    """The last waypoint that is not beyond a place, and the share of the segment from there to the next."""
+    low = min(max(np.searchsorted(travel, at, side="right") - 1, 0), max(len(travel) - 2, 0))
+    if low + 1 >= len(travel) or travel[low + 1] <= travel[low]:
         return low, 0.0
-    return low, min((at - way[low]) / (way[low + 1] - way[low]), 1.0)
+    return low, min((at - travel[low]) / (travel[low + 1] - travel[low]), 1.0)
 
 
 @njit(cache=True)
 def configuration(motion, at, out):
-    """The configuration at a place, to out[dof]."""
-    low, share = segment_at(motion.way, at)
-    high = min(low + 1, len(motion.way) - 1)
+    """Writes the configuration at a place to out[dof]."""
+    low, share = segment_at(motion.travel, at)
+    high = min(low + 1, len(motion.travel) - 1)
     for j in range(len(out)):
         out[j] = motion.q[low, j] + share * (motion.q[high, j] - motion.q[low, j])
 
 
 @njit(cache=True)
 def _cut(ends, start, stop, travel):
-    """Appends where the parts of a stretch, which are equal and about `travel` long, end."""
+    """Appends the ends of the equal parts, about `travel` long, of a stretch."""
     count = max(int(np.ceil((stop - start) / travel)), 1)
     for k in range(1, count):
         ends.append(start + (stop - start) * (k / count))
@@ -156,8 +161,8 @@ def _cut(ends, start, stop, travel):
 
 @njit(cache=True)
 def first_pieces(motion, checks, travel):
-    """Pieces whose motion bounds are about `travel` [m] and that turn little, after one of no length at the
-    start."""
+    """The initial pieces: one of length zero at the start, then pieces with a motion bound of about `travel`
+    [m] that change their direction little."""
     q, way = motion
     n, dof = q.shape
     ends = [0.0]
@@ -171,7 +176,7 @@ def first_pieces(motion, checks, travel):
             for j in range(dof):
                 u, v = q[before + 1, j] - q[before, j], q[i, j] - q[i - 1, j]
                 dot, a, b = dot + u * v, a + u * u, b + v * v
-        if dot < STRAIGHT * np.sqrt(a * b):
+        if dot < STRAIGHT_COSINE * np.sqrt(a * b):
             _cut(ends, last, way[i - 1], travel)
             last = way[i - 1]
         before = i - 1
@@ -185,7 +190,7 @@ def first_pieces(motion, checks, travel):
 
 @njit(cache=True)
 def _spread(motion, start, stop, q, dq, e, most, scratch):
-    """Fills q, dq, e and D (`most`) of the head of this file for a piece."""
+    """Writes q, dq, e and D (`most`), as defined at the top of this file, for a piece."""
     dof = len(q)
     configuration(motion, 0.5 * (start + stop), q)
     configuration(motion, start, dq)
@@ -197,9 +202,9 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
         e[j] = 0.5 * abs(after + before)
         most[j] = max(abs(before), abs(after))
         square += dq[j] * dq[j]
-    first = np.searchsorted(motion.way, start, side="right")
-    for i in range(first, len(motion.way)):
-        if motion.way[i] >= stop:
+    first = np.searchsorted(motion.travel, start, side="right")
+    for i in range(first, len(motion.travel)):
+        if motion.travel[i] >= stop:
             break
         t = 0.0
         for j in range(dof):
@@ -212,20 +217,21 @@ def _spread(motion, start, stop, q, dq, e, most, scratch):
 
 
 @njit(cache=True)
-def _remainder(lever, second, e, most):
+def _remainder(radii, second, e, most):
+    """The bound on |r| at the top of this file [m]."""
     total, before = 0.0, 0.0
-    for k in range(len(lever)):
+    for k in range(len(radii)):
         if k == second:
             before = 0.0
-        if lever[k] > 0:
-            total += lever[k] * (e[k] + most[k] * (0.5 * most[k] + before))
+        if radii[k] > 0:
+            total += radii[k] * (e[k] + most[k] * (0.5 * most[k] + before))
             before += most[k]
     return total
 
 
 @njit(cache=True)
-def by_spheres(arm, scene, motion, checks, pieces, best, work):
-    """What the spheres say of the pieces; lowers best[2]."""
+def bound_by_spheres(arm, scene, motion, checks, pieces, best, work):
+    """Bounds of the pieces from the spheres; lowers best[2], the smallest measured clearances by kind."""
     n, count = pieces.undecided.shape
     dof = motion.q.shape[1]
     clearance, lower = np.full((n, count), np.inf), np.full((n, count), np.inf)
@@ -240,7 +246,7 @@ def by_spheres(arm, scene, motion, checks, pieces, best, work):
                 _spread(motion, pieces.start[row], pieces.stop[row], q, dq, e, most, scratch)
                 for c in range(count):
                     if pieces.undecided[row, c]:
-                        rest[row, c] = _remainder(checks.levers[c], checks.second[c], e, most)
+                        rest[row, c] = _remainder(checks.motion_radii[c], checks.second[c], e, most)
             for j in range(dof):
                 block[j, i], moves[j, i] = q[j], dq[j]
         place_motions(arm.spheres, block, moves, work)
@@ -267,21 +273,24 @@ def by_spheres(arm, scene, motion, checks, pieces, best, work):
                     continue
                 clearance[row, c] = work.clearance[0, row - first] - FLOAT32_SLACK
                 lower[row, c] = work.lower[0, row - first] - rest[row, c] - FLOAT32_SLACK
-                if clearance[row, c] > HULLS_BELOW:
+                if clearance[row, c] > CONVEX_PARTS_BELOW:
                     best[kind] = min(best[kind], clearance[row, c])
     return Round(pieces, clearance, lower, rest, np.full((n, count), -1.0))
 
 
 @njit(cache=True)
 def _is_open(found, checks, best, tightness, row, c):
+    """Whether a check of a piece is not settled by its lower bound."""
     least = tightness * best[checks.kind[c]]
     return found.pieces.undecided[row, c] and found.lower[row, c] < least
 
 
 @njit(cache=True)
-def by_hulls(arm, solids, motion, checks, found, best, tightness, contact, posture):
-    """Better bounds, from the convex meshes, where those of the spheres are too coarse; lowers best[2].
-    Returns how many checks are left to Coal."""
+def bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, contact, posture):
+    """Better bounds from the convex meshes where those of the spheres are too coarse; lowers best[2].
+
+    Returns the number of checks that are left to Coal.
+    """
     n, count = found.clearance.shape
     dof = motion.q.shape[1]
     q, dq, e, most, scratch = np.empty(dof), np.empty(dof), np.empty(dof), np.empty(dof), np.empty(dof)
@@ -289,7 +298,9 @@ def by_hulls(arm, solids, motion, checks, found, best, tightness, contact, postu
     for row in range(n):
         posed = False
         for c in range(count):
-            if found.clearance[row, c] > HULLS_BELOW or not _is_open(found, checks, best, tightness, row, c):
+            if found.clearance[row, c] > CONVEX_PARTS_BELOW or not _is_open(
+                found, checks, best, tightness, row, c
+            ):
                 continue
             if not posed:
                 _spread(motion, found.pieces.start[row], found.pieces.stop[row], q, dq, e, most, scratch)
@@ -302,7 +313,7 @@ def by_hulls(arm, solids, motion, checks, found, best, tightness, contact, postu
             if not coarse:
                 found.clearance[row, c] = max(clearance, coarser)
                 found.lower[row, c] = max(lower, found.lower[row, c])
-            if coarse and not touching and coarser > SURFACES_BELOW:
+            if coarse and not touching and coarser > COAL_BELOW:
                 best[kind] = min(best[kind], coarser)
             elif touching or coarse:
                 speed = 0.0
@@ -315,12 +326,15 @@ def by_hulls(arm, solids, motion, checks, found, best, tightness, contact, postu
 
 @njit(cache=True)
 def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
-    """Of a check and a piece: lower bounds of the clearance in the middle and along the piece, `best` or less
-    if less was measured, whether something is known by its bounds alone that are too near, and whether bodies
-    touch or nearly."""
+    """Bounds of one check of a piece from separating planes.
+
+    Returns lower bounds of the clearance in the middle and along the piece; `best`, or less if a smaller
+    clearance was measured; whether a surface or point cloud, of which only a bounding box is known, is too
+    near; and whether bodies touch, or nearly.
+    """
     against_scene = checks.kind[c] == SCENE
     base, common, parts = checks.base[c], checks.common[c], len(hulls.frame)
-    clearance, lower, coarse, touching = CAP, CAP, False, False
+    clearance, lower, coarse, touching = CLEARANCE_CAP, CLEARANCE_CAP, False, False
     others = range(len(solids.disc)) if against_scene else range(checks.parts[c, 2], checks.parts[c, 3])
     for p in range(checks.parts[c, 0], checks.parts[c, 1]):
         speed = meshes.part_speed(hulls, p, base, posture)
@@ -349,7 +363,7 @@ def _parted(hulls, solids, checks, c, rest, best, tightness, contact, posture):
 
 @njit(cache=True)
 def settle(checks, found, best, certified, tightness):
-    """Settle what the bounds of a round allow and split the rest; lowers certified[2]."""
+    """Settles the checks whose bounds suffice and splits the other pieces; lowers certified[2]."""
     pieces = found.pieces
     n, count = found.clearance.shape
     parts, total = np.zeros(n, np.int64), 0
@@ -363,10 +377,10 @@ def settle(checks, found, best, certified, tightness):
                 pieces.undecided[row, c] = False
                 certified[kind] = min(certified[kind], lower)
                 continue
-            # what is lost along a piece falls with its length, the remainder with its square
+            # the loss of clearance along a piece falls linearly with its length, the remainder quadratically
             rest, spare = found.rest[row, c], found.clearance[row, c] - least
             lost, k = found.clearance[row, c] - lower - rest, 2
-            while k < MOST_PIECES and not lost / k + rest / (k * k) <= spare:
+            while k < MAX_SPLIT and not lost / k + rest / (k * k) <= spare:
                 k += 1
             parts[row] = max(parts[row], k)
         total += parts[row]
@@ -375,7 +389,7 @@ def settle(checks, found, best, certified, tightness):
 
 @njit(cache=True)
 def split(pieces, parts, total):
-    """Every piece in so many equal parts, `total` altogether; 0 drops it."""
+    """Every piece in parts[n] equal parts, `total` altogether; 0 drops a piece."""
     start, stop = np.empty(total), np.empty(total)
     undecided = np.empty((total, pieces.undecided.shape[1]), np.bool_)
     at = 0
@@ -391,16 +405,16 @@ def split(pieces, parts, total):
 
 @njit(cache=True, nogil=True)
 def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightness, contact):
-    """Rounds of bounding, settling and splitting until a check needs Coal, or nothing is left.
+    """Repeats bounding, settling and splitting until a check needs Coal, or nothing is left.
 
-    best[2] and certified[2], by kind, are lowered. Returns the last round, not settled, and which of its
-    checks Coal is to be asked about: rows and columns, in order of the motion.
+    Lowers best[2] and certified[2], by kind. Returns the last round, not yet settled, and the rows and
+    columns of the checks that Coal has to decide, in the order of the motion.
     """
     work = make_swept_spheres(arm.spheres, scene)
     posture = meshes.make_posture(arm.hulls, solids, motion.q.shape[1])
     while True:
-        found = by_spheres(arm, scene, motion, checks, pieces, best, work)
-        asked = by_hulls(arm, solids, motion, checks, found, best, tightness, contact, posture)
+        found = bound_by_spheres(arm, scene, motion, checks, pieces, best, work)
+        asked = bound_by_convex_parts(arm, solids, motion, checks, found, best, tightness, contact, posture)
         n, count = found.clearance.shape
         if n == 0 or asked:
             rows, columns, k = np.empty(asked, np.int64), np.empty(asked, np.int64), 0
@@ -415,7 +429,7 @@ def rounds(arm, scene, solids, motion, checks, pieces, best, certified, tightnes
 
 @njit(cache=True)
 def configurations(motion, places):
-    """[m, dof] at the places."""
+    """Configurations [m, dof] at places."""
     out = np.empty((len(places), motion.q.shape[1]))
     for i in range(len(places)):
         configuration(motion, places[i], out[i])

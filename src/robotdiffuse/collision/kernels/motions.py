@@ -1,4 +1,4 @@
-"""Straight motions in joint space, checked by the compiled kernel at places close enough to each other."""
+"""Compiled checks of straight motions in joint space at configurations close enough to each other."""
 
 from typing import NamedTuple
 
@@ -7,17 +7,17 @@ from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
 from robotdiffuse.collision.kernels.lane_collision import block_hits, make_workspace
-from robotdiffuse.collision.kernels.simd import W, ramp, store
+from robotdiffuse.collision.kernels.simd import W, lane_numbers, store
 
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 RELAXATION_SLOPE = np.float32(0.1)
-"""How the padding grows with the distance from an end that is closer to the scene [m/rad]."""
+"""Growth of the padding with the distance from a start or goal that is closer to the scene [m/rad]."""
 RELAXATION_STEP = np.float32(0.1)
-"""Near such an end the padding changes in steps of this length [rad]."""
+"""Near such a start or goal the padding changes in steps of this length [rad]."""
 
 
 class Space(NamedTuple):
-    """What a search needs to know about the robot and the scene."""
+    """The arguments of a search: the robot, the scene, and how motions are checked."""
 
     robot: tuple
     """RobotArrays"""
@@ -25,18 +25,20 @@ class Space(NamedTuple):
     """SceneArrays"""
     lower: np.ndarray
     upper: np.ndarray
-    levers: np.ndarray
-    """[dof] largest distance of any point of the arm from each joint's axis [m], 1 for prismatic joints."""
+    motion_radii: np.ndarray
+    """[dof] largest distance of any point of the arm from each joint's axis [m]; 1 for prismatic joints."""
     resolution: np.float32
     """No point of the arm moves further than this between two checks [m]."""
     padding: np.float32
-    """Added to the radii of the spheres towards the scene [m]."""
+    """Added to the radii of the spheres for checks against the scene [m]."""
     near_ends: np.ndarray
-    """[m, dof + 1] ends that are closer to the scene than `padding`, and the padding that they allow [m]."""
+    """[m, dof + 1] starts and goals that are closer to the scene than `padding`, and the padding that they
+    allow [m]."""
 
 
 @allocation_free(fastmath=True)
 def distance(a, b):
+    """Distance of two configurations in joint space [rad, L2]."""
     total = np.float32(0.0)
     for j in range(len(a)):
         d = np.float32(a[j] - b[j])
@@ -55,11 +57,11 @@ def path_length(path):
 
 @allocation_free()
 def motion_free(space, a, b, block, work):
-    """Whether the straight motion from a to b is free; b is checked, a is not.
+    """Whether the straight motion from a to b is free of collision; b is checked, a is not.
 
-    Ends may be of any float type. Each block of 16 takes configurations spread over the whole motion, so that
-    a collision anywhere tends to show in the first block (the rake of W. Thomason et al., "Motions in
-    Microseconds", ICRA 2024).
+    a and b may be of any float type. The 16 configurations of a block are spread over the whole motion, so
+    that the first block finds most collisions (the rake of W. Thomason et al., "Motions in Microseconds",
+    ICRA 2024).
     """
     if len(space.near_ends) == 0:
         return _stretch_free(space, a, b, np.float32(0.0), _ONE, space.padding, block, work)
@@ -81,8 +83,11 @@ def motion_free(space, a, b, block, work):
 
 @allocation_free()
 def padding_near(space, a, b, share, around):
-    """The padding asked for within `around` [rad] of the place at a share of the way from a to b: near an end
-    that is closer to the scene, what that end allows and RELAXATION_SLOPE more for each radian from it."""
+    """The padding [m] required within `around` [rad] of the configuration at a share of the way from a to b.
+
+    Near a start or goal that is closer to the scene, it is the padding which that allows, plus
+    RELAXATION_SLOPE per radian of distance from it.
+    """
     padding, dof = space.padding, len(a)
     for m in range(len(space.near_ends)):
         total = np.float32(0.0)
@@ -97,15 +102,15 @@ def padding_near(space, a, b, share, around):
 
 @allocation_free()
 def _stretch_free(space, a, b, s, t, padding, block, work):
-    """Whether the part of the motion after the share s and up to the share t is free."""
+    """Whether the part of the motion after share s and up to share t is free of collision."""
     dof = len(a)
     travel = np.float32(0.0)
     for j in range(dof):
-        travel += (t - s) * np.float32(abs(b[j] - a[j])) * space.levers[j]
+        travel += (t - s) * np.float32(abs(b[j] - a[j])) * space.motion_radii[j]
     blocks = max(int(np.ceil(travel / space.resolution / np.float32(W))), 1)
     step = (t - s) / np.float32(blocks * W)
     for k in range(blocks):
-        shares = (ramp() * np.float32(blocks) + np.float32(blocks - k)) * step
+        shares = (lane_numbers() * np.float32(blocks) + np.float32(blocks - k)) * step
         for j in range(dof):
             far = np.float32(b[j] - a[j])
             store(block, j, 0, shares * far + (np.float32(a[j]) + s * far))
@@ -116,7 +121,8 @@ def _stretch_free(space, a, b, s, t, padding, block, work):
 
 @njit(cache=True, nogil=True)
 def motions_free(space, path):
-    """Whether each straight motion between the rows of path[n, dof] is free; ends are checked, not starts."""
+    """Whether each straight motion between rows of path[n, dof] is free of collision; row 0 is not
+    checked."""
     work, block = make_workspace(space.robot, space.scene), np.empty((path.shape[1], W), np.float32)
     out = np.empty(len(path) - 1, np.bool_)
     for i in range(len(path) - 1):

@@ -1,9 +1,9 @@
-"""The compiled part of the certificate in time; see `collision/moving_obstacles.py`.
+"""The compiled part of the motion certificate among moving obstacles; see `collision/moving_obstacles.py`.
 
-A task is an interval of a timed motion and the pairs of a link and an obstacle that are open there. A pair is
-settled when its clearance in the middle exceeds, by what is asked for, how far the link's points and the
-obstacle's can move from there until either end; otherwise the interval is halved. Clearances are those of the
-covering spheres. Where these touch, the pair is left to the exact meshes.
+A task is an interval of a timed motion with the pairs of a link and an obstacle that are open there. A pair
+is settled when its clearance in the middle exceeds the motion of the link's and the obstacle's points until
+either end by the required clearance; otherwise the interval is halved. Clearances are those of the covering
+spheres. Where these touch, the pair is left to the exact meshes.
 """
 
 from typing import NamedTuple
@@ -14,10 +14,10 @@ from numba import njit
 from robotdiffuse.collision.kernels.compiled import parent_of
 from robotdiffuse.collision.kernels.frames import placed, step
 
-CAP = 1.0
+CLEARANCE_CAP = 1.0
 """Clearances beyond this [m] are reported as this."""
-DEEPEST = 48
-"""An interval is halved so often at most."""
+MAX_HALVINGS = 48
+"""Halvings of an interval at most."""
 
 
 class Links(NamedTuple):
@@ -26,23 +26,24 @@ class Links(NamedTuple):
     offsets: np.ndarray
     """[dof, 4, 4] `Robot.frame_offsets`"""
     parents: np.ndarray | None
-    """[dof] `Robot.parents`; None of a chain."""
+    """[dof] `Robot.parents`; None for a chain."""
     slides: np.ndarray
     """[dof] whether the joint is prismatic."""
     frame: np.ndarray
-    """[links]"""
+    """[links] index of the frame that each link is fixed to."""
     bounds: np.ndarray
     """[links, 4] a ball around all spheres of the link, in its frame."""
     first: np.ndarray
     """[links + 1] first sphere of each link."""
     spheres: np.ndarray
     """[n, 4] x y z radius in the frame of the link."""
-    levers: np.ndarray
-    """[links, dof] motion bounds per unit of joint motion."""
+    motion_radii: np.ndarray
+    """[links, dof] bound on the motion of any point of the link per unit of joint motion."""
 
 
 class Tracks(NamedTuple):
-    """Obstacles that move: each the sum of a box, a disc about its z axis and a ball (`hulls.Solid`)."""
+    """Moving obstacles, each the Minkowski sum of a box, a disc about its z axis and a ball, as in
+    `convex_bounds.Solids`."""
 
     first: np.ndarray
     """[obstacles + 1] first pose of each."""
@@ -51,30 +52,34 @@ class Tracks(NamedTuple):
     xyz: np.ndarray
     """[k, 3] of the poses of the obstacles' frames."""
     wxyz: np.ndarray
-    """[k, 4] each on the same side as the one before."""
+    """[k, 4] each in the same half of quaternion space as the one before."""
     speeds: np.ndarray
-    """[k] bound on the speed of the obstacle's points until the next pose; 0 for its last."""
+    """[k] bound on the speed of the obstacle's points until the next pose [m/s]; 0 for its last."""
     growth: np.ndarray
-    """[obstacles] what is added to it per second since time 0 [m/s]."""
+    """[obstacles] inflation per second since time 0 [m/s]."""
     centre: np.ndarray
-    """[obstacles, 3] of the box, in the obstacle's frame."""
+    """[obstacles, 3] centre of the box in the obstacle's frame."""
     half: np.ndarray
-    """[obstacles, 3]"""
+    """[obstacles, 3] half edges of the box."""
     disc: np.ndarray
+    """[obstacles] radius of the disc."""
     rounding: np.ndarray
+    """[obstacles] radius of the ball."""
 
 
 class Tasks(NamedTuple):
+    """Intervals of a timed motion with their open pairs."""
+
     start: np.ndarray
-    """[n] of the interval [s]"""
+    """[n] start of each interval [s]."""
     stop: np.ndarray
     pairs: np.ndarray
-    """[n, links, obstacles] which ones are open."""
+    """[n, links, obstacles] whether the pair is open."""
 
 
 @njit(cache=True)
 def pose_at(tracks, o, time, rotation, xyz):
-    """Where an obstacle is: fills R_base_obstacle [3, 3] and its origin [3]."""
+    """Writes the pose of obstacle o at a time: R_base_obstacle [3, 3] and its origin [3]."""
     low, high = tracks.first[o], tracks.first[o + 1] - 1
     share = 0.0
     if time >= tracks.times[high]:
@@ -117,7 +122,7 @@ def pose_at(tracks, o, time, rotation, xyz):
 
 @njit(cache=True)
 def speed_between(tracks, o, start, stop):
-    """No point of an obstacle is faster than this at any time between these [m/s], without its growth."""
+    """Upper bound on the speed of any point of obstacle o between two times [m/s], without its growth."""
     most = 0.0
     for k in range(tracks.first[o], tracks.first[o + 1] - 1):
         if tracks.times[k] < stop and tracks.times[k + 1] > start:
@@ -126,8 +131,8 @@ def speed_between(tracks, o, start, stop):
 
 
 @njit(cache=True)
-def _gap(tracks, o, rotation, xyz, x, y, z):
-    """Signed distance of a point to an obstacle that has not grown [m]; within, at most the true one."""
+def _obstacle_distance(tracks, o, rotation, xyz, x, y, z):
+    """Signed distance of a point to obstacle o without its growth [m]; inside, a lower bound."""
     x, y, z = x - xyz[0], y - xyz[1], z - xyz[2]
     u = abs(rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z - tracks.centre[o, 0])
     v = abs(rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z - tracks.centre[o, 1])
@@ -145,32 +150,39 @@ def _gap(tracks, o, rotation, xyz, x, y, z):
 
 @njit(cache=True)
 def _clearance(links, frames, link, tracks, o, rotation, xyz, enough):
-    """Of the spheres of a link to an obstacle [m]; or, where it is more than `enough`, a lower bound that is
+    """Clearance of the spheres of a link to obstacle o [m]; if it exceeds `enough`, a lower bound that does
     too."""
     T = frames[links.frame[link]]
     ball = links.bounds[link]
     around = (
-        _gap(tracks, o, rotation, xyz, placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)) - ball[3]
+        _obstacle_distance(
+            tracks, o, rotation, xyz, placed(T, ball, 0), placed(T, ball, 1), placed(T, ball, 2)
+        )
+        - ball[3]
     )
     if around > enough:
         return around
     least = np.inf
     for s in range(links.first[link], links.first[link + 1]):
         p = links.spheres[s]
-        gap = _gap(tracks, o, rotation, xyz, placed(T, p, 0), placed(T, p, 1), placed(T, p, 2)) - p[3]
+        gap = (
+            _obstacle_distance(tracks, o, rotation, xyz, placed(T, p, 0), placed(T, p, 1), placed(T, p, 2))
+            - p[3]
+        )
         least = min(least, gap)
     return least
 
 
 @njit(cache=True)
 def _pose_arm(links, q, frames):
+    """Writes the frames at q."""
     for j in range(len(q)):
         step(frames[parent_of(links.parents, j)], links.offsets[j], links.slides[j], q[j], frames[j + 1])
 
 
 @njit(cache=True)
 def _row_at(times, time):
-    """The last row that is not later, and the share of the way from there to the next."""
+    """The last row that is not later than a time, and the share of the time from there to the next."""
     low = min(max(np.searchsorted(times, time, side="right") - 1, 0), max(len(times) - 2, 0))
     if low + 1 >= len(times):
         return low, 0.0
@@ -178,14 +190,15 @@ def _row_at(times, time):
 
 
 @njit(cache=True)
-def _mixed(rows, low, share, j):
+def _interpolated(rows, low, share, j):
+    """Column j of rows, interpolated between row `low` and the next."""
     high = min(low + 1, len(rows) - 1)
     return rows[low, j] + share * (rows[high, j] - rows[low, j])
 
 
 @njit(cache=True)
-def ways_of(q):
-    """[n, dof] how far each joint has moved by each row, to and fro."""
+def cumulative_motion(q):
+    """[n, dof] total motion of each joint, forwards and backwards, from the first row to each row."""
     ways = np.zeros_like(q)
     for i in range(1, len(q)):
         for j in range(q.shape[1]):
@@ -194,16 +207,17 @@ def ways_of(q):
 
 
 @njit(cache=True, nogil=True)
-def certify(links, tracks, times, q, tasks, least, tightness, best):
-    """Settle the tasks, in their order, as far as the spheres can.
+def settle_tasks(links, tracks, times, q, tasks, least, tightness, best):
+    """Settles the tasks, in order, as far as the spheres can.
 
     The motion is on straight lines between the rows q[n, dof] at times[n], at rest before and after. A pair
-    is settled when its bound is at least `least` and the share `tightness` of the least clearance measured so
-    far, best[1], which is lowered. Returns the least bound that settled a pair, and the tasks that are left
-    to the exact meshes, of one pair each: their middles are where its spheres are within `least`.
+    is settled when its bound is at least `least` [m] and at least the share `tightness` of the smallest
+    clearance measured so far, best[1], which is lowered. Returns the smallest bound that settled a pair, and
+    the tasks that are left to the exact meshes, one pair each, as (start, stop, link, obstacle): in their
+    middles the spheres are within `least`.
     """
     dof, count, obstacles = q.shape[1], len(links.frame), len(tracks.growth)
-    ways = ways_of(q)
+    ways = cumulative_motion(q)
     frames = np.zeros((dof + 1, 4, 4))
     for i in range(dof + 1):
         frames[i, 3, 3] = 1.0
@@ -212,11 +226,11 @@ def certify(links, tracks, times, q, tasks, least, tightness, best):
     middle, moved = np.empty(dof), np.empty(dof)
     rotation, xyz = np.empty((3, 3)), np.empty(3)
     travel = np.empty(count)
-    starts, stops = np.empty(DEEPEST + 2), np.empty(DEEPEST + 2)
-    depths = np.empty(DEEPEST + 2, np.int64)
-    pairs = np.empty((DEEPEST + 2, count, obstacles), np.bool_)
+    starts, stops = np.empty(MAX_HALVINGS + 2), np.empty(MAX_HALVINGS + 2)
+    depths = np.empty(MAX_HALVINGS + 2, np.int64)
+    pairs = np.empty((MAX_HALVINGS + 2, count, obstacles), np.bool_)
     left = [(0.0, 0.0, 0, 0) for _ in range(0)]
-    certified = CAP
+    certified = CLEARANCE_CAP
     for task in range(len(tasks.start)):
         starts[0], stops[0], depths[0], size = tasks.start[task], tasks.stop[task], 0, 1
         pairs[0] = tasks.pairs[task]
@@ -228,15 +242,15 @@ def certify(links, tracks, times, q, tasks, least, tightness, best):
             first, first_share = _row_at(times, start)
             last, last_share = _row_at(times, stop)
             for j in range(dof):
-                middle[j] = _mixed(q, row, share, j)
-                way = _mixed(ways, row, share, j)
-                before = way - _mixed(ways, first, first_share, j)
-                moved[j] = max(before, _mixed(ways, last, last_share, j) - way)
+                middle[j] = _interpolated(q, row, share, j)
+                way = _interpolated(ways, row, share, j)
+                before = way - _interpolated(ways, first, first_share, j)
+                moved[j] = max(before, _interpolated(ways, last, last_share, j) - way)
             _pose_arm(links, middle, frames)
             for link in range(count):
                 travel[link] = 0.0
                 for j in range(dof):
-                    travel[link] += links.levers[link, j] * moved[j]
+                    travel[link] += links.motion_radii[link, j] * moved[j]
             again = False
             for o in range(obstacles):
                 posed, speed = False, 0.0
@@ -251,8 +265,8 @@ def certify(links, tracks, times, q, tasks, least, tightness, best):
                     asked = max(least, tightness * best[0])
                     enough = grown + lost + max(asked, best[0] if tightness > 0 else 0.0)
                     clear = _clearance(links, frames, link, tracks, o, rotation, xyz, enough) - grown
-                    clear = min(clear, CAP + lost)
-                    if clear <= least or depth == DEEPEST:
+                    clear = min(clear, CLEARANCE_CAP + lost)
+                    if clear <= least or depth == MAX_HALVINGS:
                         left.append((start, stop, link, o))
                         pairs[size, link, o] = False
                         continue
@@ -272,9 +286,9 @@ def certify(links, tracks, times, q, tasks, least, tightness, best):
 
 
 @njit(cache=True, nogil=True)
-def free_over(links, tracks, q, times, least):
-    """[n, k] whether no link comes within `least` [m] of any obstacle, at each of q[n, dof] and each of the
-    increasing times[k]; by the covering spheres."""
+def free_at_times(links, tracks, q, times, least):
+    """Whether the covering spheres keep `least` [m] from all obstacles, [n, k], at each of q[n, dof] and each
+    of the increasing times[k]."""
     dof, count, obstacles = q.shape[1], len(links.frame), len(tracks.growth)
     frames = np.zeros((dof + 1, 4, 4))
     for i in range(dof + 1):
@@ -304,7 +318,7 @@ def free_over(links, tracks, q, times, least):
                     )
                     out[i, k] = spare >= 0
                     until = times[k] + max(spare, 0.0) / max(speeds[o], 1e-9)
-                    k += 1  # nothing can be near before the obstacle has covered what is to spare
+                    k += 1  # nothing can be near before the obstacle has covered the spare distance
                     while k < len(times) and times[k] < until:
                         k += 1
     return out

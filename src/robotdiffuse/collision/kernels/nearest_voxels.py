@@ -1,25 +1,28 @@
-"""The exact Euclidean distance transform of a grid, compiled: what is nearest to each voxel."""
+"""Compiled exact Euclidean distance transform of a grid: finds the nearest voxel with points for every
+voxel."""
 
 import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.compiled import allocation_free
 
-_FAR = np.int32(1 << 30)
-"""Squared distance where there are no points at all [voxels²]."""
+_NO_POINTS = np.int32(1 << 30)
+"""Squared distance in lines without any points [voxels²]."""
 _ROUNDED = 1e-6
-"""More than what rounding does to a place in a line, less than how far one that is no integer is from one."""
+"""More than the rounding error of a place in a line, less than the distance of a fractional place from an
+integer."""
 
 
 @njit(fastmath=True, cache=True)
 def nearest_voxels(run):
-    """Of each voxel the nearest one with points: its squared distance in voxels, and its number in `run`.
+    """For each voxel the squared distance to the nearest voxel with points [voxels²], and that voxel's value
+    in `run`.
 
-    run int32[nx, ny, nz] is -1 where there are none; at least one has some. Axis by axis (A. Meijster,
-    J. Roerdink, W. Hesselink, 2000).
+    run int32[nx, ny, nz] is -1 for voxels without points; at least one has points. The transform goes axis by
+    axis (A. Meijster, J. Roerdink, W. Hesselink, 2000).
     """
     nx, ny, nz = run.shape
-    squares, holders = np.full((nx, ny, nz), _FAR, np.int32), run.copy()
+    squares, holders = np.full((nx, ny, nz), _NO_POINTS, np.int32), run.copy()
     for i in range(nx):
         for j in range(ny):
             for way in (1, -1):
@@ -43,14 +46,14 @@ def nearest_voxels(run):
 
 @allocation_free(fastmath=True)
 def _nearest_in_line(squares, holders, kept, since, before, whose):
-    """Let each voxel of a line know what others of it have nearer: the lower envelope of parabolas.
+    """Updates the voxels of a line from the other voxels of the line, by the lower envelope of parabolas.
 
-    The first `top` + 1 of `kept` are voxels that are nearest to some, from `since` on.
+    The first `top` + 1 entries of `kept` are the voxels on the envelope, each from place `since` on.
     """
     n, top = len(squares), -1
     for u in range(n):
         before[u], whose[u] = squares[u], holders[u]
-        if before[u] == _FAR:
+        if before[u] == _NO_POINTS:
             continue
         while (
             top >= 0 and before[kept[top]] + (since[top] - kept[top]) ** 2 > before[u] + (since[top] - u) ** 2

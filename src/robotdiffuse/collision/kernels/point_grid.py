@@ -1,10 +1,10 @@
 """Compiled queries to point clouds: a grid of distances answers most of them, the points themselves the rest.
 
-The grid holds, for the centre of each voxel, the distance to the nearest point (its centre) and which one it
-is, exact within a band around the points; beyond, a lower bound of the distance, and a point not far from the
-nearest. A query that lies e from its voxel's centre knows the distance to within e. Where that does not
-decide, the points in the cells around are looked at. `points.py` builds the arrays, which are fields of
-SceneArrays.
+For the centre of each voxel the grid holds the index of the nearest point and the distance to its centre.
+Both are exact within a band around the points; beyond it, the distance is a lower bound and the point only
+nearly the nearest. A query at distance e from its voxel's centre knows the distance to within e. If that is
+not enough, it computes the distances to points in the cells around. `point_cloud_grid.py` builds the arrays,
+which are fields of SceneArrays.
 """
 
 import numpy as np
@@ -15,32 +15,32 @@ from robotdiffuse.collision.kernels.nearest_voxels import nearest_voxels
 from robotdiffuse.collision.kernels.simd import (
     W,
     first_lane,
+    floor,
     gather,
-    greatest,
     lane,
-    least,
     load,
-    root,
-    whole,
+    maximum,
+    minimum,
+    sqrt,
 )
 
-KEEP = np.float32(0.3)
-"""Points are known this far beyond the robot's reach; clearances to points count as at most this [m]."""
+POINT_RANGE = np.float32(0.3)
+"""Points are kept up to this far beyond the robot's reach, and clearances to points are at most this [m]."""
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 _HALF = np.float32(0.5)
 _TINY = np.float32(1e-9)
 _SLACK = np.float32(1e-5)
-"""More than what rounding does to a distance within the grid [m]."""
+"""More than the rounding error of a distance within the grid [m]."""
 
 
 @njit(fastmath=True, cache=True)
 def make_grid(points, starts, run, low, voxel, shape, band, known):
-    """Distances from voxel centres to points, and a point each, from the nearest voxel that holds points.
+    """For every voxel centre the distance to the nearest point, and the index of that point.
 
-    Exact below `band`; beyond, a lower bound, and a point wherever one may be within `known` [m]. The points
-    starts[b] to starts[b + 1] lie in the b-th voxel that holds any, which is b in run[nx * ny * nz], -1 where
-    there are none.
+    Both are exact below `band` [m]; beyond, the distance is a lower bound, and the point is near the nearest
+    one where there may be one within `known` [m], else -1. Points starts[b] to starts[b + 1] lie in the voxel
+    with value b in run[nx * ny * nz], which is -1 for voxels without points.
     """
     nx, ny, nz = shape
     balls = _balls(points, starts)
@@ -52,7 +52,7 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
         for j in range(ny):
             for k in range(nz):
                 v, b = (i * ny + j) * nz + k, holders[i, j, k]
-                # no voxel with points is nearer, and no point farther off its voxel's centre
+                # no voxel with points is nearer, and no point is more than `blur` from its voxel's centre
                 lower = voxel * np.sqrt(np.float32(squares[i, j, k])) - blur
                 distances[v] = max(band, lower)
                 if lower >= known:
@@ -79,7 +79,7 @@ def make_grid(points, starts, run, low, voxel, shape, band, known):
 
 @njit(fastmath=True, cache=True)
 def _balls(points, starts):
-    """A ball around the points of each voxel, centre and radius."""
+    """A ball [x, y, z, radius] around the points of each voxel that has any."""
     balls = np.zeros((len(starts) - 1, 4), np.float32)
     for b in range(len(balls)):
         ball, share = balls[b], _ONE / np.float32(starts[b + 1] - starts[b])
@@ -94,7 +94,7 @@ def _balls(points, starts):
 
 @njit(fastmath=True, cache=True)
 def _blur(points, low, voxel):
-    """How far a point is from the centre of its voxel at most."""
+    """Largest distance of a point from the centre of its voxel [m]."""
     most = _ZERO
     for p in range(len(points)):
         square = _ZERO
@@ -108,7 +108,7 @@ def _blur(points, low, voxel):
 
 @njit(fastmath=True, cache=True)
 def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
-    """Make distances exact that are those of some point, or the band's where there is none as near."""
+    """Makes distances below the band exact, and larger ones at least the band."""
     nx, ny, nz = shape
     for b in range(len(balls)):
         x, y, z, radius = balls[b]
@@ -134,7 +134,7 @@ def _settle(points, starts, balls, low, voxel, shape, band, distances, nearest):
 
 @allocation_free(fastmath=True)
 def _any_closer(distances, at, n, base, z, voxel, radius):
-    """Whether a ball of points may hold a nearer one than what n voxels in a row know."""
+    """Whether a ball of points may contain one nearer to n voxels in a row than their current distances."""
     some = np.int32(0)
     for k in range(n):
         dz = (np.float32(k) - z) * voxel
@@ -145,7 +145,7 @@ def _any_closer(distances, at, n, base, z, voxel, radius):
 
 @allocation_free(fastmath=True)
 def _closer(distances, nearest, at, n, base, z, voxel, p, band):
-    """Let n voxels in a row know point p if it is nearest."""
+    """Updates the distances and nearest points of n voxels in a row with point p."""
     for k in range(n):
         dz = (np.float32(k) - z) * voxel
         d = np.sqrt(base + dz * dz)
@@ -157,30 +157,32 @@ def _closer(distances, nearest, at, n, base, z, voxel, p, band):
 
 @allocation_free(forceinline=True)
 def _ask_grid(x, y, z, radius, scene):
-    """What the grid says of spheres in 16 lanes: those that may touch a point, and those that surely do."""
+    """Two masks of spheres in 16 lanes, from the grid: those that may touch a point, and those that surely
+    do."""
     frame = scene.grid_frame
     band, voxel = frame[7], frame[3]
     inverse = _ONE / voxel
     fx, fy, fz = (x - frame[0]) * inverse, (y - frame[1]) * inverse, (z - frame[2]) * inverse
-    cx = least(greatest(fx, _ZERO), frame[8] - _HALF)
-    cy = least(greatest(fy, _ZERO), frame[9] - _HALF)
-    cz = least(greatest(fz, _ZERO), frame[10] - _HALF)
-    ix, iy, iz = whole(cx), whole(cy), whole(cz)
+    cx = minimum(maximum(fx, _ZERO), frame[8] - _HALF)
+    cy = minimum(maximum(fy, _ZERO), frame[9] - _HALF)
+    cz = minimum(maximum(fz, _ZERO), frame[10] - _HALF)
+    ix, iy, iz = floor(cx), floor(cy), floor(cz)
     g = gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz)
     ex, ey, ez = cx - ix - _HALF, cy - iy - _HALF, cz - iz - _HALF
-    e = root(ex * ex + ey * ey + ez * ez) * voxel
+    e = sqrt(ex * ex + ey * ey + ez * ez) * voxel
     ox, oy, oz = fx - cx, fy - cy, fz - cz
     out = (ox * ox + oy * oy + oz * oz) * (voxel * voxel)
-    inner = greatest(g - e, _ZERO)
+    inner = maximum(g - e, _ZERO)
     free = radius + (frame[5] + _SLACK)
     near = inner * inner + out < free * free
-    inside = (g + e + root(out) < radius + (frame[6] - _SLACK)) & (g < band)
+    inside = (g + e + sqrt(out) < radius + (frame[6] - _SLACK)) & (g < band)
     return near, near & inside
 
 
 @allocation_free()
 def far_from_points(scene, x0, x1, y0, y1, z0, z1, radius):
-    """Whether no sphere with its centre in a box touches a point, from the middle of the box."""
+    """Whether a look-up in the middle of a box excludes that a sphere with its centre in the box touches a
+    point."""
     lower, _, _ = _look_up(scene, _HALF * (x0 + x1), _HALF * (y0 + y1), _HALF * (z0 + z1))
     dx, dy, dz = x1 - x0, y1 - y0, z1 - z0
     return lower > radius + _HALF * np.sqrt(dx * dx + dy * dy + dz * dz) + _SLACK
@@ -188,22 +190,24 @@ def far_from_points(scene, x0, x1, y0, y1, z0, z1, radius):
 
 @allocation_free()
 def near_points(x, y, z, radius, scene):
-    """The lanes whose sphere may touch a point."""
+    """Mask of the lanes whose sphere may touch a point."""
     return _ask_grid(x, y, z, radius, scene)[0]
 
 
 @allocation_free()
 def _near_by_eight(x, y, z, radius, scene):
-    """The lanes whose sphere may touch a point, as far as the eight voxels around its centre can tell: of
-    their bounds, that of the voxel straight away from the nearest point hardly loses anything."""
+    """Mask of the lanes whose sphere may touch a point, from the eight voxels around its centre.
+
+    The bound of the voxel on the side away from the nearest point is almost exact.
+    """
     frame = scene.grid_frame
     inverse = _ONE / frame[3]
-    fx = least(greatest((x - frame[0]) * inverse, _ZERO), frame[8] - _HALF)
-    fy = least(greatest((y - frame[1]) * inverse, _ZERO), frame[9] - _HALF)
-    fz = least(greatest((z - frame[2]) * inverse, _ZERO), frame[10] - _HALF)
-    lx = least(whole(greatest(fx - _HALF, _ZERO)), frame[8] - np.float32(2.0))
-    ly = least(whole(greatest(fy - _HALF, _ZERO)), frame[9] - np.float32(2.0))
-    lz = least(whole(greatest(fz - _HALF, _ZERO)), frame[10] - np.float32(2.0))
+    fx = minimum(maximum((x - frame[0]) * inverse, _ZERO), frame[8] - _HALF)
+    fy = minimum(maximum((y - frame[1]) * inverse, _ZERO), frame[9] - _HALF)
+    fz = minimum(maximum((z - frame[2]) * inverse, _ZERO), frame[10] - _HALF)
+    lx = minimum(floor(maximum(fx - _HALF, _ZERO)), frame[8] - np.float32(2.0))
+    ly = minimum(floor(maximum(fy - _HALF, _ZERO)), frame[9] - np.float32(2.0))
+    lz = minimum(floor(maximum(fz - _HALF, _ZERO)), frame[10] - np.float32(2.0))
     bound = fx * _ZERO
     for corner in range(8):
         ix, iy, iz = (
@@ -212,8 +216,8 @@ def _near_by_eight(x, y, z, radius, scene):
             lz + np.float32(corner & 1),
         )
         ex, ey, ez = fx - ix - _HALF, fy - iy - _HALF, fz - iz - _HALF
-        e = root(ex * ex + ey * ey + ez * ez) * frame[3]
-        bound = greatest(bound, gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz) - e)
+        e = sqrt(ex * ex + ey * ey + ez * ez) * frame[3]
+        bound = maximum(bound, gather(scene.grid, (ix * frame[9] + iy) * frame[10] + iz) - e)
     return bound < radius + (frame[5] + _SLACK)
 
 
@@ -235,7 +239,8 @@ def touch_points(x, y, z, radius, scene):
 
 @allocation_free(forceinline=True)
 def _columns(frame, rx, ry, reach):
-    """The columns of cells that may hold points within `reach` of a place in the grid's frame."""
+    """Index ranges of the columns of cells that may contain points within `reach` of a place in the grid's
+    frame."""
     cell, mx, my = frame[4], int(frame[11]), int(frame[12])
     i0, i1 = max(int((rx - reach) / cell), 0), min(int((rx + reach) / cell), mx - 1)
     j0, j1 = max(int((ry - reach) / cell), 0), min(int((ry + reach) / cell), my - 1)
@@ -244,7 +249,7 @@ def _columns(frame, rx, ry, reach):
 
 @allocation_free(forceinline=True)
 def _in_column(scene, i, j, rx, ry, rz, reach):
-    """First and last of the points of a column's cells within `reach`; the same where there are none."""
+    """Index range of the points in a column's cells within `reach`; empty if there are none."""
     frame = scene.grid_frame
     cell, my, mz = frame[4], int(frame[12]), int(frame[13])
     gx = max(max(np.float32(i) * cell - rx, rx - np.float32(i + 1) * cell), _ZERO)
@@ -262,7 +267,7 @@ def _in_column(scene, i, j, rx, ry, rz, reach):
 
 @allocation_free()
 def _touches(scene, x, y, z, radius):
-    """Whether a sphere touches a point: the one that the grid knows, or another in the cells around."""
+    """Whether a sphere touches a point: the nearest one by the grid, or another in the cells around."""
     frame, rows = scene.grid_frame, scene.point_rows
     _, _, p = _look_up(scene, x, y, z)
     if p >= 0:
@@ -278,7 +283,8 @@ def _touches(scene, x, y, z, radius):
     for i in range(i0, i1):
         for j in range(j0, j1):
             first, last = _in_column(scene, i, j, rx, ry, rz, reach)
-            # sixteen points at once, and those beside them that are further away
+            # sixteen points at once; a row may begin and end with points outside the range, which does no
+            # harm
             for row in range(first // W, (last + W - 1) // W if last > first else 0):
                 dx, dy, dz = load(rows, row, 0) - x, load(rows, row, 1) - y, load(rows, row, 2) - z
                 r = load(rows, row, 3) + radius
@@ -289,7 +295,8 @@ def _touches(scene, x, y, z, radius):
 
 @allocation_free()
 def _look_up(scene, x, y, z):
-    """Lower bound of the distance to any point's surface, the squared distance from the grid, and a point."""
+    """A lower bound of the distance to the surface of all points [m], the squared distance to the grid's box,
+    and the index of the point stored in the voxel."""
     frame = scene.grid_frame
     voxel = frame[3]
     fx, fy, fz = (x - frame[0]) / voxel, (y - frame[1]) / voxel, (z - frame[2]) / voxel
@@ -332,7 +339,7 @@ def _search(scene, x, y, z, limit):
 
 @allocation_free()
 def points_distance(scene, x, y, z, limit):
-    """Distance to the nearest of the scene's points, at most `limit`.
+    """Distance to the surface of the scene's nearest point, at most `limit` [m].
 
     Exact within the grid's band, a lower bound beyond it.
     """
@@ -355,9 +362,10 @@ def points_lower_bound(scene, x, y, z):
 
 @allocation_free()
 def near_point(scene, x, y, z, limit):
-    """Distance to a point that is nearest up to a few millimetres, if below `limit`, and its gradient.
+    """Distance to a nearly nearest point, at most `limit`, and its gradient.
 
-    The nearest of those that the eight voxels around know; for gradients, where a search would cost too much.
+    It is the nearest of the points stored in the eight voxels around, and too far by a few millimetres at
+    most. It serves for gradients, where an exact search would take too long.
     """
     best, bx, by, bz = limit, _ZERO, _ZERO, _ZERO
     lower, _, _ = _look_up(scene, x, y, z)

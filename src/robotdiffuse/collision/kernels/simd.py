@@ -1,9 +1,9 @@
-"""Sixteen float32 numbers as one value in compiled code: the type `Lanes`, LLVM's <16 x float>.
+"""SIMD in compiled code: sixteen float32 numbers as one value of the type `Lanes`, LLVM's <16 x float>.
 
-Loops over lanes need not be recognised by LLVM then: whatever is written on lanes becomes SIMD instructions,
-one each with AVX-512, two with AVX2, four with SSE or NEON, without any setting. `+ - *` work on lanes and
-on a lane and a float32, which stands in all lanes; `a < b` is an int64 whose bit i tells of lane i.
-Arithmetic may be contracted to fused multiplications and knows no NaN.
+Operations on lanes become SIMD instructions without relying on LLVM's vectorizer: one instruction each with
+AVX-512, two with AVX2, four with SSE or NEON. `+ - *` work on lanes, and on lanes and a float32, which is
+broadcast. `a < b` is a mask: an int64 whose bit i belongs to lane i. Arithmetic may be contracted to fused
+multiply-add and ignores NaN.
 """
 
 import operator
@@ -22,7 +22,7 @@ from numba.extending import intrinsic
 from numpy import ndarray
 
 W = 16
-"""Lanes: configurations per block, or spheres, or obstacles."""
+"""Number of lanes: of configurations per block, or of spheres or obstacles per row."""
 _FLAGS = ("nnan", "nsz", "contract")
 _FLOAT, _BITS = ir.FloatType(), ir.IntType(64)
 _VECTOR = ir.VectorType(_FLOAT, W)
@@ -69,12 +69,12 @@ def _mask(builder: Any, bits: Any) -> Any:
 
 
 def _operation(generated: Callable) -> Any:
-    """What is called on lanes: from the types of the arguments its signature and code generator."""
+    """An intrinsic from a function that maps argument types to a signature and a code generator."""
     return intrinsic(generated)
 
 
 def _define_operator(function: Callable, result: types.Type, build: Callable[[Any, Any, Any], Any]) -> None:
-    """`build` takes the builder and two vectors."""
+    """Define a binary operator on lanes; `build` takes the builder and two vectors."""
 
     class Template(AbstractTemplate):
         key = function
@@ -102,7 +102,7 @@ _define_operator(
 
 
 def _elementwise(name: str, count: int) -> Any:
-    """An intrinsic of LLVM on so many lanes or float32 numbers."""
+    """An elementwise LLVM intrinsic of one or two arguments, each lanes or a float32."""
     known = (LANES, types.float32)
 
     def generated(context: Any, *args: Any) -> Any:
@@ -117,15 +117,17 @@ def _elementwise(name: str, count: int) -> Any:
     return _operation(lambda context, a, b: generated(context, a, b))
 
 
-least = _elementwise("minnum", 2)
-greatest = _elementwise("maxnum", 2)
-magnitude = _elementwise("fabs", 1)
-with_sign = _elementwise("copysign", 2)
-root = _elementwise("sqrt", 1)
-whole = _elementwise("floor", 1)
+minimum = _elementwise("minnum", 2)
+maximum = _elementwise("maxnum", 2)
+absolute = _elementwise("fabs", 1)
+copysign = _elementwise("copysign", 2)
+sqrt = _elementwise("sqrt", 1)
+floor = _elementwise("floor", 1)
 
 
 def _reduction(name: str) -> Any:
+    """An LLVM intrinsic that reduces lanes to a float32."""
+
     def generated(_context: Any, a: Any) -> Any:
         def codegen(_context: Any, builder: Any, _sig: Any, values: Any) -> Any:
             return _call(builder, f"vector.reduce.{name}", list(values), _FLOAT)
@@ -135,12 +137,12 @@ def _reduction(name: str) -> Any:
     return _operation(generated)
 
 
-lowest = _reduction("fmin")
-highest = _reduction("fmax")
+reduce_min = _reduction("fmin")
+reduce_max = _reduction("fmax")
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, row: Any, part: Any) -> Any:
-    """Of the sixteen numbers from 16 * part on in a row of a contiguous array."""
+    """Address of the sixteen numbers from column 16 * part on in a row of a contiguous array."""
     struct = context.make_array(array_type)(context, builder, array)
     columns = cgutils.unpack_tuple(builder, struct.shape, 2)[1]
     size = columns.type
@@ -160,14 +162,14 @@ def _holds_floats(array: Any, dimensions: int) -> bool:
 
 
 @_operation
-def ramp(_context: Any) -> Any:
-    """The number of each lane."""
+def lane_numbers(_context: Any) -> Any:
+    """Lanes that hold their own numbers, 0 to 15."""
     return LANES(), lambda *_: ir.Constant(_VECTOR, [float(i) for i in range(W)])
 
 
 @_operation
 def load(_context: Any, array: Any, row: Any, part: Any) -> Any:
-    """Lanes from array[row, 16 * part :] of a C-contiguous float32 array."""
+    """Lanes loaded from array[row, 16 * part :] of a C-contiguous float32 array."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         where = _address(context, builder, sig.args[0], *args)
@@ -178,7 +180,7 @@ def load(_context: Any, array: Any, row: Any, part: Any) -> Any:
 
 @_operation
 def store(_context: Any, array: Any, row: Any, part: Any, value: Any) -> Any:
-    """Lanes to array[row, 16 * part :] of a C-contiguous float32 array."""
+    """Stores lanes to array[row, 16 * part :] of a C-contiguous float32 array."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         where = _address(context, builder, sig.args[0], *args[:3])
@@ -192,12 +194,12 @@ def store(_context: Any, array: Any, row: Any, part: Any, value: Any) -> Any:
 
 @_operation
 def gather(_context: Any, array: Any, index: Any) -> Any:
-    """Lanes from the places of a contiguous float32 array that the index, whole numbers, tells."""
+    """Lanes gathered from a contiguous float32 array; `index` holds integers as float32 lanes."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         data = context.make_array(sig.args[0])(context, builder, args[0]).data
         places: Any = builder.gep(data, [builder.fptosi(args[1], _INTEGERS)], source_etype=_FLOAT)
-        places.type = ir.VectorType(ir.PointerType(), W)  # which llvmlite does not know of vectors of indices
+        places.type = ir.VectorType(ir.PointerType(), W)  # llvmlite does not infer it for vectors of indices
         everywhere = ir.Constant(ir.VectorType(ir.IntType(1), W), [1] * W)
         given = [places, ir.Constant(ir.IntType(32), _ALIGN), everywhere, ir.Constant(_VECTOR, ir.Undefined)]
         kind = ir.FunctionType(_VECTOR, [value.type for value in given])
@@ -218,8 +220,8 @@ def lane(_context: Any, a: Any, i: Any) -> Any:
 
 
 @_operation
-def lanes_with(_context: Any, a: Any, bit: Any) -> Any:
-    """The lanes whose whole number has a bit of `bit`."""
+def lanes_with_bit(_context: Any, a: Any, bit: Any) -> Any:
+    """Mask of the lanes whose integer value has a bit in common with `bit`."""
 
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         numbers = builder.fptosi(args[0], _INTEGERS)
@@ -233,7 +235,7 @@ def lanes_with(_context: Any, a: Any, bit: Any) -> Any:
 
 @_operation
 def first_lane(_context: Any, mask: Any) -> Any:
-    """The number of the lowest bit that is set."""
+    """The first lane in a mask: the index of its lowest set bit."""
 
     def codegen(_context: Any, builder: Any, _sig: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -243,7 +245,8 @@ def first_lane(_context: Any, mask: Any) -> Any:
 
 @njit(cache=True)
 def lanes_array(rows, parts):
-    """Zeros [rows, parts * 16] that begin at a cache line, so that no load or store of lanes touches two."""
+    """Zeros [rows, parts * 16], aligned to cache lines, so that no load or store of lanes touches two of
+    them."""
     size = rows * parts * W
     memory = np.zeros(size + W, np.float32)
     start = -(memory.ctypes.data // 4) % W
@@ -251,8 +254,11 @@ def lanes_array(rows, parts):
 
 
 def by_sixteen(rows: ndarray, fill: ndarray) -> ndarray:
-    """Rows of [n, k] numbers by sixteen, [ceil(n / 16), k * 16]: sixteen of the first numbers, of the second
-    and so on. The last sixteen are filled up with `fill`, one row."""
+    """Rows [n, k] in groups of sixteen, [ceil(n / 16), k * 16]: column 0 of sixteen rows, then column 1, and
+    so on.
+
+    The last group is filled with `fill`, one row [1, k].
+    """
     n, k = rows.shape
     filled = np.concatenate([rows, np.repeat(fill, -n % W, axis=0)]).astype(np.float32)
     return np.ascontiguousarray(filled.reshape(-1, W, k).swapaxes(1, 2)).reshape(-1, k * W)

@@ -1,10 +1,11 @@
 """Compiled lower bounds of the clearances of covering spheres along short motions, 16 motions at once.
 
-A motion is given by its middle and the joints' way dq from there to either end. A sphere's centre moves by
-t v + r from the middle to a place t in [-1, 1] of the way: v is the Jacobian's, and |r| is at most a
-remainder that `sweep.py` knows for the whole link. Distance to a convex obstacle is a convex function along
-t v, hence nowhere below its tangent: with the distance d and the direction n to the obstacle's nearest point
-in the middle, the sphere stays at least d - |n . v| - |r| away. See `lanes.py` for the form of the code.
+A motion is given by its middle and the joint motion dq from there to either end. A sphere's centre moves by t
+v + r from the middle to the place t in [-1, 1]: v is the Jacobian times dq, and |r| is at most a remainder
+that `motion_certificate.py` computes for the whole link. Distance to a convex obstacle is a convex function
+along t v and thus nowhere below its tangent: with the distance d and the direction n to the obstacle's
+nearest point in the middle, the sphere stays at least d - |n . v| - |r| away. All loops are over the 16
+lanes, as in `lane_clearance.py`.
 """
 
 from typing import NamedTuple
@@ -20,7 +21,7 @@ from robotdiffuse.collision.kernels.lane_clearance import (
     to_scene,
 )
 from robotdiffuse.collision.kernels.lane_collision import W, place, place_frames
-from robotdiffuse.collision.kernels.point_grid import KEEP, points_distance
+from robotdiffuse.collision.kernels.point_grid import POINT_RANGE, points_distance
 
 _ZERO, _TINY = np.float32(0.0), np.float32(1e-9)
 
@@ -34,15 +35,15 @@ class SweptSpheres(NamedTuple):
     """[dof + 1, 6 * W] angular velocity of each frame, and velocity of its point at the base's origin, per
     unit of t."""
     velocities: np.ndarray
-    """[spheres, 3 * W]"""
+    """[spheres, 3 * W] velocities of the sphere's centres per unit of t."""
     speed: np.ndarray
-    """[W] of any point of a bounding sphere, at most."""
+    """[W] upper bound on the speed of any point of a bounding sphere."""
     need: np.ndarray
-    """[W] what is further than this plus the sphere's own motion does not matter [m]."""
+    """[W] obstacles further away than this plus the sphere's own motion are ignored [m]."""
     clearance: np.ndarray
     """[1, W] signed distances in the middles."""
     lower: np.ndarray
-    """[1, W] lower bounds along the motions, but for the remainder."""
+    """[1, W] lower bounds along the motions, without the remainder."""
 
 
 @njit(cache=True)
@@ -61,7 +62,7 @@ def make_swept_spheres(robot, scene):
 
 @allocation_free(fastmath=True)
 def _twist(parent, frame, slides, dq, out):
-    """The twist behind a joint, from that before it; the joint's axis is z of its frame."""
+    """Writes the twist behind a joint from that before it; the joint's axis is the z axis of its frame."""
     for i in range(W):
         ax, ay, az = frame[2 * W + i] * dq[i], frame[5 * W + i] * dq[i], frame[8 * W + i] * dq[i]
         x, y, z = frame[9 * W + i], frame[10 * W + i], frame[11 * W + i]
@@ -80,7 +81,7 @@ def _twist(parent, frame, slides, dq, out):
 
 @allocation_free(fastmath=True)
 def _velocity(twist, at, s, out):
-    """Of a point that moves with a frame, to row s of `out`."""
+    """Writes the velocity of a point that is fixed to a frame to row s of `out`."""
     for i in range(W):
         x, y, z = at[s, i], at[s, W + i], at[s, 2 * W + i]
         a, b, c = twist[i], twist[W + i], twist[2 * W + i]
@@ -91,7 +92,8 @@ def _velocity(twist, at, s, out):
 
 @allocation_free(fastmath=True)
 def _speed(twist, other, at, s, radius, out):
-    """Of any point of a ball that moves with a frame, seen from another frame, at most."""
+    """Writes upper bounds on the speed of any point of a ball that is fixed to a frame, seen from another
+    frame."""
     for i in range(W):
         x, y, z = at[s, i], at[s, W + i], at[s, 2 * W + i]
         a, b, c = twist[i] - other[i], twist[W + i] - other[W + i], twist[2 * W + i] - other[2 * W + i]
@@ -103,7 +105,7 @@ def _speed(twist, other, at, s, radius, out):
 
 @allocation_free()
 def place_motions(robot, q, dq, work):
-    """Frames in the middles q[dof, 16] and their twists along dq[dof, 16]."""
+    """Writes the frames in the middles q[dof, 16] and their twists along dq[dof, 16]."""
     place_frames(robot, q, work.at.frames, work.at.centres)
     work.at.placed[:] = False
     for j in range(len(robot.offsets)):
@@ -124,6 +126,7 @@ def _place_group(robot, g, work):
 
 @allocation_free(fastmath=True)
 def _past_spheres(at, v, s, radius, obstacles, near, n, clearance, lower):
+    """Lowers clearance and bound of sphere s to those of the obstacles with near[n + k]."""
     for k in range(len(obstacles)):
         if not near[n + k]:
             continue
@@ -138,6 +141,7 @@ def _past_spheres(at, v, s, radius, obstacles, near, n, clearance, lower):
 
 @allocation_free(fastmath=True)
 def _past_boxes(at, v, s, radius, obstacles, near, n, clearance, lower):
+    """The same for boxes."""
     for k in range(len(obstacles)):
         if not near[n + k]:
             continue
@@ -152,7 +156,7 @@ def _past_boxes(at, v, s, radius, obstacles, near, n, clearance, lower):
             a = a00 * dx + a01 * dy + a02 * dz
             b = a10 * dx + a11 * dy + a12 * dz
             c = a20 * dx + a21 * dy + a22 * dz
-            # speeds away from the box's middle
+            # speeds away from the box's centre
             p = (a00 * vx + a01 * vy + a02 * vz) * (-1 if a < _ZERO else 1)
             q = (a10 * vx + a11 * vy + a12 * vz) * (-1 if b < _ZERO else 1)
             r = (a20 * vx + a21 * vy + a22 * vz) * (-1 if c < _ZERO else 1)
@@ -167,7 +171,7 @@ def _past_boxes(at, v, s, radius, obstacles, near, n, clearance, lower):
 
 @allocation_free(fastmath=True)
 def _past_round(at, v, s, radius, obstacles, flat_ends, near, n, clearance, lower):
-    """Cylinders (`flat_ends`) or capsules."""
+    """The same for cylinders (`flat_ends`) or capsules."""
     for k in range(len(obstacles)):
         if not near[n + k]:
             continue
@@ -199,11 +203,11 @@ def _past_round(at, v, s, radius, obstacles, flat_ends, near, n, clearance, lowe
 
 @allocation_free()
 def _past_points(at, v, s, radius, scene, need, clearance, lower):
-    """The nearest point changes along the motion, so that the whole speed counts."""
+    """The same for points. The nearest point changes along the motion, so the sphere's whole speed counts."""
     for i in range(W):
         x, y, z = v[s, i], v[s, W + i], v[s, 2 * W + i]
         speed = np.sqrt(x * x + y * y + z * z)
-        limit = min(need[i] + speed, KEEP) + radius
+        limit = min(need[i] + speed, POINT_RANGE) + radius
         d = points_distance(scene, at[s, i], at[s, W + i], at[s, 2 * W + i], limit) - radius
         clearance[0, i] = min(clearance[0, i], d)
         lower[0, i] = min(lower[0, i], d - speed)
@@ -211,7 +215,7 @@ def _past_points(at, v, s, radius, scene, need, clearance, lower):
 
 @allocation_free(fastmath=True)
 def _mark_near(bounds, obstacles, radius, need, speed, near):
-    """Marks the obstacles that a group's bounding sphere comes near to on any way; returns how many."""
+    """Marks the obstacles that a group's bounding sphere comes near to in any motion; returns how many."""
     count = 0
     for k in range(obstacles):
         total = 0
@@ -230,10 +234,11 @@ def _reset(work):
 
 @allocation_free()
 def group_along(robot, scene, g, work):
-    """Clearances of a group to the scene along the motions, to `work.clearance` and `work.lower`.
+    """Writes clearances of a group to the scene, and their bounds along the motions, to `work.clearance` and
+    `work.lower`.
 
-    Both are at most `work.need`, which is to hold, for each motion, what matters of the lower bounds; where
-    it is negative, nothing does.
+    Both are at most `work.need`, which the caller sets for each motion; a motion with a negative value is
+    skipped.
     """
     at, near, frame, radius = work.at, work.at.near, robot.frame[g], robot.bounds[g, 3]
     _reset(work)
@@ -260,7 +265,7 @@ def group_along(robot, scene, g, work):
 
 @allocation_free(fastmath=True)
 def _near_each_other(a, s, b, t, radii, need, speed):
-    """In how many lanes two balls can come near to each other."""
+    """Number of lanes in which two balls can come near to each other."""
     total = 0
     for i in range(W):
         dx, dy, dz = a[s, i] - b[t, i], a[s, W + i] - b[t, W + i], a[s, 2 * W + i] - b[t, 2 * W + i]
@@ -270,7 +275,8 @@ def _near_each_other(a, s, b, t, radii, need, speed):
 
 @allocation_free(fastmath=True)
 def _past_each_other(at, v, s, t, radii, clearance, lower):
-    """Only the difference of the velocities along the line between the centres counts, from any frame."""
+    """Lowers clearance and bound of spheres s and t. Only the difference of their velocities along the line
+    between the centres counts, whatever frame it is seen from."""
     for i in range(W):
         dx, dy, dz = at[s, i] - at[t, i], at[s, W + i] - at[t, W + i], at[s, 2 * W + i] - at[t, 2 * W + i]
         vx, vy, vz = v[s, i] - v[t, i], v[s, W + i] - v[t, W + i], v[s, 2 * W + i] - v[t, 2 * W + i]
@@ -282,7 +288,7 @@ def _past_each_other(at, v, s, t, radii, clearance, lower):
 
 @allocation_free()
 def pair_along(robot, p, work):
-    """The same as `group_along` between the links of a checked pair."""
+    """As `group_along`, between the links of a checked pair."""
     a, b = robot.pairs[p, 0], robot.pairs[p, 1]
     spheres, bounds, first = robot.spheres, robot.bounds, robot.first
     centres, positions = work.at.centres, work.at.positions

@@ -31,7 +31,7 @@ from torch import Generator, Tensor
 from robotdiffuse.collision import CollisionChecker
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
-from robotdiffuse.collision.motions import finer, search_space
+from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, NotNegative, Positive
 from robotdiffuse.learning.networks.mpnet import MPNetNetwork
@@ -88,7 +88,7 @@ class MPNet(LearnedPlanner[MPNetPlannerSettings]):
                 result = context.finish(start_goal.complete(found.path), self.name, one.reason(rounds))
                 if result is not None:
                     return result
-                settings = replace(settings, resolution=finer(settings.resolution))
+                settings = replace(settings, resolution=finer_resolution(settings.resolution))
             elif found.broken < best.broken:
                 best = found
         if len(best.path):

@@ -31,7 +31,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels import lane_collision
 from robotdiffuse.collision.kernels.motions import Space, motions_free
-from robotdiffuse.collision.motions import finer, search_space
+from robotdiffuse.collision.motions import finer_resolution, search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import NotNegative, Positive, Settings
@@ -128,7 +128,7 @@ class OmplPlanner(Planner[OmplSettings]):
                     if searched <= enough:
                         break
                 else:
-                    settings = replace(settings, resolution=finer(settings.resolution))
+                    settings = replace(settings, resolution=finer_resolution(settings.resolution))
                     attempt, searched = attempt + 1, np.inf
                     search = _Search(context, start_goal, self, settings, attempt)
             if context.remaining <= 0:

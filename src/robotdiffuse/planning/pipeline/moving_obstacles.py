@@ -19,8 +19,8 @@ from functools import partial
 import numpy as np
 from numpy import ndarray
 
-from robotdiffuse.collision.kernels.moving_obstacles import free_over
-from robotdiffuse.collision.moving_obstacles import MovingCollision, links_of
+from robotdiffuse.collision.kernels.moving_obstacles import free_at_times
+from robotdiffuse.collision.moving_obstacles import MovingCollision, compile_links
 from robotdiffuse.core.deadline import OutOfTimeError, check_timing
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.types import Path, Status, Trajectory
@@ -31,7 +31,7 @@ from robotdiffuse.planning.pipeline.waypoints import plan_through_waypoints
 from robotdiffuse.planning.search.constrained import corner_kept
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.trajectories.stops import APART, PACES, Rests
+from robotdiffuse.trajectories.stops import MIN_DISTANCE, SPEED_FACTORS, StopGraph
 from robotdiffuse.trajectories.timing import time_parameterize
 from robotdiffuse.validation.tolerances import goal_error
 from robotdiffuse.validation.validator import verifier
@@ -133,9 +133,9 @@ def _timed(
 ) -> Trajectory | None:
     """The earliest collision-free motion along the path on the grid of times; None if there is none."""
     robot, validator = problem.robot, verifier(replace(problem, moving=()))
-    if path.length < APART:
+    if path.length < MIN_DISTANCE:
         return time_parameterize(robot, path, lambda _: True, validator.collision_free, context.timing)
-    rests = Rests(
+    rests = StopGraph(
         robot,
         path,
         lambda t: validator.trajectory(t).valid,
@@ -146,24 +146,24 @@ def _timed(
         context.beside,
         _stops(problem, path),
     )
-    links = links_of(robot)[1]
-    s, configurations = rests.spaced(links.levers.max(axis=0), GRID_TRAVEL)
+    links = compile_links(robot)[1]
+    s, configurations = rests.sample(links.motion_radii.max(axis=0), GRID_TRAVEL)
     longest = sum(motion.ticks for motion in rests.motions if motion.target == motion.source + 1) // len(
-        PACES
+        SPEED_FACTORS
     )
     count = int(DURATION_FACTOR * longest + EXTRA_TIME / GRID_STEP)
     check_timing(f"a grid of {count} times", CELL_SECONDS * count * len(configurations))
     times = GRID_STEP * np.arange(count)
     speed = max(one.greatest_speed for one in problem.moving)
     asked = clearance + (GRID_TRAVEL + speed * GRID_STEP) / 2
-    clear = free_over(links, collision.tracks, configurations, times, asked)
+    clear = free_at_times(links, collision.tracks, configurations, times, asked)
     cells = list[ndarray]()
     for motion in rests.motions:
         check_timing("the grid of times")
-        cells.append(rests.cells(motion, configurations))
+        cells.append(rests.nearest_samples(motion, configurations))
     way, found = earliest(
         clear,
-        np.searchsorted(s, rests.places),
+        np.searchsorted(s, rests.stops),
         np.array([motion.source for motion in rests.motions]),
         np.array([motion.target for motion in rests.motions]),
         np.cumsum([0] + [len(of_motion) for of_motion in cells]),

@@ -375,7 +375,7 @@ class _MovingObstacles:
         """The same obstacles, each inflated by a margin [m]."""
         other = copy(self)
         other.margin = self.margin + margin
-        other._collision = self._collision.wider(margin)
+        other._collision = self._collision.inflated(margin)
         return other
 
     def shapes(self, time: float) -> list[Shape]:
@@ -385,7 +385,7 @@ class _MovingObstacles:
     def near(self, motion: Trajectory, begins: float, clearance: float) -> float | None:
         """When an obstacle first comes nearer to the motion than the clearance [s]; None if none does."""
         times = motion.times + (begins - self._since)
-        first = self._collision.covered_free(times, motion.positions, clearance)
+        first = self._collision.first_unproved_time(times, motion.positions, clearance)
         return None if first is None else first + self._since
 
     def comes_to(
@@ -394,7 +394,7 @@ class _MovingObstacles:
         """When an obstacle first touches the arm on its way, or while it then rests for `rest_time` [s]; None
         if none."""
         times = np.append(times, times[-1] + rest_time) - self._since
-        first = self._collision.covered_free(times, np.concatenate([q, q[-1:]]), 0.0)
+        first = self._collision.first_unproved_time(times, np.concatenate([q, q[-1:]]), 0.0)
         return None if first is None else first + self._since
 
     def comes(self, q: Float[ndarray, "dof"], time: float, rest_time: float) -> float | None:

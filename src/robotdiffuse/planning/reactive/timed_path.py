@@ -13,9 +13,9 @@ from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.trajectories import braking_kernel
 from robotdiffuse.trajectories.corner_rounding import BlendedPolyline, half_widths
-from robotdiffuse.trajectories.speed_limits import TimingSettings, symmetric, timing_grid
+from robotdiffuse.trajectories.speed_limits import TimingSettings, symmetric_bounds, timing_grid
 from robotdiffuse.trajectories.timing import rounded_corners
-from robotdiffuse.trajectories.timing_kernel import controllable, sampled
+from robotdiffuse.trajectories.timing_kernel import controllable, sample_rows
 from robotdiffuse.validation.validator import Verifier
 
 VELOCITY_FRACTION, ACCELERATION_FRACTION = 0.99, 0.96
@@ -36,7 +36,7 @@ class SpeedProfile(NamedTuple):
 
     def after(self, time: float) -> tuple[float, float]:
         """s and speed at a time after the beginning [s]."""
-        return braking_kernel.after(self.s, self.speeds, time)
+        return braking_kernel.state_after(self.s, self.speeds, time)
 
     def rest(self, time: float) -> "SpeedProfile":
         """The rest of the motion from a time after the beginning on [s]."""
@@ -98,7 +98,7 @@ class TimedPath:
                 two,
                 grid,
                 VELOCITY_FRACTION * self.robot.velocity,
-                *symmetric(self._acceleration, len(grid)),
+                *symmetric_bounds(self._acceleration, len(grid)),
             ),
         )
 
@@ -108,7 +108,7 @@ class TimedPath:
 
     def on_then_rest(self, s: float, speed: float, time: float) -> SpeedProfile:
         """The motion that drives as fast as possible towards the end for a time [s], then brakes to rest."""
-        return SpeedProfile(*braking_kernel.on_then_rest(*self._grid, s, speed, time, self._acceleration))
+        return SpeedProfile(*braking_kernel.advance_then_brake(*self._grid, s, speed, time, self._acceleration))
 
     def onwards(self, s: float, speed: float) -> SpeedProfile:
         """The fastest motion to the end."""
@@ -135,5 +135,5 @@ class TimedPath:
             q = np.repeat(self.at(float(speeds.s[0]))[None], 2, axis=0)
             return Trajectory(self.robot.joint_names, np.array([0.0, sample_time]), q, 0 * q, 0 * q)
         moving = np.append(True, (speeds.speeds[1:] + speeds.speeds[:-1]) > 0)
-        rows = sampled(self.line.arrays, speeds.s[moving], speeds.speeds[moving], sample_time)
+        rows = sample_rows(self.line.arrays, speeds.s[moving], speeds.speeds[moving], sample_time)
         return Trajectory(self.robot.joint_names, *rows)

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.collision.kernels.compiled import random_state
 from robotdiffuse.collision.kernels.motions import motions_free, path_length
-from robotdiffuse.collision.motions import finer
+from robotdiffuse.collision.motions import finer_resolution
 from robotdiffuse.core.bounds import for_kernels
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Count, Natural, Positive, Settings
@@ -209,7 +209,7 @@ class AnytimeSearch:
     def refuse(self, accepted: Float[ndarray, "n dof"] | None) -> None:
         """Halve the resolution after the validator refused the best path, and go back to the last accepted
         one."""
-        self.settings = replace(self.settings, resolution=finer(self.settings.resolution))
+        self.settings = replace(self.settings, resolution=finer_resolution(self.settings.resolution))
         self.best = accepted
         self.length = np.float32(np.inf if accepted is None else path_length(accepted))
         self._round = None

@@ -29,7 +29,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from robotdiffuse.collision import CollisionChecker
-from robotdiffuse.collision.motions import FINEST, levers, search_space
+from robotdiffuse.collision.motions import FINEST_RESOLUTION, largest_motion_radii, search_space
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.results import PlanResult
 from robotdiffuse.core.settings import Bound, Count, NotNegative, Positive, Settings
@@ -270,7 +270,9 @@ class DStarLiteSearch(_Search):
         super().__init__(checker, start, goals, settings, padding, incremental=True)
         self._last = np.zeros((len(goals), 2 ** len(start)), np.uint8)
         moves = np.abs(self._graph.lattice.moves[: len(self._graph.lattice.moves) // 2])
-        self._reaches = (0.5 * settings.spacing * moves @ levers(checker.robot)).astype(np.float32)
+        self._reaches = (0.5 * settings.spacing * moves @ largest_motion_radii(checker.robot)).astype(
+            np.float32
+        )
         """How far any point of the arm moves by half of each move [m]."""
         self._offset = 0
         self._start = int(table.find_or_add(self._table, self._graph.start_key))
@@ -388,7 +390,7 @@ class _LatticePlanner(Planner[LatticePlannerSettings]):
             result = context.finish(start_goal.complete(path), context.planner_name, reason=done)
             if result is not None:
                 return result
-            if settings.resolution <= FINEST:
+            if settings.resolution <= FINEST_RESOLUTION:
                 break
         return context.unsolved(
             "the validator refused every path that was found; a larger clearance may help"

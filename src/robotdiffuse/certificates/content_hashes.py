@@ -1,4 +1,4 @@
-"""Content hashes of robots, scenes and motions, part by part, so that a difference can be named."""
+"""Content hashes of robots, scenes and motions, part by part, so that the checker can name what differs."""
 
 import hashlib
 import json
@@ -13,20 +13,15 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import PointCloud, Shape, Triangulated
 
-DIGITS = 9
-"""Numbers count up to this decimal: rotations from quaternions differ in the last bits by machine."""
-LENGTH = 16
-"""Hexadecimal digits of the hash of a part; a whole has all 64 of SHA-256."""
+HASH_DECIMALS = 9
+"""Decimals that are hashed: rotations from quaternions differ in the last bits between machines."""
+HASH_LENGTH = 16
+"""Hexadecimal digits of the hash of a part."""
 LIMITS = ("lower", "upper", "velocity", "acceleration")
 
 
-def whole(parts: Mapping[str, str]) -> str:
-    """The hash of all parts."""
-    return hashlib.sha256(json.dumps(sorted(parts.items())).encode()).hexdigest()
-
-
 def robot_parts(robot: Robot) -> dict[str, str]:
-    """What a proof about a robot depends on."""
+    """Hashes of everything in a robot that a proof depends on."""
     parts = {
         "planned joints": _hash([robot.base, *robot.joint_names]),
         "allowed collisions": _hash(sorted(sorted(pair) for pair in robot.allowed_collisions)),
@@ -45,12 +40,13 @@ def robot_parts(robot: Robot) -> dict[str, str]:
 
 
 def scene_parts(scene: Scene) -> dict[str, str]:
-    """Each obstacle by its name."""
+    """Hashes of the obstacles, by name."""
     return {shape.name: _hash(shape.kind, *_numbers(shape)) for shape in scene.shapes}
 
 
 def request_parts(problem: Problem) -> dict[str, str]:
-    """Obstacles that move, with their motions, path constraints, and a payload with what bears it."""
+    """Hashes of moving obstacles with their motions, of path constraints, and of the payload with all that
+    torques depend on: inertias, effort limits and the base's pose."""
     parts = {}
     if problem.payload is not None:
         robot, carried = problem.robot, problem.payload
@@ -71,7 +67,7 @@ def request_parts(problem: Problem) -> dict[str, str]:
 
 
 def motion_hash(names: Iterable[str], *rows: np.ndarray | None) -> str:
-    """Of all numbers exactly as they are."""
+    """Hash of joint names and arrays, without any rounding."""
     digest = hashlib.sha256(json.dumps(list(names)).encode())
     for array in rows:
         if array is not None:
@@ -80,11 +76,11 @@ def motion_hash(names: Iterable[str], *rows: np.ndarray | None) -> str:
 
 
 def differences(what: str, certified: Mapping[str, str], here: Mapping[str, str]) -> list[str]:
-    """A line for each part that is not the one that was certified."""
-    lines = [f"{what}: {name} is not here" for name in certified if name not in here]
-    lines += [f"{what}: {name} was not there" for name in here if name not in certified]
+    """A line for each part that is missing, added or changed since it was certified."""
+    lines = [f"{what}: {name} is missing" for name in certified if name not in here]
+    lines += [f"{what}: {name} was added" for name in here if name not in certified]
     changed = (name for name in certified if name in here and certified[name] != here[name])
-    return lines + [f"{what}: {name} is not as it was" for name in changed]
+    return lines + [f"{what}: {name} has changed" for name in changed]
 
 
 def _numbers(shape: Shape) -> list[object]:
@@ -102,6 +98,6 @@ def _numbers(shape: Shape) -> list[object]:
 def _hash(names: object, *numbers: object) -> str:
     digest = hashlib.sha256(json.dumps(names).encode())
     for values in numbers:
-        rounded = np.round(np.asarray(values, np.float64), DIGITS) + 0.0  # no negative zeros
+        rounded = np.round(np.asarray(values, np.float64), HASH_DECIMALS) + 0.0  # no negative zeros
         digest.update(str(rounded.shape).encode() + rounded.tobytes())
-    return digest.hexdigest()[:LENGTH]
+    return digest.hexdigest()[:HASH_LENGTH]

@@ -1,4 +1,4 @@
-"""What a problem asks of a motion beside that it is free: limits, start, goal, rates. The checker's own."""
+"""The checker's own tests of all requirements but freedom from collision: limits, start, goal and rates."""
 
 from collections.abc import Iterator
 
@@ -6,26 +6,29 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from robotdiffuse.certificates.constraints import kept, too_fast
+from robotdiffuse.certificates.constraints import constraint_bounds, frame_speed_errors
 from robotdiffuse.certificates.kinematics import Linkage
-from robotdiffuse.certificates.proof import AGREEMENT, Certificate, Tolerances
-from robotdiffuse.certificates.torques import most_torques
+from robotdiffuse.certificates.proof import BOUND_TOLERANCE, MotionProof, Tolerances
+from robotdiffuse.certificates.torques import torque_bounds
 from robotdiffuse.core.errors import joined
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PosesGoal
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 
-WINDOWS = (1e-3, 4e-3, 16e-3)
-"""Rows closer to each other than the first of these [s] must keep limits over windows of at least these
-lengths too: from one row to the next, the slack of positions hides any rate."""
-SHORTEST = 1e-12
-"""Shorter times count as this one [s]: rates over them are not finite."""
+AVERAGING_WINDOWS = (1e-3, 4e-3, 16e-3)
+"""Where rows are closer than the first of these [s], mean accelerations are also tested over windows of at
+least these lengths: from one row to the next, the position tolerance would hide any rate."""
+MIN_TIME = 1e-12
+"""Shorter times are taken as this [s], so that rates over them are finite."""
 
 
 def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> Float[ndarray, "n dof"]:
-    """The rows of a motion, and between them further ones: on the cubics through positions and velocities at
-    times; of a path, on its straight lines at places, rows plus shares of the way to the next."""
+    """The rows of a motion and further configurations between them, in order.
+
+    `between`: times [s], for which the configurations are on the cubics through the rows' positions and
+    velocities; for a path, rows plus shares of the way to the next, on its straight lines.
+    """
     if not len(between):
         return motion.positions
     if not isinstance(motion, Trajectory):
@@ -38,12 +41,13 @@ def configurations(motion: Path | Trajectory, between: Float[ndarray, "k"]) -> F
 
 
 def _cubic(motion: Trajectory, at: Float[ndarray, "k"]) -> Float[ndarray, "k dof"]:
+    """Configurations at times on the cubics through the rows' positions and velocities."""
     row = np.clip(np.searchsorted(motion.times, at, side="right") - 1, 0, len(motion.times) - 2)
     h = (motion.times[row + 1] - motion.times[row])[:, None]
     u = (at - motion.times[row])[:, None] / h
     # Hermite's basis
-    q0, q1, v0, v1 = motion.positions[row], motion.positions[row + 1], motion.velocities[row], 0
-    v1 = motion.velocities[row + 1]
+    q0, q1 = motion.positions[row], motion.positions[row + 1]
+    v0, v1 = motion.velocities[row], motion.velocities[row + 1]
     return (
         (1 + 2 * u) * (1 - u) ** 2 * q0
         + u**2 * (3 - 2 * u) * q1
@@ -53,13 +57,13 @@ def _cubic(motion: Trajectory, at: Float[ndarray, "k"]) -> Float[ndarray, "k dof
 
 
 def not_covered(problem: Problem, motion: Path | Trajectory) -> list[str]:
-    """What a problem asks for and no certificate of such a motion proves."""
+    """Requirements of the problem that no certificate of such a motion can prove."""
     untimed = not isinstance(motion, Trajectory)
     return ["moving, without times"] if untimed and problem.moving else []
 
 
-def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
-    """A line for each thing that the motion does not do."""
+def requirement_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
+    """A line for each requirement that the motion fails, or is not shown to meet."""
     robot, motion, tolerances = problem.robot, certificate.motion, certificate.tolerances
     for name in not_covered(problem, motion):
         yield f"problem: certificates do not prove anything about {name}"
@@ -78,51 +82,54 @@ def wrong(problem: Problem, certificate: Certificate) -> Iterator[str]:
         yield "motion: it does not end at the goal"
     if isinstance(motion, Trajectory):
         begins = np.zeros(robot.dof) if problem.start_velocity is None else problem.start_velocity
-        yield from _wrong_rates(robot, motion, certificate, begins)
-        yield from too_fast(problem, motion, tolerances.rate_slack)
-    yield from _not_kept(problem, certificate, q)
-    yield from _not_borne(problem, certificate)
+        yield from _rate_errors(robot, motion, certificate, begins)
+        yield from frame_speed_errors(problem, motion, tolerances.rate_slack)
+    yield from _constraint_errors(problem, certificate, q)
+    yield from _torque_errors(problem, certificate)
 
 
-def _not_borne(problem: Problem, certificate: Certificate) -> Iterator[str]:
-    """What is not shown of the torques of a payload, or not as the certificate says."""
+def _torque_errors(problem: Problem, certificate: MotionProof) -> Iterator[str]:
+    """Torque limits that are not shown to be kept with the payload, and torques that differ from the
+    proof."""
     motion, said = certificate.motion, dict(certificate.torques)
     if problem.payload is None:
         if said:
             yield "torques: the problem has no payload"
         return
     if [*said] != [*problem.robot.joint_names]:
-        yield "torques: the certificate is not about those of the robot's joints"
+        yield "torques: their joints are not those of the robot"
         return
     if isinstance(motion, Trajectory) and not (np.diff(motion.times) > 0).all():
         return
-    most = most_torques(problem, motion, certificate.looks).max(axis=0)
+    most = torque_bounds(problem, motion, certificate.torque_samples).max(axis=0)
     allowed = problem.robot.effort * (1 + certificate.tolerances.rate_slack)
     for name, torque, limit in zip(said, most, allowed, strict=True):
-        if abs(torque - said[name]) > AGREEMENT:
-            yield f"torques: {name} bears at most {torque:.6f}, not {said[name]:.6f}"
+        if abs(torque - said[name]) > BOUND_TOLERANCE:
+            yield f"torques: the bound of {name} is {torque:.6f}, not {said[name]:.6f}"
         if not torque <= limit:
-            yield f"torques: {name} is not shown to keep its limit: {torque:.6f}, of {limit:.6f}"
+            yield f"torques: {name} is not shown to keep its limit: {torque:.6f} of {limit:.6f}"
 
 
-def _not_kept(problem: Problem, certificate: Certificate, q: Float[ndarray, "n dof"]) -> Iterator[str]:
-    """What is not shown of path constraints, or not as the certificate says."""
+def _constraint_errors(
+    problem: Problem, certificate: MotionProof, q: Float[ndarray, "n dof"]
+) -> Iterator[str]:
+    """Path constraints that are not shown to be kept, and bounds that differ from the proof."""
     if not problem.constraints and not certificate.constraints:
         return
-    shown = kept(problem, q, certificate.tolerances.chord)
+    shown = constraint_bounds(problem, q, certificate.tolerances.chord)
     if [one.name for one in shown] != [name for name, _ in certificate.constraints]:
-        yield "constraints: the certificate is not about those of the problem"
+        yield "constraints: they are not those of the problem"
         return
     for one, (_, said) in zip(shown, certificate.constraints, strict=True):
         most = float(one.bounds.max())
-        if abs(most - said) > AGREEMENT:
-            yield f"constraints: {one.name} is at most {most:.6f}, not {said:.6f}"
+        if abs(most - said) > BOUND_TOLERANCE:
+            yield f"constraints: the bound of {one.name} is {most:.6f}, not {said:.6f}"
         if not most <= one.limit:
-            yield f"constraints: {one.name} is not shown to be kept: {most:.6f}, of {one.limit:.6f}"
+            yield f"constraints: {one.name} is not shown to be kept: {most:.6f} of {one.limit:.6f}"
 
 
-def _wrong_rates(
-    robot: Robot, motion: Trajectory, certificate: Certificate, begins: Float[ndarray, "dof"]
+def _rate_errors(
+    robot: Robot, motion: Trajectory, certificate: MotionProof, begins: Float[ndarray, "dof"]
 ) -> Iterator[str]:
     tolerances, step = certificate.tolerances, np.diff(motion.times)[:, None]
     if not (step > 0).all():
@@ -130,9 +137,12 @@ def _wrong_rates(
         return
     times = np.sort(np.concatenate([motion.times, certificate.between]), kind="stable")
     if len(np.unique(times)) != len(times) or times[0] < motion.times[0] or times[-1] > motion.times[-1]:
-        yield "motion: the times between its rows are not between them"
+        yield "motion: the times of `between` do not lie between its rows"
         return
-    if len(motion.times) > 1 and not _widest_chord(motion, times) <= tolerances.chord * (1 + 1e-6) + 1e-12:
+    if (
+        len(motion.times) > 1
+        and not _largest_chord_error(motion, times) <= tolerances.chord * (1 + 1e-6) + 1e-12
+    ):
         yield "motion: its cubics leave the straight lines that were certified"
     v, a, share = motion.velocities, motion.accelerations, 1 + tolerances.rate_slack
     mean, change = np.diff(motion.positions, axis=0) / step, np.diff(v, axis=0) / step
@@ -143,14 +153,14 @@ def _wrong_rates(
         ("mean acceleration between rows", change, robot.acceleration),
     )
     unsure = 2 * tolerances.limit_slack
-    blur = {"mean velocity between rows": unsure / np.maximum(step, SHORTEST)}
+    blur = {"mean velocity between rows": unsure / np.maximum(step, MIN_TIME)}
     for what, values, limit in rates:
         over = ~(np.abs(values) <= share * limit + blur.get(what, 0.0)) & (limit > 0)
         for j in np.flatnonzero(over.any(axis=0)):
             most = np.abs(values[:, j]).max()
             yield f"motion: {robot.joint_names[j]} exceeds its limit of {what}: {most:.4g} > {limit[j]:.4g}"
-    yield from _too_far(robot, motion, share, unsure)
-    yield from _too_bent(robot, motion, begins, share, unsure, tolerances.rate_slack)
+    yield from _position_errors(robot, motion, share, unsure)
+    yield from _acceleration_errors(robot, motion, begins, share, unsure, tolerances.rate_slack)
     known = np.where(robot.velocity > 0, robot.velocity, np.abs(v).max(axis=0, initial=0.0))
     off = np.abs(np.stack([v[0] - begins, v[-1]]))
     if (off > tolerances.rate_slack * known + tolerances.rest).any():
@@ -158,19 +168,19 @@ def _wrong_rates(
         yield f"motion: it does not begin {how} at rest"
 
 
-def _too_far(robot: Robot, motion: Trajectory, share: float, unsure: float) -> Iterator[str]:
-    """Joints that get further, from any row to any later one, than their velocity limits allow in that time.
+def _position_errors(robot: Robot, motion: Trajectory, share: float, unsure: float) -> Iterator[str]:
+    """Joints that move further, from any row to any later one, than their velocity limits allow in that time.
 
-    Positions are not known better than `unsure`, once for the two rows and, for rows far apart, once for each
-    step between them.
+    Positions have a tolerance of `unsure`: once for the two rows and, for rows far apart, once for each step
+    between them.
     """
     step, q = np.diff(motion.times)[:, None], motion.positions
     allowed = np.zeros_like(q)
-    most = share * robot.velocity * step + unsure * np.minimum(step / WINDOWS[0], 1.0)
+    most = share * robot.velocity * step + unsure * np.minimum(step / AVERAGING_WINDOWS[0], 1.0)
     np.cumsum(most, axis=0, out=allowed[1:])
     furthest = np.zeros(q.shape[1])
     for way in (q, -q):
-        # the greatest of what each earlier row leaves room for, less what is allowed since then
+        # largest excess over all earlier rows, by a running minimum
         least = np.minimum.accumulate(way - allowed, axis=0)
         furthest = np.maximum(furthest, (way - allowed - least).max(axis=0))
     for j in np.flatnonzero((furthest > unsure) & (robot.velocity > 0)):
@@ -179,7 +189,7 @@ def _too_far(robot: Robot, motion: Trajectory, share: float, unsure: float) -> I
         yield f"motion: {name} exceeds its limit of mean velocity from one row to another: {how}"
 
 
-def _too_bent(
+def _acceleration_errors(
     robot: Robot,
     motion: Trajectory,
     begins: Float[ndarray, "dof"],
@@ -187,14 +197,15 @@ def _too_bent(
     unsure: float,
     rest_slack: float,
 ) -> Iterator[str]:
-    """Joints whose positions, over windows, are accelerated more than their limits allow.
+    """Joints whose mean accelerations over windows, computed from positions, exceed their limits.
 
-    Before the first row the arm moves on as it begins, and after the last it stands. Each mean acceleration,
-    from the mean velocity before a row to that after it, is one of those that the joint must have had.
+    Before the first row the arm is taken to move at its start velocity, and after the last row to stand
+    still. The mean acceleration, from the mean velocity before a row to that after it, is a value that the
+    joint must have reached.
     """
     times, q, limit = motion.times, motion.positions, robot.acceleration
-    fine = np.diff(times).min(initial=np.inf) < WINDOWS[0]
-    for window in WINDOWS if fine else WINDOWS[:1]:
+    fine = np.diff(times).min(initial=np.inf) < AVERAGING_WINDOWS[0]
+    for window in AVERAGING_WINDOWS if fine else AVERAGING_WINDOWS[:1]:
         at = np.concatenate([[times[0] - window], times, [times[-1] + window]])
         rows = np.concatenate([q[:1] - window * begins, q, q[-1:]])
         first = np.searchsorted(at, times - window, side="right") - 1
@@ -213,10 +224,13 @@ def _too_bent(
             return
 
 
-def _widest_chord(motion: Trajectory, times: Float[ndarray, "n"]) -> float:
-    """How far the cubics leave the straight lines between certified configurations at most [rad] or [m]: an
-    eighth of the greatest second derivative times the square of the time between them. It is linear in time,
-    so greatest at an end."""
+def _largest_chord_error(motion: Trajectory, times: Float[ndarray, "n"]) -> float:
+    """Upper bound on how far the cubics leave the straight lines between certified configurations [rad] or
+    [m].
+
+    It is an eighth of the greatest second derivative times the square of the time between configurations. The
+    second derivative is linear in time, so its greatest value is at an end.
+    """
     row = np.clip(np.searchsorted(motion.times, times[:-1], side="right") - 1, 0, len(motion.times) - 2)
     h = (motion.times[row + 1] - motion.times[row])[:, None]
     mean = (motion.positions[row + 1] - motion.positions[row]) / h

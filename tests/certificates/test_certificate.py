@@ -1,4 +1,4 @@
-"""Certificates: what is valid can be certified, what is certified is free, and nobody can tamper with one."""
+"""Certificates: valid motions can be certified, certified motions are free, and tampering is detected."""
 
 import json
 from collections.abc import Callable
@@ -13,9 +13,10 @@ import trimesh
 import robotdiffuse as rd
 from helpers.box_arm import box_arm
 from robotdiffuse.certificates.bounds import Prover, Stretches
-from robotdiffuse.certificates.checker import described, hash_of
-from robotdiffuse.certificates.content import robot_parts, scene_parts
-from robotdiffuse.certificates.proof import Certificate, Proof, Tolerances, load_certificate
+from robotdiffuse.certificates.certificate import Certificate, load_certificate
+from robotdiffuse.certificates.checker import describe_claim, hash_of
+from robotdiffuse.certificates.content_hashes import robot_parts, scene_parts
+from robotdiffuse.certificates.proof import StretchProof, Tolerances
 from robotdiffuse.certificates.search import NotValidError, certify
 from robotdiffuse.collision.exact_meshes import ExactCollision
 from robotdiffuse.core.errors import InputError
@@ -98,14 +99,15 @@ def test_a_certificate_is_checked_from_its_file_alone(file: FilePath) -> None:
 
 
 def test_the_checker_loads_neither_compiled_code_nor_coal() -> None:
-    """It is another path than the validator's, and starts in a fraction of the time."""
+    """It is independent of the validator's code, and starts in a fraction of the time."""
     import subprocess
     import sys
 
     code = (
         "import sys, robotdiffuse.certificates.checker, robotdiffuse.problems.files\n"
         "print([m for m in ('numba', 'coal', 'torch') if m in sys.modules])\n"
-        "print([m for m in sys.modules if 'robotdiffuse.collision' in m or m == 'robotdiffuse.validation.validator'])"
+        "own = 'robotdiffuse.collision', 'robotdiffuse.validation.validator'\n"
+        "print([m for m in sys.modules if m.startswith(own)])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout.split("\n")[:2] == ["[]", "[]"], done.stderr
@@ -190,18 +192,18 @@ def looser(record: dict[str, Any]) -> None:
 
 
 TAMPERED = {
-    moved_obstacle: "scene: ball is not as it was",
-    removed_obstacle: "scene: table is not here",
+    moved_obstacle: "scene: ball has changed",
+    removed_obstacle: "scene: table is missing",
     altered_waypoint: "motion: it is not the one that was certified: its hash differs",
     altered_time: "motion: it is not the one that was certified: its hash differs",
     other_start: "motion: it begins 0.01 off the start",
     other_goal: "motion: it does not end at the goal",
     altered_clearance: r"proof: clearance of \w+ against [\w ]+ from row [\d.]+ to row [\d.]+ is",
     altered_displacement: r"proof: displacement of \w+ against [\w ]+ from row [\d.]+ to row [\d.]+ is",
-    removed_stretch: r"proof: nothing is said of \w+ against [\w ]+ from row 0 to row",
-    removed_claim: r"proof: nothing is said of \w+ against",
+    removed_stretch: r"proof: \w+ against [\w ]+ is missing from row 0 to row",
+    removed_claim: r"proof: \w+ against [\w ]+ is missing",
     claimed_more: r"proof: \w+ against the scene from row [\d.]+ to row [\d.]+ is clear by [\d.]+ m, not by",
-    claimed_nothing: "proof: a self clearance of 0 m is none",
+    claimed_nothing: "proof: its self clearance is 0 m, which is not positive",
     looser: "tolerances: goal_tolerance is 0.5, looser than 0.0001",
     tighter: "motion: its cubics leave the straight lines that were certified",
 }
@@ -223,10 +225,10 @@ def test_another_robot_is_caught_and_named(file: FilePath, planned: tuple[Proble
     certificate, problem = load_certificate(file), planned[0]
     opened = replace(problem, robot=problem.robot.with_locked({"panda_finger_joint1": 0.01}))
     found = certificate.check(opened).differences
-    assert "robot: joint panda_finger_joint1 is not as it was" in found
+    assert "robot: joint panda_finger_joint1 has changed" in found
     wider = dict(problem.robot.spheres) | {"panda_link5": problem.robot.spheres["panda_link5"] * 1.1}
     found = certificate.check(replace(problem, robot=replace(problem.robot, spheres=wider))).differences
-    assert "robot: spheres of panda_link5 is not as it was" in found
+    assert "robot: spheres of panda_link5 has changed" in found
     other = Problem(box_arm(), problem.scene, [0, 0, 0], [0, 0, 0])
     assert any(
         line.startswith("motion: its joints are panda_joint1")
@@ -237,7 +239,7 @@ def test_another_robot_is_caught_and_named(file: FilePath, planned: tuple[Proble
 def test_whoever_forges_the_hashes_too_still_needs_a_proof(
     planned: tuple[Problem, rd.PlanResult], file: FilePath
 ) -> None:
-    """An obstacle in the way, with a certificate that says that it always was there."""
+    """An obstacle in the way, with forged hashes."""
     problem, certificate = planned[0], load_certificate(file)
     blocked = replace(problem, scene=Scene([*problem.scene.shapes, Sphere([0.0, 0.0, 0.6], 0.3, "new")]))
     forged = replace(certificate, scene_parts=scene_parts(blocked.scene))
@@ -259,7 +261,7 @@ def test_rates_are_checked_anew(planned: tuple[Problem, rd.PlanResult]) -> None:
 
 
 def timed(positions: np.ndarray, times: np.ndarray) -> tuple[Problem, Trajectory]:
-    """A motion that says that it stands still all the time."""
+    """A motion whose velocities are all 0."""
     problem, path = problem_of(positions)
     still = np.zeros_like(positions)
     return problem, Trajectory(path.joint_names, times, positions, still, still)
@@ -287,7 +289,7 @@ TOO_QUICK = {
 
 @pytest.mark.parametrize("name", TOO_QUICK)
 def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All else is proved: the validator that refuses them is made to pass them."""
+    """The validator, which would reject these motions, is patched to accept them."""
     made, wanted = TOO_QUICK[name]
     problem, motion = made()
     report = Report(True, None, 1.0, 0.2)
@@ -299,18 +301,18 @@ def test_short_steps_hide_no_rate_from_the_checker(name: str, monkeypatch: pytes
 
 @pytest.mark.parametrize("with_times", [False, True])
 def test_an_empty_proof_of_one_row_is_none(with_times: bool) -> None:
-    """Start and goal within a box: a motion of one row leaves no gap between no stretches."""
+    """Start and goal inside a box: a motion of one row has no gap even without stretches."""
     robot, here = box_arm(), np.zeros((1, 3))
     problem = Problem(robot, Scene([Box([0.3, 0, 0], [2, 2, 2])]), here[0], JointGoal(here))
     motion = Trajectory(robot.joint_names, np.zeros(1), here, here, here)
     motion = motion if with_times else Path(robot.joint_names, here)
     none = np.zeros(0)
     claims = Prover(robot, problem.scene, here).claims
-    proof = Proof(claims, Stretches(none.astype(int), none, none), none.astype(bool), none, none, ())
+    proof = StretchProof(claims, Stretches(none.astype(int), none, none), none.astype(bool), none, none, ())
     parts = robot_parts(robot), scene_parts(problem.scene), hash_of(motion)
     certificate = Certificate(robot.name, *parts, Tolerances(), motion, none, 0.5, 0.5, proof)
     assert certificate.check(problem).differences == tuple(
-        f"proof: nothing is said of {described(claim)} from row 0 to row 0" for claim in claims
+        f"proof: {describe_claim(claim)} is missing from row 0 to row 0" for claim in claims
     )
 
 
@@ -338,7 +340,7 @@ def test_files_that_are_none(tmp_path: FilePath, text: str, wanted: str) -> None
 
 
 def test_damaged_files_are_one_line(file: FilePath, tmp_path: FilePath) -> None:
-    """Every field in turn is replaced by what does not belong there."""
+    """Every field in turn is replaced by a wrong value."""
     whole = json.loads(file.read_text())
     for name in whole:
         for value in (None, [], {}, "x", -1, [[1, 2], [3]], {"a": [None]}):

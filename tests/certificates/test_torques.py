@@ -12,10 +12,10 @@ import pytest
 
 import robotdiffuse as rd
 from helpers.heavy_arms import ROBOTS, TURNED, pendulum, wild
-from robotdiffuse.certificates.content import request_parts
-from robotdiffuse.certificates.proof import Certificate, load_certificate
+from robotdiffuse.certificates.certificate import Certificate, load_certificate
+from robotdiffuse.certificates.content_hashes import request_parts
 from robotdiffuse.certificates.search import certify
-from robotdiffuse.certificates.torques import inverse_dynamics, most_torques
+from robotdiffuse.certificates.torques import inverse_dynamics, torque_bounds
 from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.dynamics import Dynamics
@@ -53,15 +53,16 @@ def test_dynamics_are_pinocchios(name: str) -> None:
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("step", [0.2, 0.02])
 def test_bounds_are_bounds(name: str, step: float) -> None:
-    """Against torques of motions with a row at each of many looks, by which nothing of the motion changes."""
+    """Against torques of motions with a row at each of many samples, by which nothing of the motion
+    changes."""
     problem, rng = loaded(name), np.random.default_rng(1)
     for _ in range(5):
         motion = wild(problem.robot, rng, step)
-        looks = np.linspace(0, motion.times[-1], 201)[1:-1]
-        for one, at in ((motion, looks), (Path(motion.joint_names, motion.positions), looks / step)):
-            few = most_torques(problem, one, np.zeros(0))
-            dense = most_torques(problem, one, at)
-            rows = np.sort(np.concatenate([motion.times / step, looks / step]))
+        samples = np.linspace(0, motion.times[-1], 201)[1:-1]
+        for one, at in ((motion, samples), (Path(motion.joint_names, motion.positions), samples / step)):
+            few = torque_bounds(problem, one, np.zeros(0))
+            dense = torque_bounds(problem, one, at)
+            rows = np.sort(np.concatenate([motion.times / step, samples / step]))
             piece = np.clip(((rows[1:] + rows[:-1]) / 2).astype(int), 0, len(few) - 1)
             assert (dense <= few[piece] + 1e-9).all()
 
@@ -84,12 +85,12 @@ def test_paths_are_proved_to_be_held() -> None:
     assert held.check(problem).valid and len(held.torques) == 7
 
 
-def test_a_peak_between_rows_needs_looks() -> None:
-    """Of a robot without bodies, which has nothing else to prove."""
+def test_a_peak_between_rows_needs_samples() -> None:
+    """The robot has no geometry, so there is nothing else to prove."""
     problem = Problem(pendulum(9.75), rd.Scene(), [1.0], [2.0], payload=Payload(0.0))
     certificate = certify(problem, Path(("hinge",), np.array([[1.0], [2.0]])))
-    assert len(certificate.looks) and certificate.check(problem).valid
-    found = replace(certificate, looks=np.zeros(0)).check(problem).differences
+    assert len(certificate.torque_samples) and certificate.check(problem).valid
+    found = replace(certificate, torque_samples=np.zeros(0)).check(problem).differences
     assert any("hinge is not shown to keep its limit" in line for line in found)
 
 
@@ -106,9 +107,9 @@ def other(certificate: Certificate) -> Certificate:
 
 
 TAMPERED: dict[str, tuple[Callable[[Certificate], Certificate], str]] = {
-    "torques": (lighter, r"torques: panda_joint\d bears at most "),
-    "none": (silent, "torques: the certificate is not about those of the robot's joints"),
-    "other joints": (other, "torques: the certificate is not about those of the robot's joints"),
+    "torques": (lighter, r"torques: the bound of panda_joint\d is "),
+    "none": (silent, "torques: their joints are not those of the robot"),
+    "other joints": (other, "torques: their joints are not those of the robot"),
 }
 
 
@@ -123,7 +124,7 @@ def test_tampering_is_caught(case: str) -> None:
 def test_a_heavier_payload_needs_another_proof() -> None:
     problem, certificate = certified()
     problem = replace(problem, payload=Payload(3.5, [0.0, 0.0, 0.1]))
-    assert "requests: payload is not as it was" in certificate.check(problem).differences
+    assert "requests: payload has changed" in certificate.check(problem).differences
     found = replace(certificate, request_parts=request_parts(problem)).check(problem).differences
     assert any("panda_joint2 is not shown to keep its limit" in line for line in found), found
 

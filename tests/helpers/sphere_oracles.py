@@ -1,0 +1,136 @@
+"""Distances of covering spheres in float64, with robots and scenes: oracles of the collision kernels."""
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from helpers.box_arm import box_arm
+from helpers.example_robots import example_robot
+from robotdiffuse.collision.exact_meshes import forward_frames
+from robotdiffuse.collision.kernel_arrays import robot_groups
+from robotdiffuse.robots import load_robot
+from robotdiffuse.robots.robot import Robot
+from robotdiffuse.scenes.scene import Scene
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere
+
+TOLERANCE = 1e-5
+"""Bound on float32 rounding at distances of a few metres [m]."""
+
+
+def sphere_centres(robot: Robot, q: ndarray) -> tuple[list[ndarray], list[ndarray]]:
+    """Centres [n, k, 3] and radii [k] of the spheres of each group, base frame."""
+    frames, centres, radii = forward_frames(robot, q), [], []
+    for link in robot_groups(robot):
+        T = frames[:, robot.link_frame(link)] @ robot.T_frame_link(link)
+        spheres = robot.spheres[link]
+        centres.append(np.einsum("nij,kj->nki", T[:, :3, :3], spheres[:, :3]) + T[:, None, :3, 3])
+        radii.append(spheres[:, 3])
+    return centres, radii
+
+
+def distance(shape: Shape, points: ndarray) -> ndarray:
+    """Signed distance of points [..., 3] to a shape."""
+    if isinstance(shape, PointCloud):
+        found = [np.linalg.norm(points - p, axis=-1) - shape.point_radius for p in shape.points]
+        return np.min(found, axis=0)
+    if isinstance(shape, Sphere):
+        return np.linalg.norm(points - shape.center, axis=-1) - shape.radius
+    assert isinstance(shape, Box | Cylinder | Capsule)
+    local = (points - shape.center) @ Rotation.from_quat(np.roll(shape.wxyz, -1)).as_matrix()
+    if isinstance(shape, Capsule):
+        local[..., 2] -= np.clip(local[..., 2], -shape.height / 2, shape.height / 2)
+        return np.linalg.norm(local, axis=-1) - shape.radius
+    if isinstance(shape, Box):
+        gaps = np.abs(local) - shape.size / 2
+    else:
+        side = np.linalg.norm(local[..., :2], axis=-1) - shape.radius
+        gaps = np.stack([side, np.abs(local[..., 2]) - shape.height / 2], axis=-1)
+    return np.linalg.norm(np.maximum(gaps, 0), axis=-1) + np.minimum(gaps.max(axis=-1), 0)
+
+
+def link_distances(robot: Robot, scene: Scene, q: ndarray) -> ndarray:
+    """[n, moving links], at most 1 m."""
+    columns = []
+    for link, centres, radii in zip(robot_groups(robot), *sphere_centres(robot, q), strict=True):
+        if robot.link_frame(link) > 0:
+            found = [(distance(shape, centres) - radii).min(axis=1) for shape in scene.shapes]
+            columns.append(np.min([np.ones(len(q)), *found], axis=0))
+    return np.stack(columns, axis=1)
+
+
+def pair_distances(robot: Robot, q: ndarray) -> ndarray:
+    """[n, pairs], at most 1 m."""
+    index = {link: i for i, link in enumerate(robot_groups(robot))}
+    centres, radii = sphere_centres(robot, q)
+    columns = [np.zeros((len(q), 0))]
+    for a, b in ((index[a], index[b]) for a, b in robot.checked_pairs()):
+        gap = np.linalg.norm(centres[a][:, :, None] - centres[b][:, None], axis=-1)
+        gap -= radii[a][:, None] + radii[b]
+        columns.append(np.minimum(gap.reshape(len(q), -1).min(axis=1), 1)[:, None])
+    return np.concatenate(columns, axis=1)
+
+
+def with_spheres(name: str) -> Robot:
+    """The bundled Panda, the arm of boxes, or an example robot with a few spheres at its moving links."""
+    if name == "panda":
+        return load_robot("panda")
+    if name == "box_arm":
+        return box_arm()
+    robot, rng = example_robot(name), np.random.default_rng(0)
+    links = [link for link in robot.link_names if robot.link_frame(link) > 0 or link == robot.base]
+    spheres = {
+        link: np.column_stack([rng.uniform(-0.1, 0.1, (4, 3)), rng.uniform(0.01, 0.06, 4)]) for link in links
+    }
+    near = [pair for pair in combinations(links, 2) if _nearby(robot, *pair)]
+    return replace(robot, spheres=spheres, meshes={}, allowed_collisions=frozenset(map(frozenset, near)))
+
+
+def _nearby(robot: Robot, a: str, b: str) -> bool:
+    return (robot.moved_by[robot.link_frame(a)] != robot.moved_by[robot.link_frame(b)]).sum() < 2
+
+
+ROBOTS = ("panda", "box_arm", "awkward", "ur5", "two_arms")
+
+
+def rows(robot: Robot, count: int, seed: int = 0) -> ndarray:
+    return np.random.default_rng(seed).uniform(robot.lower, robot.upper, (count, robot.dof))
+
+
+def solids() -> Scene:
+    return Scene(
+        [
+            Sphere((0.5, 0.3, 0.6), 0.2),
+            Box((0.0, 0.6, 0.4), (0.2, 0.3, 0.2), (0.9, 0.1, 0.3, 0.1)),
+            Cylinder((0.4, -0.4, 0.3), 0.08, 0.5, (0.9, 0.3, 0.0, 0.1)),
+            Capsule((-0.4, -0.3, 0.5), 0.06, 0.5, (0.9, 0.3, 0.5, 0.1)),
+        ]
+    )
+
+
+def poses(rng: np.random.Generator) -> tuple[ndarray, ndarray]:
+    wxyz = rng.normal(size=4)
+    return rng.uniform([-0.9, -0.9, -0.2], [0.9, 0.9, 1.0]), wxyz / np.linalg.norm(wxyz)
+
+
+def random_shape(kind: str, rng: np.random.Generator) -> Shape:
+    center, wxyz = poses(rng)
+    a, b, c = rng.uniform(0.02, 0.4, 3)
+    if kind == "sphere":
+        return Sphere(center, a)
+    if kind == "box":
+        return Box(center, (a, b, c), wxyz)
+    if kind == "cylinder":
+        return Cylinder(center, a / 2, b, wxyz)
+    if kind == "capsule":
+        return Capsule(center, a / 2, b, wxyz)
+    return PointCloud(center + rng.normal(0, 0.1, (30, 3)), a / 10)
+
+
+def box_triangles(size: tuple[float, float, float]) -> tuple[ndarray, ndarray]:
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
+    faces = [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1)]
+    faces += [(2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4), (1, 5, 7), (1, 7, 3)]
+    return corners, np.array(faces)
