@@ -13,7 +13,7 @@ from robotdiffuse.core.types import Path, Trajectory
 from robotdiffuse.robots.robot import Joint, Robot
 from robotdiffuse.trajectories import speed_limits as speeds_module
 from robotdiffuse.trajectories.corner_rounding import BLEND_DEVIATION, BlendedPolyline, half_widths
-from robotdiffuse.trajectories.speed_limits import LEAST_JERK, TimingSettings, symmetric_bounds, timing_grid
+from robotdiffuse.trajectories.speed_limits import LEAST_JERK, TimingSettings, timing_grid
 from robotdiffuse.trajectories.timing import SAME_WAYPOINT_DISTANCE, time_parameterize
 from robotdiffuse.trajectories.timing_kernel import fastest, slowdown
 from robotdiffuse.validation.rates import RateTolerances, rate_violations

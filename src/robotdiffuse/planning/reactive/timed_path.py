@@ -108,7 +108,9 @@ class TimedPath:
 
     def on_then_rest(self, s: float, speed: float, time: float) -> SpeedProfile:
         """The motion that drives as fast as possible towards the end for a time [s], then brakes to rest."""
-        return SpeedProfile(*braking_kernel.advance_then_brake(*self._grid, s, speed, time, self._acceleration))
+        return SpeedProfile(
+            *braking_kernel.advance_then_brake(*self._grid, s, speed, time, self._acceleration)
+        )
 
     def onwards(self, s: float, speed: float) -> SpeedProfile:
         """The fastest motion to the end."""
