@@ -27,7 +27,6 @@ from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle, track_speeds
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shape_transforms import placed
 
 if TYPE_CHECKING:
     from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -133,7 +132,7 @@ class MovingCollision:
     def _distance(self, link: int, o: int, times: ndarray, q: ndarray, time: float) -> float:
         """Signed distance of the meshes of a link to an obstacle at a time, less what that can have grown."""
         obstacle = self.moving[o]
-        T_stands_moved = placed(obstacle.shape) @ inverse(obstacle.pose(time))
+        T_stands_moved = obstacle.shape.T_base_shape @ inverse(obstacle.pose(time))
         distance = self._exact[o].distance_seen_from(
             self.link_names[link], _at(times, q, time), T_stands_moved
         )
@@ -218,7 +217,7 @@ def tracks_of(moving: Sequence[MovingObstacle]) -> Tracks:
         speeds.append(np.append(track_speeds(at, poses, obstacle.radius), 0.0))
         solids += solids_of(Scene([obstacle.shape]))
     boxes = [
-        inverse(placed(obstacle.shape)) @ solid.T_base_box
+        inverse(obstacle.shape.T_base_shape) @ solid.T_base_box
         for obstacle, solid in zip(moving, solids, strict=True)
     ]
     # of a surface, the box stands along the axes of the base; in the obstacle's own frame it is turned

@@ -11,7 +11,7 @@ from robotdiffuse.core.transforms import transform
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
-from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
+from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 Color = tuple[int, int, int]
 OBSTACLE: Color = (0xD9, 0x7B, 0x5C)
@@ -64,9 +64,9 @@ def _drawn(shape: Shape) -> Drawn:
         case Sphere():
             return Ball(transform(shape.center), shape.radius, OBSTACLE)
         case Box():
-            return Brick(pose(shape), shape.size, OBSTACLE)
+            return Brick(shape.T_base_shape, shape.size, OBSTACLE)
         case Cylinder():
-            return Can(pose(shape), shape.radius, shape.height, OBSTACLE)
+            return Can(shape.T_base_shape, shape.radius, shape.height, OBSTACLE)
         case PointCloud():
             return Points(shape.points, shape.point_radius, OBSTACLE)
         case Triangulated():

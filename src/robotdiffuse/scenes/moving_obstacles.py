@@ -22,7 +22,6 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
-from robotdiffuse.scenes.shape_transforms import placed
 from robotdiffuse.scenes.shapes import Shape
 
 FASTEST = 100.0
@@ -60,7 +59,7 @@ class MovingObstacle(Value):
     def __post_init__(self) -> None:
         if not isinstance(self.shape, Shape):
             raise InputError(f"moving: shape is {shown(self.shape)}; it must be a shape, e.g. rd.Sphere")
-        placed(self.shape)  # an error for shapes that have no frame
+        self.shape.T_base_shape  # an error for shapes that have no frame
         ways = [
             name
             for name, given in (
@@ -109,11 +108,11 @@ class MovingObstacle(Value):
             object.__setattr__(self, key, value)
 
     def _check_track(self, times: ndarray, poses: ndarray) -> None:
-        off = inverse(placed(self.shape)) @ poses[0]
+        off = inverse(self.shape.T_base_shape) @ poses[0]
         if np.linalg.norm(off[:3, 3]) > SAME or rotation_angle(off[:3, :3]) > SAME:
             raise InputError(
                 f"{self.name}.poses[0] is at {shown(poses[0, :3, 3])}; the shape must stand there, in the "
-                f"same orientation, and stands at {shown(placed(self.shape)[:3, 3])}"
+                f"same orientation, and stands at {shown(self.shape.T_base_shape[:3, 3])}"
             )
         speeds = track_speeds(times, poses, self.radius)
         jumps = np.flatnonzero(speeds > FASTEST)
@@ -137,14 +136,14 @@ class MovingObstacle(Value):
     def radius(self) -> float:
         """No point of it is further from the origin of its frame [m]."""
         low, high = self.shape.bounds
-        centre = placed(self.shape)[:3, 3]
+        centre = self.shape.T_base_shape[:3, 3]
         return float(np.linalg.norm(np.maximum(np.abs(low - centre), np.abs(high - centre))))
 
     @cached_property
     def track(self) -> tuple[Float[ndarray, "k"], Float[ndarray, "k 4 4"]]:
         """Times and poses between which it moves evenly, standing still before and after; of one that is not
         known, where it stands at time 0."""
-        T = placed(self.shape)
+        T = self.shape.T_base_shape
         if self.velocity is not None:
             poses = np.stack([T, transform(self.velocity * FOREVER) @ T])
             return read_only((np.array([0.0, FOREVER]), poses))
@@ -174,7 +173,7 @@ class MovingObstacle(Value):
 
     def at(self, time: float) -> Shape:
         """The shape where it is at a time [s]; of one that is not known, at time 0."""
-        return self.shape.moved(self.pose(time) @ inverse(placed(self.shape)))
+        return self.shape.moved(self.pose(time) @ inverse(self.shape.T_base_shape))
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "MovingObstacle":
         """The obstacle and its motion after a rigid motion."""

@@ -39,7 +39,6 @@ from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shape_transforms import placed
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.validation.validator import verifier
 
@@ -312,7 +311,7 @@ class _Seen:
 
     def again(self, value: ArrayLike, now: float) -> "_Seen":
         """Seen anew."""
-        name, T_before = self.obstacle.name, placed(self.obstacle.shape)
+        name, T_before = self.obstacle.name, self.obstacle.shape.T_base_shape
         xyz = numbers(value)
         if xyz is not None and xyz.shape == (3,) and within(xyz):
             T = transform(xyz, T_before[:3, :3])

@@ -17,7 +17,7 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint, PositionBox
-from robotdiffuse.problems.robot_setup_files import pose_of
+from robotdiffuse.problems.files.robot_setup import pose_of
 from robotdiffuse.scenes.files import check_fields
 
 POSE = ("xyz", "wxyz")

@@ -16,11 +16,10 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import numbers
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import pose_entry
+from robotdiffuse.problems.files.robot_setup import pose_of
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
-from robotdiffuse.problems.robot_setup_files import pose_of
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shape_transforms import placed
 
 GOALS = ("joints", "joint_set", "pose", "poses", "any")
 TOLERANCES = ("xyz_tolerance", "rpy_tolerance")
@@ -93,6 +92,6 @@ def _object_pose(field: str, name: object, scene: Scene) -> Float[ndarray, "4 4"
     if name not in shapes:
         raise unknown_name(f"object in {field}.relative_to:", str(name), shapes)
     try:
-        return placed(shapes[str(name)])
+        return shapes[str(name)].T_base_shape
     except InputError as error:
         raise InputError(f"{field}.relative_to: {error}") from None

@@ -28,7 +28,7 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud,
 
 Z = np.array([0.0, 0.0, 1.0])
 READY = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
-DATA = Path(__file__).parents[1] / "files"
+DATA = Path(__file__).parents[2] / "files"
 
 
 def crane() -> Robot:

@@ -24,7 +24,7 @@ from robotdiffuse.problems.files import (
     load_problems,
     problem_record,
 )
-from robotdiffuse.problems.moveit import (
+from robotdiffuse.problems.files.moveit import (
     MoveItFrames,
     moveit_frames,
     moveit_request,
@@ -38,7 +38,7 @@ from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
 
-FOLDER = Path(__file__).parents[1] / "files" / "motion_bench_maker"
+FOLDER = Path(__file__).parents[2] / "files" / "motion_bench_maker"
 Z = np.array([0.0, 0.0, 1.0])
 QUARTER = [0, 0, 0.7071067811865476, 0.7071067811865476]
 """xyzw of a quarter turn about z."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.transforms import pose_entry
-from robotdiffuse.problems.robot_setup_files import one_shape, read_pose
+from robotdiffuse.problems.files.robot_setup import one_shape, read_pose
 from robotdiffuse.scenes.files import SHAPES, scene_entries
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene

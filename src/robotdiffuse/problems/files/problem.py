@@ -14,9 +14,9 @@ from robotdiffuse.core.input_files import no_files, parse_json, parse_yaml, read
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
-from robotdiffuse.problems.constraint_files import constraint_entry, read_constraints
-from robotdiffuse.problems.goal_files import goal_entry, read_goal, read_waypoints
-from robotdiffuse.problems.moveit import (
+from robotdiffuse.problems.files.constraints import constraint_entry, read_constraints
+from robotdiffuse.problems.files.goals import goal_entry, read_goal, read_waypoints
+from robotdiffuse.problems.files.moveit import (
     MoveItRequest,
     holding_at,
     moveit_frames,
@@ -26,7 +26,15 @@ from robotdiffuse.problems.moveit import (
     request_robot_notes,
     scene_robot_notes,
 )
-from robotdiffuse.problems.moving_obstacle_files import moving_entry, read_moving
+from robotdiffuse.problems.files.moving_obstacles import moving_entry, read_moving
+from robotdiffuse.problems.files.robot_setup import (
+    equipment_entries,
+    equipped,
+    payload_entry,
+    read_payload,
+    read_pose,
+    rounded,
+)
 from robotdiffuse.problems.problem import (
     OPTIMISTIC,
     JointGoal,
@@ -34,14 +42,6 @@ from robotdiffuse.problems.problem import (
     Problem,
     check_clearance,
     moved_goal,
-)
-from robotdiffuse.problems.robot_setup_files import (
-    equipment_entries,
-    equipped,
-    payload_entry,
-    read_payload,
-    read_pose,
-    rounded,
 )
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
