@@ -271,8 +271,8 @@ class PlanningContext:
     def beside(self) -> Beside:
         """The speeds that constraints bound, and the torques of a payload."""
         constraints, pace = self.validator.constraints, None
-        if constraints is not None and len(constraints.paced):
-            pace = Pace(constraints.speeds, constraints.most_speeds)
+        if constraints is not None and len(constraints.speed_limited):
+            pace = Pace(constraints.speeds, constraints.speed_limits)
         if pace is None and self.validator.dynamics is None:
             return NOTHING
         return Beside(pace, self.validator.dynamics)

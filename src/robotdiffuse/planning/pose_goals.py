@@ -76,7 +76,7 @@ def _reaching_constrained(
     found = np.zeros((0, problem.robot.dof))
 
     def keeps(q: ndarray) -> ndarray:
-        kept = constraints.kept(q)
+        kept = constraints.satisfied(q)
         return kept if accept is None else kept & accept(q)
 
     def reached(T_base_frame: ndarray, count: int, accept: Accept | None) -> ndarray:
@@ -100,7 +100,7 @@ def _reaching_constrained(
     within = PathConstraints(replace(problem, constraints=(*problem.constraints, box)))
     for i in range(POSES):
         few = reached(goal.draw(rng) if i else goal.T_base_frame, OF_EACH, None)
-        few = np.concatenate([few[constraints.kept(few)], within.projected(few, SHARE_AT_GOAL)])
+        few = np.concatenate([few[constraints.satisfied(few)], within.projected(few, SHARE_AT_GOAL)])
         at_goal = [goal_error(problem.robot, goal, q) is None for q in few]
         few = few[np.array(at_goal, bool)]
         found = np.concatenate([found, few if accept is None or not len(few) else few[accept(few)]])

@@ -20,7 +20,7 @@ def path_constraints(constraints: PathConstraints, share: float) -> Cost:
     """The cost of being beyond a share of the tolerances; its strength is the longest step of a waypoint
     [rad]."""
     rows, kept = constraints.rows, constraints.limits(share)
-    unit = np.where(rows.what == DISTANCE, 1.0, ANGLE_WEIGHT)
+    unit = np.where(rows.row_kind == DISTANCE, 1.0, ANGLE_WEIGHT)
 
     def value(
         _checker: CollisionChecker, q: Float[ndarray, "count waypoints dof"], _push: float

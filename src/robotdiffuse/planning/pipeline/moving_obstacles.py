@@ -158,7 +158,7 @@ def _timed(
     count = int(LONGER * longest + PATIENCE / STEP)
     check_timing(f"a grid of {count} times", CELL_SECONDS * count * len(configurations))
     times = STEP * np.arange(count)
-    speed = max(one.greatest_speed for one in problem.moving)
+    speed = max(one.top_speed for one in problem.moving)
     asked = clearance + (TRAVEL + speed * STEP) / 2
     clear = free_over(links, collision.tracks, configurations, times, asked)
     cells = list[ndarray]()

@@ -186,7 +186,7 @@ class Replanner:
     def _guess(self) -> "_Ahead":
         """Where the obstacles will be, with as much of the berth as the arm has now."""
         moving = [seen.straight_on(self._now) for seen in self._seen.values()]
-        speeds = np.array([seen.obstacle.greatest_speed for seen in self._seen.values()])
+        speeds = np.array([seen.obstacle.top_speed for seen in self._seen.values()])
         here = self._course.at(float(self._left.s[0]))
         guess = _Ahead(self._robot, moving, self._now)
         for share in BERTHS:
@@ -317,7 +317,7 @@ class _Seen:
             T = transform(xyz, T_before[:3, :3])
         else:
             T = rigid_transform(f"observation[{name!r}]", value)
-        most = self.obstacle.greatest_speed
+        most = self.obstacle.top_speed
         velocity = self.obstacle.velocity
         if np.isfinite(self.time):
             passed = now - self.time
@@ -334,7 +334,7 @@ class _Seen:
 
     def anywhere(self) -> MovingObstacle:
         """From when it was seen on, in any way."""
-        return MovingObstacle(self.obstacle.shape, max_speed=self.obstacle.greatest_speed)
+        return MovingObstacle(self.obstacle.shape, max_speed=self.obstacle.top_speed)
 
     def straight_on(self, now: float) -> MovingObstacle:
         """From now on, as it moved when it was seen."""

@@ -103,4 +103,4 @@ class ConstrainedSearch(AnytimeSearch):
 def corner_kept(constraints: PathConstraints | None, q: Float[ndarray, "n dof"]) -> bool:
     """Whether the way through configurations, of a rounded corner say, keeps what the search keeps."""
     rows = q if len(q) > 1 else np.repeat(q, 2, axis=0)
-    return constraints is None or constraints.first(rows, share=SHARE) is None
+    return constraints is None or constraints.first_violation(rows, tolerance_fraction=SHARE) is None

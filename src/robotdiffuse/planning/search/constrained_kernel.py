@@ -123,7 +123,7 @@ def _straight(limits, a, b, memory):
     evaluate(rows, a, 0, work)
     evaluate(rows, b, 1, work)
     for m in range(len(limits.kept)):
-        most = max(work.values[0, m], work.values[1, m]) + ADDED * rows.room[m]
+        most = max(work.values[0, m], work.values[1, m]) + ADDED * rows.tolerance[m]
         memory.growing[m] = min(limits.kept[m], most)
     return proved(rows, memory.growing, a, b, COARSEST, work)[1] < 0
 
