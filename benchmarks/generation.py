@@ -33,7 +33,7 @@ from robotdiffuse.generation import GenerationSettings
 from robotdiffuse.generation.aorrtc_solver import AORRTCSearchSettings
 from robotdiffuse.generation.shard_maker import draw, solve, with_near_goals
 from robotdiffuse.generation.solvers import SEARCHES
-from robotdiffuse.problems.families.family import Drawn
+from robotdiffuse.problems.families.family import SampledProblem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 
@@ -65,7 +65,11 @@ class Found(NamedTuple):
 
 
 def searched(
-    settings: GenerationSettings, checker: CollisionChecker, drawn: Drawn, seed: int, marks: tuple[float, ...]
+    settings: GenerationSettings,
+    checker: CollisionChecker,
+    drawn: SampledProblem,
+    seed: int,
+    marks: tuple[float, ...],
 ) -> Iterator[Found]:
     """What the search of the settings has after so much CPU time [s], and where it ends by itself."""
     began = time.process_time()
@@ -83,7 +87,7 @@ def searched(
         yield Found(spent, search.cost, float(checker.link_clearances(along).min()), search.safety_distance)
 
 
-def problems(settings: GenerationSettings, robot: Robot, count: int) -> Iterator[tuple[int, Drawn]]:
+def problems(settings: GenerationSettings, robot: Robot, count: int) -> Iterator[tuple[int, SampledProblem]]:
     """Random ones that the straight line does not solve."""
     number = 0
     while count > 0:

@@ -19,7 +19,7 @@ from robotdiffuse.scenes.surface_points import PANDA_REGION, sample_surface
 def both_ways(request, monkeypatch):
     """Every test with the compiled code for whole surfaces, and with PyTorch alone, as on other devices."""
     if request.param == "tensors":
-        monkeypatch.setattr(module, "COMPILED_ON", ())
+        monkeypatch.setattr(module, "COMPILED_DEVICES", ())
     return request.param
 
 
