@@ -180,7 +180,7 @@ def test_same_seed_same_cloud(how, monkeypatch):
     a, b, c = (surface_clouds(scenes, 64, seeded(seed), **extra) for seed in (0, 0, 1))
     torch.testing.assert_close(a, b, atol=0, rtol=0)
     assert (a != c).any()
-    monkeypatch.setattr(module, "PART", 1)
+    monkeypatch.setattr(module, "CPU_BATCH_POINTS", 1)
     assert surface_clouds(scenes, 64, seeded(), **extra).shape == a.shape
 
 

@@ -449,7 +449,7 @@ def test_scaling_factors_are_noted() -> None:
     request = moveit_request(request_data() | asked, moveit_frames({}, load_robot("panda")))
     [note] = request.notes
     assert note == (
-        "the request's max_velocity_scaling_factor 0.1 is not taken over: plan with velocity_scaling=0.1"
+        "the request's max_velocity_scaling_factor 0.1 is ignored: plan with velocity_scaling=0.1"
     )
 
 
@@ -464,7 +464,7 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
     "cartesian speed": (request_data() | {"max_cartesian_speed": 0.1}, "max_cartesian_speed is not supp"),
     "scaling": (
         request_data() | {"max_velocity_scaling_factor": 2},
-        "max_velocity_scaling_factor is 2; it must be a share from 0 to 1",
+        "max_velocity_scaling_factor is 2; it must be a number from 0 to 1",
     ),
     "attached": (
         change(request_data(), ["start_state", "attached_collision_objects"], [1]),

@@ -128,9 +128,9 @@ def request_robot_notes(
 def joint_notes(
     where: str, values: dict[str, float], robot: Robot, model: str, ignore_joints: bool
 ) -> tuple[str, ...]:
-    """A note on joints that a robot lacks, if they are to be ignored; else InputError.
+    """A note on joints that the robot lacks. Raises InputError for them unless `ignore_joints`.
 
-    A fixed joint of the robot counts as known at zero, where it stands.
+    A fixed joint of the robot counts as known if its value is zero.
     """
     kinds = {joint.name: joint.kind for joint in robot.joints}
     lacking = [
