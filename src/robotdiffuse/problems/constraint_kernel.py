@@ -257,10 +257,10 @@ def _add_velocity(rows, m, k, rate, work, total):
 
 
 @njit(cache=True)
-def _unproved(rows, limits, a, b, share, first, second, work):
+def _unproved(rows, limits, a, b, fraction, first, second, work):
     """The first row that is not proved along a piece of the motion from a to b; -1 if all are proved.
 
-    The piece is `share` of the motion, and its ends are evaluated as `first` and `second`.
+    The piece is `fraction` of the motion, and its ends are evaluated as `first` and `second`.
     """
     for m in range(len(rows.row_kind)):
         u, v = work.values[first, m], work.values[second, m]
@@ -268,7 +268,7 @@ def _unproved(rows, limits, a, b, share, first, second, work):
         for k in range(rows.chain_length[m]):
             if rows.joint_kinds[m, k] != PRISMATIC:
                 j = rows.chain[m, k]
-                turn += share * abs(b[j] - a[j])
+                turn += fraction * abs(b[j] - a[j])
         if rows.row_kind[m] == CONE:
             if limits[m] < np.pi and min(np.cos(u), np.cos(v)) - turn * turn / 8 < np.cos(limits[m]):
                 return m
@@ -276,10 +276,10 @@ def _unproved(rows, limits, a, b, share, first, second, work):
         beyond, before, travel, bend = 0.0, 0.0, 0.0, 0.0
         for k in range(rows.chain_length[m]):
             j = rows.chain[m, k]
-            beyond += rows.lever_bounds[m, k] * share * abs(b[j] - a[j])
+            beyond += rows.lever_bounds[m, k] * fraction * abs(b[j] - a[j])
         for k in range(rows.chain_length[m]):
             j = rows.chain[m, k]
-            d = share * abs(b[j] - a[j])
+            d = fraction * abs(b[j] - a[j])
             beyond -= rows.lever_bounds[m, k] * d
             lever = max(work.levers[first, m, k], work.levers[second, m, k])
             if rows.joint_kinds[m, k] != PRISMATIC:
@@ -299,28 +299,28 @@ def _unproved(rows, limits, a, b, share, first, second, work):
 
 
 @njit(cache=True)
-def proved(rows, limits, a, b, least, work):
+def proved(rows, limits, a, b, min_fraction, work):
     """The fraction of the straight motion from a to b up to which the limits are proved, and the row that is
-    not proved there; 1.0 and -1 if all are proved. Pieces are split down to the fraction `least`."""
-    done, share, end = 0.0, 1.0, 0
+    not proved there; 1.0 and -1 if all are proved. Pieces are split down to the fraction `min_fraction`."""
+    done, fraction, end = 0.0, 1.0, 0
     evaluate(rows, a, 0, work)
     while done < 1.0:
-        share = min(share, 1.0 - done)
+        fraction = min(fraction, 1.0 - done)
         for k in range(len(a)):
-            work.trial[k] = a[k] + (done + share) * (b[k] - a[k])
+            work.trial[k] = a[k] + (done + fraction) * (b[k] - a[k])
         evaluate(rows, work.trial, 1 - end, work)
-        row = _unproved(rows, limits, a, b, share, end, 1 - end, work)
+        row = _unproved(rows, limits, a, b, fraction, end, 1 - end, work)
         if row < 0:
-            done, end, share = done + share, 1 - end, 2 * share
-        elif share <= least:
+            done, end, fraction = done + fraction, 1 - end, 2 * fraction
+        elif fraction <= min_fraction:
             return done, row
         else:
-            share *= 0.5
+            fraction *= 0.5
     return 1.0, -1
 
 
 @njit(cache=True)
-def first_unproved(rows, limits, q, least):
+def first_unproved(rows, limits, q, min_fraction):
     """Where the limits are first not proved along the motion through q[n, dof]: the segment, the fraction of
     it, and the row. The row is -1 if all are proved."""
     work = make_work(rows)
@@ -329,9 +329,9 @@ def first_unproved(rows, limits, q, least):
         if work.values[0, m] > limits[m]:
             return 0, 0.0, m
     for i in range(len(q) - 1):
-        share, row = proved(rows, limits, q[i], q[i + 1], least, work)
+        fraction, row = proved(rows, limits, q[i], q[i + 1], min_fraction, work)
         if row >= 0:
-            return i, share, row
+            return i, fraction, row
     return len(q) - 1, 0.0, -1
 
 
