@@ -182,7 +182,7 @@ class _Set:
     def __init__(self, problem: Problem) -> None:
         self.ready = PathConstraints(problem)
         self.rows, self.work = self.ready.rows, kernel.make_work(self.ready.rows)
-        self.kept = self.rows.limit - 0.05 * self.rows.room
+        self.kept = self.rows.limit - 0.05 * self.rows.tolerance
 
     def contains(self, q: ndarray) -> bool:
         kernel.evaluate(self.rows, q, 0, self.work)

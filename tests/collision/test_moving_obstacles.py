@@ -143,9 +143,9 @@ STANDS = transform(BALL.center)
         ),
         (
             {"times": [0.0, 1.0], "poses": [transform(BALL.center + 1)] * 2},
-            r"sphere.poses\[0\] is at .*; the shape must stand there",
+            r"sphere.poses\[0\] is at .*; it must be the pose of the shape",
         ),
-        ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is no rigid transform"),
+        ({"times": [0.0, 1.0], "poses": [STANDS, 2 * STANDS]}, r"sphere.poses\[1\] is not a rigid transform"),
     ],
 )
 def test_motions_that_are_none(motion: dict, message: str) -> None:
@@ -198,7 +198,7 @@ def test_files_name_the_field(entry: object, message: str) -> None:
 
 def test_moving_obstacles_stand_beside_neither_blends_nor_start_velocities() -> None:
     ball = rd.MovingObstacle(BALL, velocity=[0, 1, 0])
-    with pytest.raises(InputError, match="moving cannot be had beside blend: the motion stops"):
+    with pytest.raises(InputError, match="moving cannot be combined with blend: the motion stops"):
         rd.Problem(PANDA, rd.Scene(), START, END, waypoints=[END], moving=[ball], blend=0.1)
-    with pytest.raises(InputError, match="start_velocity cannot be had beside moving"):
+    with pytest.raises(InputError, match="start_velocity cannot be combined with moving"):
         rd.Problem(PANDA, rd.Scene(), START, END, moving=[ball], start_velocity=[0.1] * 7)

@@ -82,7 +82,7 @@ def test_parts_of_the_learned_stack_are_used_by_name(names: dict[str, Any]) -> N
 def test_a_family_draws_problems(names: dict[str, Any]) -> None:
     family = load_family("posts")
     assert isinstance(family, Family)
-    assert len(names["drawn"].scene.shapes) <= 1 + family.most_obstacles
+    assert len(names["drawn"].scene.shapes) <= 1 + family.max_obstacles
     first, again = (family.draw(names["problem"].robot, np.random.default_rng(3)) for _ in range(2))
     assert np.array_equal(first.start, again.start)
 

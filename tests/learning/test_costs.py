@@ -68,7 +68,7 @@ def test_steps_go_down_until_all_waypoints_keep_it(constraint: Constraint) -> No
     once, many = guidance(q, 1)[0], guidance(q, 30)[0]
     assert (formula(constraints, 0.95, once) < before)[off].all()
     np.testing.assert_array_equal(many[:, [0, -1]], q[:, [0, -1]])
-    assert constraints.kept(many.reshape(-1, PANDA.dof).astype(np.float64)).all()
+    assert constraints.satisfied(many.reshape(-1, PANDA.dof).astype(np.float64)).all()
 
 
 def test_steps_are_no_longer_than_pushes() -> None:

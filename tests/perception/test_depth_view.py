@@ -36,7 +36,7 @@ def test_a_cloud_becomes_the_image_that_its_camera_had() -> None:
     upper, lower = view.depth[2 : h // 2 - 2, 2:-2], view.depth[h // 2 + 2 : -2, 2:-2]
     for half, z in ((upper, 1.0), (lower, 2.0)):
         assert np.mean(half > 0) > 0.6 and np.allclose(half[half > 0], z, atol=1e-5)
-    with pytest.raises(InputError, match="none of 10 lies ahead"):
+    with pytest.raises(InputError, match="none of 10 is in front"):
         DepthView.from_cloud(T[:3, 3] - T[:3, 2] + np.zeros((10, 3)), T)
 
 
@@ -67,7 +67,7 @@ def test_depth_files(tmp_path: Path) -> None:
     np.save(tmp_path / "colour.npy", np.zeros((4, 4, 3)))
     (tmp_path / "bad.png").write_bytes(b"no image")
     for name, message in {
-        "grey.png": "grey with 16 bits",
+        "grey.png": "greyscale with 16 bits",
         "colour.npy": "holds float64 of 4 x 4 x 3",
         "bad.png": "cannot be read",
         "none.png": "does not exist",

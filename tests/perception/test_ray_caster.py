@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.ray_caster import FAR, DepthNoise, looking_at, ray_cast, voxels_within
+from robotdiffuse.perception.ray_caster import MAX_RANGE, DepthNoise, looking_at, ray_cast, voxels_within
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.scenes.scene import Scene
@@ -63,7 +63,7 @@ def test_points_lie_on_surfaces_and_nothing_is_nearer(seed: int) -> None:
     v, u = np.mgrid[: SIZE[1], : SIZE[0]]
     fx, fy, cx, cy = INTRINSICS
     rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
-    ends = np.minimum(view.depth, FAR) - 1e-4
+    ends = np.minimum(view.depth, MAX_RANGE) - 1e-4
     between = position + (ends[..., None] * rays)[..., None, :] * np.linspace(0.02, 1, 60)[:, None]
     assert min(distance(shape, between).min() for shape in scene.shapes) > -5e-5
 

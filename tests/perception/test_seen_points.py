@@ -11,7 +11,13 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.perception.depth_view import DepthView, SeenPoints
-from robotdiffuse.perception.seen_points import ARM, BARE_RADIUS, POINT_RADIUS, VOXEL, seen_points
+from robotdiffuse.perception.seen_points import (
+    ARM_DISTANCE,
+    MIN_POINT_RADIUS,
+    POINT_RADIUS,
+    VOXEL,
+    seen_points,
+)
 from robotdiffuse.problems.files import load_problem, problem_from_record, problem_record, save_problem
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots import load_robot
@@ -63,7 +69,7 @@ def test_the_arm_is_filtered_as_it_stood_then() -> None:
         arm = placed_spheres(PANDA, q)
         points = seen_points([view(np.concatenate([arm, BALL_ROW]), told)], PANDA, START)
         to_arm = np.linalg.norm(points[:, None] - arm[None, :, :3], axis=2) - arm[:, 3]
-        assert len(points) and to_arm.min() > ARM - VOXEL
+        assert len(points) and to_arm.min() > ARM_DISTANCE - VOXEL
         assert np.abs(np.linalg.norm(points - BALL.center, axis=1) - BALL.radius).max() < 0.004
     assert len(seen_points([view(placed_spheres(PANDA, GOAL), START)], PANDA, START)) > 100
 
@@ -105,7 +111,7 @@ def test_points_that_an_end_is_near_are_bare() -> None:
     near = np.array([[sphere[0] + sphere[3] + 0.105, *sphere[1:3], 0.1]])
     problem = Problem(PANDA, Scene(), START, GOAL, views=[view(near)])
     radii = {s.name: s.point_radius for s in problem.scene.shapes if isinstance(s, SeenPoints)}
-    assert radii == {"seen": POINT_RADIUS, "seen_at_ends": BARE_RADIUS}
+    assert radii == {"seen": POINT_RADIUS, "seen_at_ends": MIN_POINT_RADIUS}
 
 
 def test_files_keep_views_and_policy(tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ WRONG: dict[str, tuple[Any, str]] = {
         lambda: asked("left_gripper", "middle_gripper"),
         "unknown link in goal.poses: 'middle_gripper'",
     ),
-    "still": (lambda: asked("left_gripper", "torso"), "goal.poses 'torso' is moved by no planned joint"),
+    "still": (lambda: asked("left_gripper", "torso"), "goal.poses: no planned joint moves 'torso'"),
     "one part": (
         lambda: asked("left_gripper", "left_gripper_base_link"),
         "goal.poses: left_gripper and left_gripper_base_link are one rigid part; give the pose of one",

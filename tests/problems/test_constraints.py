@@ -89,9 +89,9 @@ def test_what_is_proved_holds_at_every_sample_and_what_is_not_proved_does_not(co
         if (most > 3.1).any():  # a kink, which samples miss
             continue
         ready.rows = ready.rows._replace(limit=most + 2e-5)
-        assert ready.first(q) is None
+        assert ready.first_violation(q) is None
         ready.rows = ready.rows._replace(limit=most - 2e-5)
-        found = ready.first(q)
+        found = ready.first_violation(q)
         assert found is not None and found.excess > 0
         over = np.flatnonzero((sampled > ready.rows.limit).any(axis=1))
         assert abs(found.at - over[0] / 4000) < 0.005, "the first place"
@@ -115,16 +115,16 @@ def test_proofs_hold_for_sliding_and_endless_joints_on_skew_axes() -> None:
         sampled = ready.values(q[0] + np.linspace(0, 1, 8001)[:, None] * (q[1] - q[0]))
         # a proof must fail at limits that samples exceed, and succeed well above all of them
         ready.rows = ready.rows._replace(limit=sampled.max(axis=0) - 1e-9)
-        assert ready.first(q) is not None
+        assert ready.first_violation(q) is not None
         ready.rows = ready.rows._replace(limit=sampled.max(axis=0) + 1e-2)
-        assert ready.first(q) is None
+        assert ready.first_violation(q) is None
 
 
 @pytest.mark.parametrize("constraint", EACH, ids=lambda one: one.kind)
 def test_projection_ends_where_the_constraint_is_kept(constraint: Constraint) -> None:
     ready, rng = PathConstraints(problem(constraint)), np.random.default_rng(2)
     found = ready.projected(rng.uniform(PANDA.lower, PANDA.upper, (50, 7)), 0.9)
-    assert len(found) >= 20 and ready.kept(found, 0.9).all()
+    assert len(found) >= 20 and ready.satisfied(found, 0.9).all()
     assert ((found >= PANDA.lower) & (found <= PANDA.upper)).all()
 
 
@@ -178,16 +178,22 @@ BAD: list[tuple[Callable[[], object], str]] = [
     (lambda: rd.CartesianLine(HAND, 0.0), "cartesian_line.tolerance is 0"),
     (lambda: rd.CartesianLine(HAND, speed=0.0), "cartesian_line.speed is 0"),
     (lambda: problem(rd.OnPlane("hnd", [0, 0, 0], [0, 0, 1], 0.1)), r"link in constraints\[0\].frame: 'hnd'"),
-    (lambda: problem(rd.OnPlane("panda_link0", [0, 0, 0], [0, 0, 1], 0.1)), "moved by no planned joint"),
+    (
+        lambda: problem(rd.OnPlane("panda_link0", [0, 0, 0], [0, 0, 1], 0.1)),
+        "no planned joint moves 'panda_link0'",
+    ),
     (lambda: replace(problem(), constraints="upright"), "constraints is 'upright'"),  # type: ignore[arg-type]
-    (lambda: replace(problem(EACH[4]), waypoints=(GOAL,)), "cartesian_line goes from start to goal"),  # type: ignore[arg-type]
+    (
+        lambda: replace(problem(EACH[4]), waypoints=(GOAL,)),
+        "cartesian_line cannot be combined",
+    ),  # type: ignore[arg-type]
     (lambda: PathConstraints(replace(problem(EACH[4]), goal=[START, GOAL])), "2 configurations .* different"),  # type: ignore[arg-type]
-    (lambda: PathConstraints(replace(problem(EACH[4]), goal=START)), "0 mm from where the goal has it"),  # type: ignore[arg-type]
+    (lambda: PathConstraints(replace(problem(EACH[4]), goal=START)), "0 mm from its goal position"),  # type: ignore[arg-type]
     (
         lambda: PathConstraints(
             replace(problem(EACH[4]), goal=rd.PoseGoal(HAND, link_pose(PANDA, GOAL, HAND), [0.1, 0, 0]))
         ),
-        "the goal must say one pose of it, but it leaves room",
+        "the goal must determine its pose, but it has tolerances",
     ),
 ]
 

@@ -37,7 +37,7 @@ def test_problems_are_as_the_family_says(name: str, target: str) -> None:
         np.testing.assert_allclose(poses[1:, :3, 3], [drawn.T_base_tip[:3, 3]] * len(drawn.goals), atol=1e-3)
         floors = () if family.floor is None else (family.floor,)
         assert drawn.scene.shapes[: len(floors)] == floors
-        PackedScenes.pack([drawn.scene], family.most_obstacles, floor=bool(floors))
+        PackedScenes.pack([drawn.scene], family.max_obstacles, floor=bool(floors))
 
 
 @every_family
@@ -51,7 +51,7 @@ def test_data_are_made_of_it(name: str) -> None:
     settings = GenerationSettings(mix={"rop": 1.0, name: 1e6}, goals=2)
     number, drawn = draw(settings, PANDA, np.random.default_rng(1))
     assert list(settings.mix)[number] == name and 1 <= len(drawn.goals) <= 2
-    assert settings.slots >= load_family(name).most_obstacles
+    assert settings.slots >= load_family(name).max_obstacles
 
 
 @every_family
@@ -70,7 +70,7 @@ def test_position_of_the_tip_is_uniform_in_the_region() -> None:
 
 
 def test_impossible_problems(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawing, "SCENES", 2)
+    monkeypatch.setattr(drawing, "MAX_SCENES", 2)
     with pytest.raises(InputError, match="no free start and goal in 2 scenes of Rop for panda"):
         replace(ROP, tip_z=(5.0, 6.0)).draw(PANDA, np.random.default_rng(10))
 

@@ -13,9 +13,9 @@ from robotdiffuse.problems.families.crate import CRATE
 from robotdiffuse.problems.families.family import base_spheres
 from robotdiffuse.problems.families.furniture import (
     FLOOR,
-    MARGIN,
+    REGION_MARGIN,
     SHOULDER,
-    Furnished,
+    FurnishedScene,
     Furniture,
     Region,
     sample_target,
@@ -40,12 +40,12 @@ FURNITURE: dict[str, Furniture] = {
 every_family = pytest.mark.parametrize("name", FURNITURE)
 
 
-def drawn(name: str, count: int, seed: int = 0) -> list[Furnished]:
+def drawn(name: str, count: int, seed: int = 0) -> list[FurnishedScene]:
     rng = np.random.default_rng(seed)
     return [FURNITURE[name].furnish(rng, BASE) for _ in range(count)]
 
 
-def named(furnished: Furnished, name: str) -> list[Shape]:
+def named(furnished: FurnishedScene, name: str) -> list[Shape]:
     return [shape for shape in furnished.scene.shapes if shape.name.split("_")[0] == name]
 
 
@@ -61,7 +61,7 @@ def gaps(shape: Shape, points: np.ndarray) -> np.ndarray:
 
 @every_family
 def test_scenes_pack_and_stand_on_the_ground(name: str) -> None:
-    slots = FURNITURE[name].most_obstacles
+    slots = FURNITURE[name].max_obstacles
     assert slots <= 32
     for furnished in drawn(name, 30):
         floor, *shapes = furnished.scene.shapes
@@ -151,14 +151,14 @@ def test_same_seed_same_scene(name: str) -> None:
 
 def test_targets_have_the_fingers_in_the_region() -> None:
     approach = np.array([0.6, 0.0, -0.8])
-    region = Region(np.array([0.5, 0.1, 0.3]), np.array([0.4, 0.2, 2 * MARGIN]), 0.7, approach)
+    region = Region(np.array([0.5, 0.1, 0.3]), np.array([0.4, 0.2, 2 * REGION_MARGIN]), 0.7, approach)
     rng = np.random.default_rng(5)
     T = np.stack([sample_target(region, rng, spread=0.3, fingers=0.1) for _ in range(2000)])
     products = T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), (2000, 3, 3)), atol=1e-12)
     local = (T[:, :3, 3] + 0.1 * T[:, :3, 2] - region.center) @ turned(0.7)
-    assert (np.abs(local) <= region.size / 2 - MARGIN + 1e-12).all()
-    assert (np.abs(local).max(axis=0) > 0.95 * (region.size / 2 - MARGIN) - 1e-12).all()
+    assert (np.abs(local) <= region.size / 2 - REGION_MARGIN + 1e-12).all()
+    assert (np.abs(local).max(axis=0) > 0.95 * (region.size / 2 - REGION_MARGIN) - 1e-12).all()
     cosines = T[:, :3, 2] @ approach
     assert cosines.min() > np.cos(0.3) - 1e-12
     # uniform on the cap: the cosine is uniform; mean of 2000 draws within five standard deviations
@@ -184,7 +184,7 @@ def test_wrong_settings(settings: object, change: dict[str, object], message: st
 @every_family
 def test_impossible_settings(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(furniture, "MAX_TRIES", 5)
-    with pytest.raises(InputError, match="in 5 draws; change distance or reach"):
+    with pytest.raises(InputError, match="in 5 samples; change distance or reach"):
         replace(FURNITURE[name], reach=0.01).furnish(np.random.default_rng(6), BASE)
 
 

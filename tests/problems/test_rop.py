@@ -39,7 +39,7 @@ def test_dense_scenes() -> None:
     scenes = [ROP_DENSE.scene(rng) for _ in range(200)]
     counts = {len(scene.shapes) - FLOOR for scene in scenes}
     assert counts == set(range(3, 13))
-    assert ROP_DENSE.most_obstacles == 12
+    assert ROP_DENSE.max_obstacles == 12
     radii = [shape.radius for scene in scenes for shape in scene.shapes if isinstance(shape, Sphere)]
     assert 0.08 <= min(radii) < 0.1 and 0.18 < max(radii) <= 0.2
 
@@ -47,7 +47,7 @@ def test_dense_scenes() -> None:
 def test_every_setting_counts() -> None:
     settings = Rop(obstacles=(4, 4), kinds=("box",), cube_side=(0.3, 0.4), x=(2.0, 3.0), yaw=True)
     shapes = settings.scene(np.random.default_rng(2)).shapes[FLOOR:]
-    assert len(shapes) == 4 == settings.most_obstacles
+    assert len(shapes) == 4 == settings.max_obstacles
     for shape in shapes:
         assert isinstance(shape, Box) and 2 <= shape.center[0] <= 3 and 0.3 <= shape.size[0] <= 0.4
         assert 0 < abs(shape.wxyz[3]) <= np.sin(np.pi / 8) and shape.wxyz[1] == shape.wxyz[2] == 0

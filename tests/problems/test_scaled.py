@@ -48,6 +48,6 @@ def test_problems_of_an_arm_of_five_joints_and_a_third_of_the_reach(name: str) -
     assert floor is not None and theirs is not None
     np.testing.assert_array_equal(floor.size, 0.4 * theirs.size)
     np.testing.assert_array_equal(drawn.scene.shapes[0].bounds, floor.bounds)
-    PackedScenes.pack([drawn.scene], family.most_obstacles, floor=True)
+    PackedScenes.pack([drawn.scene], family.max_obstacles, floor=True)
     again = family.draw(SMALL, np.random.default_rng(3), 2, POSE)
     assert problem_record(again.problem(SMALL)) == problem_record(drawn.problem(SMALL))

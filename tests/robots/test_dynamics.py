@@ -117,7 +117,7 @@ WRONG = {
     "no mass": ({"com": [0, 0, 0]}, "missing field of payload: mass|payload.*mass"),
     "com": ({"mass": 1, "com": [0, 0]}, r"payload.com is \[0, 0\]; it must be 3 numbers"),
     "link": ({"mass": 1, "link": "hand"}, "unknown link in payload.link: 'hand'"),
-    "fixed": ({"mass": 1, "link": "panda_link0"}, "payload.link 'panda_link0' is moved by no planned joint"),
+    "fixed": ({"mass": 1, "link": "panda_link0"}, "payload.link: no planned joint moves 'panda_link0'"),
     "field": ({"mass": 1, "weight": 2}, "unknown field of payload: 'weight'"),
 }
 

@@ -91,5 +91,5 @@ def test_what_cannot_be_packed() -> None:
     with pytest.raises(InputError, match="cylinder"):
         PackedScenes.pack([Scene([Cylinder([0, 0, 0], 1, 1)])], 2)
     for floor in (Capsule([0, 0, 0], 1, 1), Box([0, 0, 0], [1, 1, 1], [1, 1, 0, 0])):
-        with pytest.raises(InputError, match=f"is a {floor.kind}; it must be a box that is not turned"):
+        with pytest.raises(InputError, match=f"is a {floor.kind}; it must be a box without rotation"):
             PackedScenes.pack([Scene([floor])], 2, floor=True)

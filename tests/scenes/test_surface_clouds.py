@@ -19,7 +19,7 @@ from robotdiffuse.scenes.surface_points import PANDA_REGION, sample_surface
 def both_ways(request, monkeypatch):
     """Every test with the compiled code for whole surfaces, and with PyTorch alone, as on other devices."""
     if request.param == "tensors":
-        monkeypatch.setattr(module, "COMPILED_ON", ())
+        monkeypatch.setattr(module, "COMPILED_DEVICES", ())
     return request.param
 
 
@@ -180,7 +180,7 @@ def test_same_seed_same_cloud(how, monkeypatch):
     a, b, c = (surface_clouds(scenes, 64, seeded(seed), **extra) for seed in (0, 0, 1))
     torch.testing.assert_close(a, b, atol=0, rtol=0)
     assert (a != c).any()
-    monkeypatch.setattr(module, "PART", 1)
+    monkeypatch.setattr(module, "CPU_BATCH_POINTS", 1)
     assert surface_clouds(scenes, 64, seeded(), **extra).shape == a.shape
 
 

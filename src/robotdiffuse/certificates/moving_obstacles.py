@@ -59,7 +59,7 @@ class MovingProver(Prover):
             of_it = np.flatnonzero(which == i)
             if one.max_speed is None:
                 T = np.array([one.pose(time) for time in at[of_it]]).reshape(-1, 4, 4)
-                obstacle[of_it] = one.greatest_speed * np.maximum(at - begin, end - at)[of_it]
+                obstacle[of_it] = one.top_speed * np.maximum(at - begin, end - at)[of_it]
             else:
                 T = np.broadcast_to(one.pose(0.0), (len(of_it), 4, 4))
                 obstacle[of_it] = one.max_speed * np.maximum(end[of_it], 0.0)

@@ -15,7 +15,7 @@ from robotdiffuse.collision.kernels.convex_bounds import Hulls, Solids
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 
 class Check(NamedTuple):
@@ -131,13 +131,13 @@ def _solid(shape: Shape) -> Solid | None:
         case Sphere():
             return Solid(shape, transform(shape.center), np.zeros(3), 0.0, shape.radius, False)
         case Box():
-            return Solid(shape, pose(shape), shape.size / 2, 0.0, 0.0, False)
+            return Solid(shape, shape.T_base_shape, shape.size / 2, 0.0, 0.0, False)
         case Cylinder():
             half = np.array([0.0, 0.0, shape.height / 2])
-            return Solid(shape, pose(shape), half, shape.radius, 0.0, False)
+            return Solid(shape, shape.T_base_shape, half, shape.radius, 0.0, False)
         case Capsule():
             half = np.array([0.0, 0.0, shape.height / 2])
-            return Solid(shape, pose(shape), half, 0.0, shape.radius, False)
+            return Solid(shape, shape.T_base_shape, half, 0.0, shape.radius, False)
         case Triangulated():
             return _bounded(shape, shape.mesh.world_vertices, 0.0)
         case PointCloud():

@@ -28,7 +28,6 @@ from robotdiffuse.robots.motion_bounds import motion_radii
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle, track_speeds
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shape_transforms import placed
 
 if TYPE_CHECKING:
     from robotdiffuse.collision.exact_meshes import ExactCollision
@@ -138,7 +137,7 @@ class MovingCollision:
         """Signed distance of a link's meshes to obstacle o at a time [m], less the obstacle's growth until
         then."""
         obstacle = self.moving[o]
-        T_stands_moved = placed(obstacle.shape) @ inverse(obstacle.pose(time))
+        T_stands_moved = obstacle.shape.T_base_shape @ inverse(obstacle.pose(time))
         distance = self._exact[o].distance_from_moved_base(
             self.link_names[link], _at(times, q, time), T_stands_moved
         )
@@ -225,7 +224,7 @@ def compile_tracks(moving: Sequence[MovingObstacle]) -> Tracks:
         speeds.append(np.append(track_speeds(at, poses, obstacle.radius), 0.0))
         solids += solids_of(Scene([obstacle.shape]))
     boxes = [
-        inverse(placed(obstacle.shape)) @ solid.T_base_box
+        inverse(obstacle.shape.T_base_shape) @ solid.T_base_box
         for obstacle, solid in zip(moving, solids, strict=True)
     ]
     # A surface's box is aligned with the base frame, so it is rotated in the obstacle's own frame.

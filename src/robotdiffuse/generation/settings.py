@@ -72,7 +72,7 @@ class GenerationSettings(Settings):
     @property
     def slots(self) -> int:
         """Most obstacles of a scene, without the floor."""
-        return max(family.most_obstacles for family in self.families.values())
+        return max(family.max_obstacles for family in self.families.values())
 
     @property
     def shards(self) -> int:

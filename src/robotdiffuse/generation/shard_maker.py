@@ -19,7 +19,7 @@ from robotdiffuse.generation.aorrtc_solver import AORRTCSearch
 from robotdiffuse.generation.settings import GenerationSettings
 from robotdiffuse.generation.solvers import SEARCHES
 from robotdiffuse.planning.search.shared_tree.planner import SharedTreeSearch
-from robotdiffuse.problems.families.family import Drawn
+from robotdiffuse.problems.families.family import SampledProblem
 from robotdiffuse.robots import load_robot
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene_arrays import PackedScenes
@@ -109,7 +109,7 @@ def solve(settings: GenerationSettings, robot: Robot, number: int) -> Row | str:
     )
 
 
-def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -> tuple[int, Drawn]:
+def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -> tuple[int, SampledProblem]:
     """A random problem and the number of its family in the mix; it depends on the state of `rng` alone."""
     shares = np.array(list(settings.mix.values()))
     number = int(rng.choice(len(shares), p=shares / shares.sum()))
@@ -117,7 +117,7 @@ def draw(settings: GenerationSettings, robot: Robot, rng: np.random.Generator) -
     return number, family.draw(robot, rng, settings.goals, settings.target)
 
 
-def with_near_goals(robot: Robot, drawn: Drawn) -> Drawn:
+def with_near_goals(robot: Robot, drawn: SampledProblem) -> SampledProblem:
     """The problem with the goals of continuous joints moved by whole turns as near to the start as
     possible."""
     return replace(drawn, goals=np.stack([robot.same_stance(q, drawn.start)[0] for q in drawn.goals]))

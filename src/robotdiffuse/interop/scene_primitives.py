@@ -11,7 +11,7 @@ from robotdiffuse.core.transforms import transform
 from robotdiffuse.problems.problem import Problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
-from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
+from robotdiffuse.scenes.shapes import Box, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 Color = tuple[int, int, int]
 OBSTACLE_COLOR: Color = (0xD9, 0x7B, 0x5C)
@@ -64,9 +64,9 @@ def _primitive(shape: Shape) -> Primitive:
         case Sphere():
             return SpherePrimitive(transform(shape.center), shape.radius, OBSTACLE_COLOR)
         case Box():
-            return BoxPrimitive(pose(shape), shape.size, OBSTACLE_COLOR)
+            return BoxPrimitive(shape.T_base_shape, shape.size, OBSTACLE_COLOR)
         case Cylinder():
-            return CylinderPrimitive(pose(shape), shape.radius, shape.height, OBSTACLE_COLOR)
+            return CylinderPrimitive(shape.T_base_shape, shape.radius, shape.height, OBSTACLE_COLOR)
         case PointCloud():
             return PointsPrimitive(shape.points, shape.point_radius, OBSTACLE_COLOR)
         case Triangulated():

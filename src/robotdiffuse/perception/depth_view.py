@@ -1,6 +1,6 @@
-"""DepthView: one picture of a depth camera, with where the camera and the arm were when it was taken.
+"""DepthView: a depth image, with the camera pose and the arm's configuration when it was taken.
 
-As with shapes, the constructor checks its arguments itself: see `no_type_check` in shapes.py.
+As with shapes, the constructor checks its arguments itself: see `no_type_check` in scenes/shapes.py.
 """
 
 from dataclasses import dataclass, replace
@@ -15,10 +15,10 @@ from robotdiffuse.core.bounds import MAX_RATE, Value, numbers, rigid_transform, 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.scenes.shapes import PointCloud
 
-LEAST_FOCAL = 1e-3
-"""Of a lens [pixels]: smaller ones are no numbers above 0 in float32, or say nothing."""
-CLOUD_WIDTH, CLOUD_HEIGHT = 320, 240
-"""Most pixels of the image that a cloud becomes: coarser where its points are sparse."""
+MIN_FOCAL_LENGTH = 1e-3
+"""Minimum focal length [pixels]: smaller values underflow in float32, or are meaningless."""
+MAX_CLOUD_WIDTH, MAX_CLOUD_HEIGHT = 320, 240
+"""Maximum size of the image that is made of a point cloud; sparse clouds get coarser images [pixels]."""
 
 
 @no_type_check
@@ -26,23 +26,23 @@ CLOUD_WIDTH, CLOUD_HEIGHT = 320, 240
 class DepthView(Value):
     """A depth image of a pinhole camera, in the frame of the robot's base.
 
-    A pixel without a return, 0, negative or not a number, says nothing: neither that space is free nor that
-    it is occupied. One that is +inf saw nothing as far as the camera sees (as in ROS, REP 117). Raises
-    InputError for arrays of the wrong shape and for poses that are none.
+    A pixel without a return (0, negative or not a number) says nothing: its ray may be free or occupied. A
+    pixel of +inf means that nothing is within the camera's range (as in ROS, REP 117). Raises InputError for
+    arrays of the wrong shape and for matrices that are not poses.
     """
 
     depth: Float32[ndarray, "h w"]
-    """Along the optical axis [m]."""
+    """Distance along the optical axis [m]."""
     intrinsics: tuple[float, float, float, float]
-    """fx, fy, cx, cy [pixels]; centres of pixels are at whole coordinates."""
+    """fx, fy, cx, cy [pixels]; pixel centres have integer coordinates."""
     T_base_camera: Float[ndarray, "4 4"]
     """x to the right in the image, y down, z ahead: the optical frame of ROS and OpenCV."""
     configuration: Float[ndarray, "dof"] | None = None
-    """The arm's when the picture was taken; None: the problem's start."""
+    """Configuration of the arm when the image was taken; None: the problem's start."""
     cloud: Float[ndarray, "n 3"] | None = None
-    """The points themselves [m], where the image was made of a cloud: it holds only the nearest ones."""
+    """The original points [m] of an image that was made of a cloud; the image keeps only the nearest ones."""
     source: dict[str, str | float] | None = None
-    """How a problem file names the picture: `depth`, a file, and its `scale`, or `cloud`."""
+    """The image's entry in problem files: `depth`, a file name, and its `scale`, or `cloud`, a file name."""
 
     def __post_init__(self) -> None:
         depth = numbers(self.depth)
@@ -50,14 +50,14 @@ class DepthView(Value):
             form = "not numbers" if depth is None else f"an array of {' x '.join(map(str, depth.shape))}"
             raise InputError(f"view.depth is {form}; it must be an image of height x width")
         intrinsics = vector("view", "intrinsics", self.intrinsics, 4, MAX_RATE)
-        if min(intrinsics[:2]) < LEAST_FOCAL:
-            least = f"fx and fy must be at least {LEAST_FOCAL:g} [pixels]"
+        if min(intrinsics[:2]) < MIN_FOCAL_LENGTH:
+            least = f"fx and fy must be at least {MIN_FOCAL_LENGTH:g} [pixels]"
             raise InputError(f"view.intrinsics is {shown(intrinsics)}; {least}")
         configuration = self.configuration
         if configuration is not None:
             array = numbers(configuration)
             configuration = vector("view", "configuration", configuration, 1 if array is None else array.size)
-        with np.errstate(over="ignore"):  # beyond float32 is as far as +inf
+        with np.errstate(over="ignore"):  # values beyond float32 become +inf
             depth = np.ascontiguousarray(depth, np.float32)
         for key, value in {
             "depth": depth,
@@ -81,7 +81,8 @@ class DepthView(Value):
         ) -> None: ...
 
     def points(self) -> Float[ndarray, "n 3"]:
-        """Those of the cloud, or one for each pixel that returned, row by row."""
+        """The points in the base frame [m]: those of the cloud, or one for each pixel with a return, row by
+        row."""
         if self.cloud is not None:
             return self.cloud
         rows, columns = np.nonzero(np.isfinite(self.depth) & (self.depth > 0))
@@ -91,7 +92,7 @@ class DepthView(Value):
         return in_camera @ self.T_base_camera[:3, :3].T + self.T_base_camera[:3, 3]
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "DepthView":
-        """The view with camera and points after a rigid motion."""
+        """The view after the rigid motion T of camera and points."""
         cloud = None if self.cloud is None else self.cloud @ T[:3, :3].T + T[:3, 3]
         return replace(self, T_base_camera=T @ self.T_base_camera, cloud=cloud)
 
@@ -103,11 +104,11 @@ class DepthView(Value):
         configuration: Float[ndarray, "dof"] | None = None,
         source: dict[str, str | float] | None = None,
     ) -> "DepthView":
-        """The image that a camera has of a cloud in the base frame: each pixel its nearest point.
+        """The depth image that a camera at `T_base_camera` has of a point cloud in the base frame [m].
 
-        The image is as wide as the cloud is seen, and its pixels so wide that most of them hold points.
-        Points behind the camera, which it cannot have seen, are left out. Raises InputError if no point is
-        ahead of the camera.
+        Each pixel holds its nearest point. The image covers the cloud, and its pixels are large enough that
+        most of them contain points. Points behind the camera are ignored. Raises InputError if no point is
+        in front of the camera.
         """
         T = cls(np.zeros((1, 1)), (1.0, 1.0, 0.0, 0.0), T_base_camera, configuration).T_base_camera
         in_camera = (points - T[:3, 3]) @ T[:3, :3]
@@ -115,14 +116,14 @@ class DepthView(Value):
         ahead = z > 1e-3
         if not ahead.any():
             raise InputError(
-                f"view.points: none of {len(points)} lies ahead of the camera; is T_base_camera (x right, y"
+                f"view.points: none of {len(points)} is in front of the camera; is T_base_camera (x right, y"
                 " down, z ahead) right, and are the points in the base frame?"
             )
         z = z[ahead]
         slopes = in_camera[ahead, :2] / z[:, None]
         low, high = np.percentile(slopes, (0.1, 99.9), axis=0)
         span = np.maximum(high - low, 1e-3)
-        pixel = max(np.sqrt(2 * span.prod() / len(z)), span[0] / CLOUD_WIDTH, span[1] / CLOUD_HEIGHT)
+        pixel = max(np.sqrt(2 * span.prod() / len(z)), span[0] / MAX_CLOUD_WIDTH, span[1] / MAX_CLOUD_HEIGHT)
         at = np.rint((slopes - low) / pixel).astype(np.int64)
         width, height = (np.ceil(span / pixel).astype(np.int64) + 1).tolist()
         inside = ((at >= 0) & (at < (width, height))).all(axis=1)
@@ -134,8 +135,8 @@ class DepthView(Value):
 
 
 class SeenPoints(PointCloud):
-    """What a problem has of its views, beside the shapes that it was given."""
+    """Points of a problem's scene that its views observed."""
 
 
 class AssumedPoints(PointCloud):
-    """What is taken for occupied beside what was seen."""
+    """Points of unknown space that an assumption treats as occupied."""

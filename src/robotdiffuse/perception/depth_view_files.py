@@ -1,4 +1,4 @@
-"""Depth views in problem files: images and clouds that are read, and entries that name them.
+"""Reads and writes the depth views of problem files, and reads depth images.
 
 - {depth: shelf.png, scale: 0.001, intrinsics: [fx, fy, cx, cy], camera: {xyz: [...], wxyz: [...]}}
 - {cloud: shelf.ply, camera: {...}, configuration: [...]}
@@ -20,15 +20,15 @@ from robotdiffuse.scenes.files import check_fields, name_from
 from robotdiffuse.scenes.point_cloud import read_points
 
 DEPTH_FORMATS = (".png", ".npy", ".npz", ".exr")
-MILLIMETRE = 0.001
-"""The unit of depth images of whole numbers, unless a scale is given [m]."""
+INTEGER_SCALE = 0.001
+"""Metres per unit of integer depth images, unless a scale is given."""
 
 
 def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "h w"]:
     """A depth image [m]: a 16 bit .png, an array in .npy or .npz (named depth, or the only one), or .exr.
 
-    `scale`: metres per unit; None: 0.001 for whole numbers, 1 for others. Raises InputError for a file that
-    is missing or holds something else.
+    scale: metres per unit; None: 0.001 for integers, 1 for floating-point numbers. Raises InputError for a
+    file that is missing or is not a depth image.
     """
     file = Path(file)
     if file.suffix.lower() not in DEPTH_FORMATS:
@@ -38,7 +38,7 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
         image = _READERS[file.suffix.lower()](file)
     except InputError:
         raise
-    except Exception as error:  # the readers raise whatever their library does about a damaged file
+    except Exception as error:  # the libraries raise many kinds of errors for damaged files
         raise InputError(f"depth image {file} cannot be read: {shortened(str(error))}") from None
     if image.ndim != 2 or image.dtype.kind not in "uif":
         form = " x ".join(map(str, image.shape))
@@ -46,7 +46,7 @@ def read_depth(file: str | Path, scale: float | None = None) -> Float[ndarray, "
             f"depth image {file} holds {image.dtype} of {form}; it must be numbers, height x width"
         )
     if scale is None:
-        scale = MILLIMETRE if image.dtype.kind in "ui" else 1.0
+        scale = INTEGER_SCALE if image.dtype.kind in "ui" else 1.0
     return image.astype(np.float64) * scale
 
 
@@ -55,7 +55,9 @@ def _read_png(file: Path) -> ndarray:
 
     with Image.open(file) as image:
         if image.mode not in ("I;16", "I;16B", "I"):
-            raise InputError(f"depth image {file} is of mode {image.mode}; it must be grey with 16 bits")
+            raise InputError(
+                f"depth image {file} has the mode {image.mode}; it must be greyscale with 16 bits"
+            )
         return np.asarray(image).astype(np.int64)
 
 
@@ -91,10 +93,10 @@ _READERS = {
 
 
 def read_views(entries: object, folder: Path) -> tuple[tuple[DepthView, ...], tuple[str, ...]]:
-    """The views of a problem file, and notes on what was left out of them; files are looked up from `folder`.
+    """The views of a problem file, and notes on removed points. File names are relative to `folder`.
 
-    Raises InputError for unknown and missing fields, values of the wrong kind and files that cannot be read;
-    the message starts with the place, e.g. views[1].
+    Raises InputError for unknown and missing fields, values of the wrong type and files that cannot be read;
+    the message starts with the place in the file, e.g. views[1].
     """
     if not isinstance(entries, list):
         raise InputError(f"views is {shown(entries)}; it must be a list of views, each with depth or cloud")
@@ -123,8 +125,8 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
         points = values["cloud"]
         if isinstance(points, str):
             file = str(folder / points)
-            points, more = read_points(file)
-            notes.extend(more)
+            points, new_notes = read_points(file)
+            notes.extend(new_notes)
             source = {"cloud": file}
         return DepthView.from_cloud(_rows(where, points), T_base_camera, configuration, source)
     image = values["depth"]
@@ -133,7 +135,9 @@ def _view(where: str, entry: object, folder: Path, notes: list[str]) -> DepthVie
         file = str(folder / image)
         image, source = read_depth(file, scale), {"depth": file} | ({} if scale is None else {"scale": scale})
     elif scale is not None:
-        raise InputError("view.scale is for images that are read from files; give numbers in metres")
+        raise InputError(
+            "view.scale cannot be combined with an image in the problem file, which is in metres"
+        )
     return DepthView(image, values["intrinsics"], T_base_camera, configuration, source=source)
 
 
@@ -145,7 +149,8 @@ def _rows(where: str, points: Any) -> Float[ndarray, "n 3"]:
 
 
 def view_entry(view: DepthView, folder: Path | None) -> dict[str, Any]:
-    """The view as `read_views` takes it; what was read from a file is written as its name."""
+    """The entry of a view, as `read_views` reads it. Data that were read from a file are written as its
+    name."""
     entry: dict[str, Any] = {}
     if view.source is not None:
         entry |= {
@@ -155,7 +160,7 @@ def view_entry(view: DepthView, folder: Path | None) -> dict[str, Any]:
     elif view.cloud is not None:
         entry["cloud"] = view.cloud.tolist()
     else:
-        # what is no number would be no JSON; a pixel that saw nothing however far keeps that, as 1e9
+        # JSON has no NaN or infinity: missing returns become 0, and infinite depths 1e9
         image = np.nan_to_num(view.depth, nan=0.0, posinf=1e9, neginf=0.0)
         entry["depth"] = image.tolist()
     if view.cloud is None:

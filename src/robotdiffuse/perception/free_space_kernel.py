@@ -1,6 +1,6 @@
-"""What one depth image tells of a grid of voxels, by compiled code: see `observed_volume`.
+"""Numba kernel of `observed_volume`: classifies the voxels of a grid by one depth image.
 
-Projective: each voxel is looked up in the image, and not each ray followed through the voxels.
+Each voxel is projected into the image; rays are not followed through the voxels.
 """
 
 import numpy as np
@@ -9,42 +9,44 @@ from numba import njit
 from robotdiffuse.perception.ray_kernel import rectangle
 
 HIDDEN, FREE, BEHIND, SHADOW, OUT = 0, 1, 2, 3, 4
-"""What a view says of a voxel: nothing, all of it seen free, behind a surface, behind the arm, not in the
+"""States of a voxel in a view: not observed, entirely free, behind a surface, behind the arm, outside the
 image."""
-NOTHING = np.float32(-1.0)
-"""Depth of a pixel that returned nothing."""
-FAR = np.float32(1e6)
-"""Depth of a pixel that saw nothing within its range, and of what is not known [m]."""
-FOCAL = 250.0
-"""Images are pooled while their focal length stays above this [pixels]: a voxel of 4 cm is 5 pixels wide then
-at a distance of 2 m."""
-RETURNED = np.float32(0.5)
-"""Share of a voxel's pixels that must have returned something for it to be seen free."""
-SOLID = np.float32(0.03)
-"""Share of a voxel's pixels that must lie in it for it to be seen occupied: stray ones do not count."""
-FLYING = np.float32(0.03)
-"""A pixel so much nearer than one neighbour and farther than the opposite one belongs to neither [m]..."""
-FLYING_PIXELS = np.float32(4.0)
-"""... or, if that is more, so many times the width of a pixel at its distance."""
-FAST = {"contract", "reassoc", "arcp", "nsz"}
-"""All of fastmath but what assumes that nothing is infinite or not a number."""
+NO_RETURN = np.float32(-1.0)
+"""Depth of a pixel without a return."""
+MAX_DEPTH = np.float32(1e6)
+"""Depth of a pixel without an obstacle in range, and of unknown pixels [m]."""
+POOLED_FOCAL_LENGTH = 250.0
+"""Images are downsampled by min-pooling while their focal length stays above this [pixels]: a voxel of 4 cm
+at a distance of 2 m is then 5 pixels wide."""
+MIN_RETURN_FRACTION = np.float32(0.5)
+"""Minimum fraction of a voxel's pixels with a return for it to be observed free."""
+MIN_POINT_FRACTION = np.float32(0.03)
+"""Minimum fraction of a voxel's pixels with points in it for it to be observed occupied: excludes
+outliers."""
+FLYING_PIXEL_STEP = np.float32(0.03)
+"""A flying pixel is nearer than one neighbour and farther than the opposite one by at least this [m]..."""
+FLYING_PIXEL_WIDTHS = np.float32(4.0)
+"""... or, if that is more, by this many widths of a pixel at its distance."""
+FASTMATH = {"contract", "reassoc", "arcp", "nsz"}
+"""All fastmath flags except those that assume finite numbers."""
 _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 
 
-@njit(cache=True, fastmath=FAST)
-def _cleaned(depth, focal):
-    """Depths, FAR where the ray met nothing, NOTHING where it returned nothing or between two surfaces."""
+@njit(cache=True, fastmath=FASTMATH)
+def _filtered(depth, focal):
+    """The depths, with MAX_DEPTH for rays without an obstacle and NO_RETURN for missing returns and flying
+    pixels."""
     h, w = depth.shape
     out = np.empty((h, w), np.float32)
     for v in range(h):
         for u in range(w):
             d = depth[v, u]
-            out[v, u] = min(d, FAR) if d > _ZERO else NOTHING
+            out[v, u] = min(d, MAX_DEPTH) if d > _ZERO else NO_RETURN
     flying = np.zeros((h, w), np.bool_)
     for v in range(1, h - 1):
         for u in range(1, w - 1):
             d = out[v, u]
-            step = max(FLYING, FLYING_PIXELS * d / focal)
+            step = max(FLYING_PIXEL_STEP, FLYING_PIXEL_WIDTHS * d / focal)
             a, b, c, e = out[v, u - 1], out[v, u + 1], out[v - 1, u], out[v + 1, u]
             across = (a > _ZERO) & (b > _ZERO) & (min(a, b) < d - step) & (max(a, b) > d + step)
             along = (c > _ZERO) & (e > _ZERO) & (min(c, e) < d - step) & (max(c, e) > d + step)
@@ -52,13 +54,13 @@ def _cleaned(depth, focal):
     for v in range(h):
         for u in range(w):
             if flying[v, u]:
-                out[v, u] = NOTHING
+                out[v, u] = NO_RETURN
     return out
 
 
-@njit(cache=True, fastmath=FAST)
-def _arm(depth, intrinsics, spheres):
-    """Which pixels lie in the spheres, [n, 4] x y z radius in the camera's frame."""
+@njit(cache=True, fastmath=FASTMATH)
+def _arm_pixels(depth, intrinsics, spheres):
+    """Which pixels have points inside the spheres, [n, 4] x y z radius in the camera's frame."""
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
     mask = np.zeros((h, w), np.bool_)
@@ -75,20 +77,20 @@ def _arm(depth, intrinsics, spheres):
     return mask
 
 
-@njit(cache=True, fastmath=FAST)
-def _pooled(depth, factor):
-    """Least depth of blocks of pixels, and how many of them returned nothing, summed from the upper left."""
+@njit(cache=True, fastmath=FASTMATH)
+def _min_pooled(depth, factor):
+    """Minimum depth of blocks of pixels, and the summed-area table of missing returns."""
     h, w = (depth.shape[0] + factor - 1) // factor, (depth.shape[1] + factor - 1) // factor
-    least = np.full((h, w), FAR, np.float32)
+    least = np.full((h, w), MAX_DEPTH, np.float32)
     missing = np.zeros((h + 1, w + 1), np.int32)
     nearest, lost = np.empty(depth.shape[1], np.float32), np.empty(depth.shape[1], np.int32)
     for block in range(h):
-        nearest[:], lost[:] = FAR, 0
+        nearest[:], lost[:] = MAX_DEPTH, 0
         for v in range(block * factor, min((block + 1) * factor, depth.shape[0])):
             row = depth[v]
             for u in range(depth.shape[1]):
                 known = row[u] > _ZERO
-                nearest[u] = min(nearest[u], row[u] if known else FAR)
+                nearest[u] = min(nearest[u], row[u] if known else MAX_DEPTH)
                 lost[u] += np.int32(0) if known else np.int32(1)
         total = np.int32(0)
         for u in range(depth.shape[1]):
@@ -99,9 +101,10 @@ def _pooled(depth, factor):
     return least, missing
 
 
-@njit(cache=True, fastmath=FAST)
-def _windows(least, levels):
-    """Least depth of the square of 2^k cells below and right of each cell, for each k: a sparse table."""
+@njit(cache=True, fastmath=FASTMATH)
+def _minimum_table(least, levels):
+    """Sparse table for range minima: minimum depth of the square of 2^k cells below and right of each
+    cell."""
     h, w = least.shape
     table = np.empty((levels, h, w), np.float32)
     table[0] = least
@@ -117,13 +120,13 @@ def _windows(least, levels):
     return table
 
 
-@njit(cache=True, fastmath=FAST)
-def _least(table, v0, v1, u0, u1):
-    """Least depth of the cells of a rectangle, ends included."""
+@njit(cache=True, fastmath=FASTMATH)
+def _rectangle_minimum(table, v0, v1, u0, u1):
+    """Minimum depth of the cells of a rectangle, whose bounds are inclusive."""
     k = 0
     while 2 << k <= min(v1 - v0, u1 - u0) + 1 and k + 1 < len(table):
         k += 1
-    step, least = 1 << k, FAR
+    step, least = 1 << k, MAX_DEPTH
     for v in range(v0, v1 + step, step):
         row = table[k, max(v0, min(v, v1 - step + 1))]
         for u in range(u0, u1 + step, step):
@@ -131,9 +134,9 @@ def _least(table, v0, v1, u0, u1):
     return least
 
 
-@njit(cache=True, fastmath=FAST)
-def _count(depth, arm, intrinsics, T, low, voxel, counts):
-    """Adds up the points, those of the arm left out, that lie in each voxel."""
+@njit(cache=True, fastmath=FASTMATH)
+def _count_points(depth, arm, intrinsics, T, low, voxel, counts):
+    """Counts the points in each voxel, without those of the arm."""
     fx, fy, cx, cy = intrinsics
     h, w = depth.shape
     nx, ny, nz = counts.shape
@@ -159,24 +162,24 @@ def _count(depth, arm, intrinsics, T, low, voxel, counts):
                 flat[at[u]] += 1
 
 
-@njit(cache=True, fastmath=FAST)
+@njit(cache=True, fastmath=FASTMATH)
 def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
-    """What a view says of each voxel, in state [nx ny nz], and how far behind a surface it is [m].
+    """Writes the state of each voxel [nx ny nz], its depth behind a surface [m], and its number of points.
 
-    intrinsics fx, fy, cx, cy; T = T_base_camera [4 4]; spheres of the arm in the camera's frame; low: corner
-    of the grid; counts: points in each voxel, more than the stray ones, 0 elsewhere. All of float32 but for
-    state, uint8, and counts, int32.
+    intrinsics: fx, fy, cx, cy; T: T_base_camera [4 4]; spheres: those of the arm in the camera's frame; low:
+    lower corner of the grid; counts: number of points in each voxel in excess of outliers. All arrays are
+    float32, except state, uint8, and counts, int32.
     """
     fx, fy, cx, cy = intrinsics
     nx, ny, nz = state.shape
-    raw = _cleaned(depth, fx)
-    arm = _arm(raw, intrinsics, spheres)
+    raw = _filtered(depth, fx)
+    arm = _arm_pixels(raw, intrinsics, spheres)
     counts[:] = 0
-    _count(raw, arm, intrinsics, T, low, voxel, counts)
-    factor = max(1, int(fx / FOCAL))
-    least, missing = _pooled(raw, factor)
+    _count_points(raw, arm, intrinsics, T, low, voxel, counts)
+    factor = max(1, int(fx / POOLED_FOCAL_LENGTH))
+    least, missing = _min_pooled(raw, factor)
     h, w = least.shape
-    table = _windows(least, 6)
+    table = _minimum_table(least, 6)
     share = _ONE / np.float32(factor)
     half = _HALF * voxel
     ez = half * (abs(T[0, 2]) + abs(T[1, 2]) + abs(T[2, 2]))
@@ -199,10 +202,10 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
                     continue
                 if counts[i, j, k] > 0:
                     pixels = fx * fy * (voxel / z) ** 2
-                    counts[i, j, k] = max(0, counts[i, j, k] - int(SOLID * pixels))
+                    counts[i, j, k] = max(0, counts[i, j, k] - int(MIN_POINT_FRACTION * pixels))
                 front = raw[row, column]
                 if front > z + ez or front <= _ZERO:
-                    # half the width and height of what the voxel's corners span in the image
+                    # half the width and height of the rectangle that the voxel covers in the image
                     du, dv = _ZERO, _ZERO
                     for c in range(3):
                         du += abs(T[c, 0] - x * T[c, 2])
@@ -216,8 +219,12 @@ def carve(depth, intrinsics, T, spheres, low, voxel, state, behind, counts):
                         missing[v1 + 1, u1 + 1] - missing[v0, u1 + 1] - missing[v1 + 1, u0] + missing[v0, u0]
                     )
                     pixels = np.float32((v1 + 1 - v0) * (u1 + 1 - u0) * factor * factor)
-                    nearest = _least(table, v0, v1, u0, u1)
-                    if inside and nearest > z + ez and np.float32(lost) <= (_ONE - RETURNED) * pixels:
+                    nearest = _rectangle_minimum(table, v0, v1, u0, u1)
+                    if (
+                        inside
+                        and nearest > z + ez
+                        and np.float32(lost) <= (_ONE - MIN_RETURN_FRACTION) * pixels
+                    ):
                         state[i, j, k] = FREE
                         continue
                     front = nearest if front <= _ZERO else front

@@ -1,4 +1,5 @@
-"""What depth views tell of the space within an arm's reach: voxels seen occupied, seen free, and the rest."""
+"""ObservedVolume: voxels within an arm's reach that depth views observed occupied or free; the rest is
+unknown."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,30 +17,31 @@ from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 
 VOXEL = 0.04
-"""Edge of a voxel [m]."""
+"""Edge length of a voxel [m]."""
 LOW = (-1.12, -1.12, -0.1)
-"""Least corner of the volume, in the frame of the base [m]: a floor at z = 0 is in the middle of voxels, and
-not between two layers of them."""
+"""Lower corner of the volume, in the frame of the base [m]. A floor at z = 0 is in the middle of a layer of
+voxels, not between two layers."""
 SHAPE = (56, 56, 32)
-"""Voxels along x, y and z: all that an arm of a reach of 1.1 m on a table gets near."""
+"""Number of voxels along x, y and z: the space around an arm with a reach of 1.1 m on a table."""
 ARM_MARGIN = 0.015
-"""Points so close to the arm's covering spheres are taken for the arm's own: more than depth is off [m]."""
+"""Points within this distance of the arm's covering spheres are points of the arm; larger than the error of
+depth [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedVolume:
-    """What is known of each voxel of the volume. What is neither seen occupied nor free is unknown."""
+    """What the views tell about each voxel. Voxels observed neither occupied nor free are unknown."""
 
     occupied: Bool[ndarray, "56 56 32"]
-    """Points lie in it that are not the arm's."""
+    """The voxel contains points that are not the arm's."""
     free: Bool[ndarray, "56 56 32"]
-    """A view saw through all of it."""
+    """A view observed all of it as free."""
     shadow: Bool[ndarray, "56 56 32"]
-    """Unknown, and in some view behind the arm."""
+    """Unknown, and behind the arm in some view."""
     out_of_view: Bool[ndarray, "56 56 32"]
-    """In no image."""
+    """Outside all images."""
     behind: Float32[ndarray, "56 56 32"]
-    """How far behind a surface that was seen, in the view where that is least [m]; 0 where behind none."""
+    """Depth behind an observed surface, the minimum over all views [m]; 0 if it is behind none."""
 
     @cached_property
     def unknown(self) -> Bool[ndarray, "56 56 32"]:
@@ -47,11 +49,11 @@ class ObservedVolume:
 
 
 def observe(views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"]) -> ObservedVolume:
-    """What the views tell together: occupied or free where any of them says so, occupied first.
+    """The volume observed by all views: a voxel is occupied, or else free, if any view says so.
 
-    A voxel is free where no pixel that it may cover is nearer than its far side. `start`: the arm's
-    configuration in views that tell none. Raises InputError without a view, or for a configuration of another
-    robot.
+    A voxel is free in a view if none of the pixels that it may cover is nearer than its far side. start: the
+    arm's configuration in views without one. Raises InputError without a view, or for a configuration of the
+    wrong length.
     """
     if not len(views):
         raise InputError("views is empty; at least one depth view is needed")

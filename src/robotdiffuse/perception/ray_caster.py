@@ -1,4 +1,4 @@
-"""What an ideal depth camera sees of a scene, in milliseconds; and what a real one makes of that."""
+"""Renders depth images of scenes in milliseconds, and simulates the noise of depth cameras."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -12,24 +12,25 @@ from robotdiffuse.core.errors import InputError
 from robotdiffuse.core.settings import Bound, NotNegative, Positive, Settings
 from robotdiffuse.core.transforms import transform
 from robotdiffuse.perception.depth_view import DepthView
-from robotdiffuse.perception.ray_kernel import BOX, CAPSULE, CYLINDER, SPHERE, draw
-from robotdiffuse.perception.voxel_kernel import fill
+from robotdiffuse.perception.ray_kernel import BOX, CAPSULE, CYLINDER, SPHERE, render_depth
+from robotdiffuse.perception.voxel_kernel import fill_voxels
 from robotdiffuse.robots.kinematics import placed_spheres
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Shape, Sphere
 
-FAR = 4.0
-"""Nothing farther than this is seen [m]."""
+MAX_RANGE = 4.0
+"""Range of the cameras [m]."""
 ShareBelowOne = Annotated[float, Bound(least=0.0, below=1.0)]
 
 
 def looking_at(
     position: Float[ndarray, "3"], target: Float[ndarray, "3"], roll: float = 0.0
 ) -> Float[ndarray, "4 4"]:
-    """T_base_camera of a camera that has `target` in the middle of its image, upright but for `roll` [rad].
+    """T_base_camera of a camera at `position` that looks at `target`, upright except for `roll` [rad].
 
-    x is to the right in the image, y down, z ahead. Straight down, the image's upper side is towards +x.
+    x is to the right in the image, y down, z forward. If the camera looks straight down, the top of the image
+    is towards +x.
     """
     z = np.subtract(target, position) / np.linalg.norm(np.subtract(target, position))
     right = np.array([z[1], -z[0], 0.0])
@@ -47,19 +48,19 @@ def ray_cast(
     robot: Robot | None = None,
     configuration: Float[ndarray, "dof"] | None = None,
 ) -> DepthView:
-    """What a camera of this pose sees of a scene, and of a robot, as its covering spheres, if one is given.
+    """The depth image of a scene, and of the covering spheres of a robot if one is given.
 
-    size: width and height [pixels]; intrinsics: see DepthView. Where nothing is within FAR, depth is
-    infinite. Raises InputError for shapes other than spheres, boxes, cylinders and capsules.
+    size: width and height [pixels]; intrinsics: see DepthView. Depth is infinite for pixels without an
+    obstacle within MAX_RANGE. Raises InputError for shapes other than spheres, boxes, cylinders and capsules.
     """
     kinds, rows = _rows(scene)
     if robot is not None and configuration is not None:
         spheres = [_sphere_row(sphere) for sphere in placed_spheres(robot, configuration)]
         kinds = np.append(kinds, np.full(len(spheres), SPHERE))
         rows = np.concatenate([rows, np.array(spheres, np.float32).reshape(-1, 16)])
-    depth = np.full((size[1], size[0]), FAR, np.float32)
-    draw(kinds, rows, np.array(intrinsics, np.float32), np.asarray(T_base_camera, np.float32), depth)
-    depth[depth >= FAR] = np.inf
+    depth = np.full((size[1], size[0]), MAX_RANGE, np.float32)
+    render_depth(kinds, rows, np.array(intrinsics, np.float32), np.asarray(T_base_camera, np.float32), depth)
+    depth[depth >= MAX_RANGE] = np.inf
     return DepthView(depth, intrinsics, T_base_camera, configuration)
 
 
@@ -70,18 +71,18 @@ def voxels_within(
     shape: tuple[int, int, int],
     margin: float = 0.005,
 ) -> Bool[ndarray, "nx ny nz"]:
-    """Which voxels of a grid hold obstacles: their centre is in a shape, or at most `margin` [m] from it.
+    """Which voxels of a grid are occupied: their centre is in a shape, or at most `margin` [m] from it.
 
-    With half a centimetre, walls that are half as thick as a voxel of 2 cm is wide have no holes. Raises
+    With the default margin, walls of 1 cm have no holes in a grid with voxels of 2 cm. Raises
     InputError for shapes other than spheres, boxes, cylinders and capsules.
     """
     out = np.zeros(shape, np.bool_)
-    fill(*_rows(scene), np.array(low, np.float32), np.float32(voxel), np.float32(margin), out)
+    fill_voxels(*_rows(scene), np.array(low, np.float32), np.float32(voxel), np.float32(margin), out)
     return out
 
 
 def _rows(scene: Scene) -> tuple[Int64[ndarray, "n"], Float32[ndarray, "n 16"]]:
-    """Kinds and rows of the shapes as compiled code has them."""
+    """Kinds and parameter rows of the shapes for the Numba kernels."""
     kinds = np.array([_kind(shape) for shape in scene.shapes], np.int64)
     return kinds, np.array([_row(shape) for shape in scene.shapes], np.float32).reshape(-1, 16)
 
@@ -90,7 +91,7 @@ def _kind(shape: Shape) -> int:
     kind = {Sphere: SPHERE, Box: BOX, Cylinder: CYLINDER, Capsule: CAPSULE}.get(type(shape))
     if kind is None:
         raise InputError(
-            f"{shape.name} is a {shape.kind}; only spheres, boxes, cylinders and capsules can be seen by rays"
+            f"{shape.name} is a {shape.kind}; only spheres, boxes, cylinders and capsules can be rendered"
         )
     return kind
 
@@ -113,22 +114,22 @@ def _sphere_row(sphere: Float[ndarray, "4"]) -> ndarray:
 
 @dataclass(frozen=True)
 class DepthNoise(Settings, name="depth_noise"):
-    """What a real depth camera does to depth; the defaults are about those of a stereo camera."""
+    """Noise of a real depth camera; the defaults resemble a stereo camera."""
 
     spread: NotNegative = 0.002
     """Standard deviation of depth at a distance of 1 m [m]; it grows with the square of the distance."""
     missing: ShareBelowOne = 0.02
-    """Share of the pixels that return nothing."""
+    """Fraction of the pixels without a return."""
     flying: ShareBelowOne = 0.3
-    """Share of the pixels at edges whose depth is somewhere between the two surfaces."""
+    """Fraction of the pixels at edges whose depth is between the two surfaces (flying pixels)."""
     edge: Positive = 0.05
-    """Neighbouring pixels that differ by more than this are at an edge [m]."""
+    """Neighbouring pixels whose depths differ by more than this are at an edge [m]."""
 
     def applied(self, view: DepthView, rng: Generator) -> DepthView:
-        """The same view as such a camera would have taken it."""
+        """The view with noise."""
         clean, depth = view.depth, view.depth.astype(np.float64)
         for axis in (0, 1):
-            # of two neighbours with an edge between them, the first flies
+            # of two neighbours with an edge between them, the first becomes a flying pixel
             other = clean.take(np.arange(1, clean.shape[axis] + 1), axis, mode="clip")
             both = np.isfinite(clean) & np.isfinite(other)
             apart = np.where(both, other, 0.0) - np.where(both, clean, 0.0)

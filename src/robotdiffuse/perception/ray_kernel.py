@@ -1,4 +1,5 @@
-"""Depth images of shapes by compiled code: rays through the pixels that a shape may cover meet it, or not."""
+"""Numba kernel of `ray_caster`: renders depth images of shapes by casting rays through the pixels they may
+cover."""
 
 import numpy as np
 from numba import njit
@@ -11,7 +12,8 @@ _MISS = np.float32(1e9)
 
 @njit(cache=True)
 def rectangle(x, y, z, r, intrinsics, h, w):
-    """Pixels that a sphere in the camera's frame may cover: first and last row, first and last column."""
+    """First and last row, first and last column of the pixels that a sphere in the camera's frame may
+    cover."""
     fx, fy, cx, cy = intrinsics
     if z + r <= _ZERO:
         return 0, -1, 0, -1
@@ -25,7 +27,7 @@ def rectangle(x, y, z, r, intrinsics, h, w):
 
 @njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _quadratic(a, b, c, last):
-    """The lesser root, or with `last` the greater, of a t^2 + 2 b t + c; a miss if there is none."""
+    """The smaller root, or with `last` the larger one, of a t^2 + 2 b t + c; _MISS if there is none."""
     under = b * b - a * c
     if under < _ZERO or a <= _ZERO:
         return _MISS
@@ -34,14 +36,14 @@ def _quadratic(a, b, c, last):
 
 
 @njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
-def _ball(ox, oy, oz, dx, dy, dz, r):
+def _sphere(ox, oy, oz, dx, dy, dz, r):
     c = ox * ox + oy * oy + oz * oz - r * r
     return _quadratic(dx * dx + dy * dy + dz * dz, ox * dx + oy * dy + oz * dz, c, False)
 
 
 @njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
 def _slab(o, d, half):
-    """Where a ray enters and leaves |x| < half."""
+    """The parameters at which a ray enters and leaves |x| < half."""
     if abs(d) < np.float32(1e-9):
         return (-_MISS, _MISS) if abs(o) < half else (_MISS, -_MISS)
     a, b = (-half - o) / d, (half - o) / d
@@ -49,10 +51,10 @@ def _slab(o, d, half):
 
 
 @njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
-def _meet(kind, ox, oy, oz, dx, dy, dz, a, b, c):
-    """After how many times its direction a ray enters a shape at the origin; a miss if it does not."""
+def _intersect(kind, ox, oy, oz, dx, dy, dz, a, b, c):
+    """The parameter, in lengths of its direction, at which a ray enters a shape at the origin; or _MISS."""
     if kind == SPHERE:
-        return _ball(ox, oy, oz, dx, dy, dz, a)
+        return _sphere(ox, oy, oz, dx, dy, dz, a)
     if kind == BOX:
         x0, x1 = _slab(ox, dx, a)
         y0, y1 = _slab(oy, dy, b)
@@ -70,15 +72,16 @@ def _meet(kind, ox, oy, oz, dx, dy, dz, a, b, c):
     side = _quadratic(square, mixed, offset, False)
     if abs(oz + side * dz) > b:
         side = _MISS
-    return min(side, _ball(ox, oy, oz - b, dx, dy, dz, a), _ball(ox, oy, oz + b, dx, dy, dz, a))
+    return min(side, _sphere(ox, oy, oz - b, dx, dy, dz, a), _sphere(ox, oy, oz + b, dx, dy, dz, a))
 
 
 @njit(cache=True, fastmath={"contract", "reassoc", "arcp", "nsz"})
-def draw(kinds, rows, intrinsics, T, depth):
-    """Lowers each pixel of `depth` [h w] to the nearest shape's; what the camera is inside of is not seen.
+def render_depth(kinds, rows, intrinsics, T, depth):
+    """Lowers each pixel of `depth` [h w] to the depth of the nearest shape.
 
-    rows [n, 16]: centre, rotation of the base's frame to the shape's, half sizes or radius and half height,
-    radius of a sphere around it; T = T_base_camera. All of float32 but for kinds.
+    Shapes that contain the camera are not rendered. rows [n, 16]: centre, rotation from the base's frame to
+    the shape's, half sizes or radius and half height, radius of a bounding sphere; T: T_base_camera. All
+    arrays are float32, except kinds.
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
@@ -102,7 +105,7 @@ def draw(kinds, rows, intrinsics, T, depth):
             dx, dy, dz = M[0, 1] * q + M[0, 2], M[1, 1] * q + M[1, 2], M[2, 1] * q + M[2, 2]
             for u in range(u0, u1 + 1):
                 p = (np.float32(u) - cx) / fx
-                t = _meet(
+                t = _intersect(
                     kinds[s], o[0], o[1], o[2],
                     dx + M[0, 0] * p, dy + M[1, 0] * p, dz + M[2, 0] * p,
                     row[12], row[13], row[14],

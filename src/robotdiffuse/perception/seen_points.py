@@ -1,4 +1,4 @@
-"""What depth views add to the scene of a problem: the points that a camera saw, few enough to plan with."""
+"""Reduces depth views to few points, which are added to the scene of a problem."""
 
 from collections.abc import Sequence
 
@@ -21,42 +21,43 @@ from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.scene import Scene
 
 VOXEL = 0.015
-"""Points in a cell so wide become one, their mean [m]."""
+"""Edge length of the cells whose points are replaced by their mean [m]."""
 POINT_RADIUS = 0.01
-"""[m]"""
-BARE_RADIUS = 0.001
-"""Of points that an end would touch otherwise [m]."""
-ARM = 0.02
-"""Points nearer than this to the arm as it stood are the arm's own [m]."""
-KNOWN = 0.01
-"""Points nearer than this to a known shape are its own [m]."""
-AROUND = 0.3
-"""Points are kept this far beyond the robot's reach [m]."""
-FEW = 3
-"""Points in a cell, alone among empty ones, that are not taken for a sensor's mistake."""
-FARTHEST = 2.0
-"""Where a camera is that is to see a cell well [m]."""
-CELLS = 1 << 16
-"""That there is room for at first."""
+"""Radius of the obstacle around each point [m]."""
+MIN_POINT_RADIUS = 0.001
+"""Radius of points that would otherwise collide at start or goal [m]."""
+ARM_DISTANCE = 0.02
+"""Points within this distance of the arm, at its configuration in the view, are points of the arm [m]."""
+KNOWN_DISTANCE = 0.01
+"""Points within this distance of a known shape are points of the shape [m]."""
+REACH_MARGIN = 0.3
+"""Points are kept up to this distance beyond the robot's reach [m]."""
+MIN_CELL_POINTS = 3
+"""Minimum number of points of an isolated cell; cells with fewer are sensor errors."""
+CAMERA_DISTANCE = 2.0
+"""Distance at which a camera of sufficient resolution has many pixels per cell [m]."""
+INITIAL_CELLS = 1 << 16
+"""Initial capacity of the table of cells."""
 
 
 def seen_points(
     views: Sequence[DepthView], robot: Robot, start: Float[ndarray, "dof"], voxel: float = VOXEL
 ) -> Float32[ndarray, "n 3"]:
-    """The mean of the points in each cell of a grid, in the base frame [m].
+    """The mean of the observed points in each cell of a grid, in the base frame [m].
 
-    Without flying pixels, what lies on the arm as it stood in each view, and what is far beyond its reach.
+    Flying pixels, points of the arm at its configuration in each view, and points far beyond its reach are
+    left out.
     """
-    room = CELLS
+    capacity = INITIAL_CELLS
     while True:
-        keys = np.full(4 * room, -1, np.int64)
-        cells, sums = np.zeros(4 * room, np.int32), np.zeros((room, 4), np.float32)
+        keys = np.full(4 * capacity, -1, np.int64)
+        cells, sums = np.zeros(4 * capacity, np.int32), np.zeros((capacity, 4), np.float32)
         count = 0
         for view in views:
             spheres = placed_spheres(robot, start if view.configuration is None else view.configuration)
-            spheres = (spheres + np.array([0, 0, 0, ARM])).astype(np.float32)
+            spheres = (spheres + np.array([0, 0, 0, ARM_DISTANCE])).astype(np.float32)
             rest = (
-                np.float32(reach_bound(robot) + AROUND),
+                np.float32(reach_bound(robot) + REACH_MARGIN),
                 spheres,
                 np.float32(voxel),
                 keys,
@@ -73,15 +74,16 @@ def seen_points(
             if count < 0:
                 break
         if count >= 0:
-            kept = supported(keys, cells, sums, count, np.float32(_least(views, voxel)))
+            kept = supported(keys, cells, sums, count, np.float32(_min_cell_points(views, voxel)))
             return sums[:count, :3][kept] / sums[:count, 3:][kept]
-        room *= 4
+        capacity *= 4
 
 
-def _least(views: Sequence[DepthView], voxel: float) -> int:
-    """Points that make a cell one that was seen: a few, where images are so fine that it should have many."""
+def _min_cell_points(views: Sequence[DepthView], voxel: float) -> int:
+    """Minimum number of points of an isolated cell: more than one only if all images have many pixels per
+    cell."""
     focal = min((0.0 if view.cloud is not None else view.intrinsics[0] for view in views), default=0.0)
-    return FEW if (voxel * focal / FARTHEST) ** 2 >= FEW**2 else 1
+    return MIN_CELL_POINTS if (voxel * focal / CAMERA_DISTANCE) ** 2 >= MIN_CELL_POINTS**2 else 1
 
 
 def seen_shapes(
@@ -91,16 +93,16 @@ def seen_shapes(
     start: Float[ndarray, "dof"],
     goals: Float[ndarray, "n dof"],
 ) -> tuple[SeenPoints, ...]:
-    """What was seen beside the known shapes, as obstacles.
+    """The observed points as obstacles, without those of known shapes.
 
-    Points are spheres of POINT_RADIUS; those that the spheres of start or goals would touch then, of
-    BARE_RADIUS: what is added to a point for safety must not make an end invalid that is free. What lies
-    within KNOWN of a known shape is taken as a part of it.
+    Points get POINT_RADIUS, but those that the arm's spheres at start or goals would then touch get
+    MIN_POINT_RADIUS: this safety margin must not make a free start or goal invalid. Points within
+    KNOWN_DISTANCE of a known shape are left out.
     """
     points = seen_points(views, robot, start)
     if known.shapes:
-        points = points[~near_scene(compile_scene_for(robot, known), points, np.float32(KNOWN))]
+        points = points[~near_scene(compile_scene_for(robot, known), points, np.float32(KNOWN_DISTANCE))]
     ends = np.concatenate([placed_spheres(robot, q) for q in (start, *goals)]).astype(np.float32)
-    close = sphere_distances(points, ends) < POINT_RADIUS + BARE_RADIUS
-    parts = (~close, POINT_RADIUS, "seen"), (close, BARE_RADIUS, "seen_at_ends")
+    close = sphere_distances(points, ends) < POINT_RADIUS + MIN_POINT_RADIUS
+    parts = (~close, POINT_RADIUS, "seen"), (close, MIN_POINT_RADIUS, "seen_at_ends")
     return tuple(SeenPoints(points[part], radius, name=name) for part, radius, name in parts if part.any())

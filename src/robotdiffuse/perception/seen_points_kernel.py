@@ -1,21 +1,21 @@
-"""Depth images and clouds to a few points, in compiled code: what a scene needs of what a camera saw."""
+"""Numba kernel of `seen_points`: reduces depth images and clouds to the mean points of grid cells."""
 
 import numpy as np
 from numba import njit
 
 from robotdiffuse.collision.kernels.distance import scene_distance
 
-PIXELS, SHARE = np.float32(4.0), np.float32(0.01)
-"""Neighbours whose depths differ by less than so many widths of a pixel there, or by less than this share of
-the depth, are on the same surface."""
-FARTHEST = np.float32(1e6)
-"""Depths beyond are none [m]."""
+SAME_SURFACE_PIXELS, SAME_SURFACE_FRACTION = np.float32(4.0), np.float32(0.01)
+"""Neighbouring pixels are on the same surface if their depths differ by less than this many widths of a pixel
+at that depth, or by less than this fraction of the depth."""
+MAX_DEPTH = np.float32(1e6)
+"""Larger depths are no returns [m]."""
 _ZERO = np.float32(0.0)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _slot(keys, key):
-    """Where a key is in an open table, or is to be put."""
+    """Index of a key in an open-addressing hash table, or of the slot for it."""
     mask = len(keys) - 1
     x = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     at = np.int64(x >> np.uint64(32)) & mask
@@ -26,7 +26,7 @@ def _slot(keys, key):
 
 @njit(cache=True, nogil=True, fastmath=True, inline="never")
 def _within(x, y, z, xs, ys, zs, radii):
-    """Whether a point is in one of the spheres."""
+    """Whether a point is inside one of the spheres."""
     inside = np.int32(0)
     for s in range(len(xs)):
         dx, dy, dz = x - xs[s], y - ys[s], z - zs[s]
@@ -36,7 +36,7 @@ def _within(x, y, z, xs, ys, zs, radii):
 
 @njit(cache=True, nogil=True, inline="always")
 def _key(x, y, z, voxel):
-    """The number of a point's cell."""
+    """The key of a point's cell."""
     span = np.int64(1) << 20
     i, j, k = np.int64(np.floor(x / voxel)), np.int64(np.floor(y / voxel)), np.int64(np.floor(z / voxel))
     return ((i + span) << 42) | ((j + span) << 21) | (k + span)
@@ -44,7 +44,7 @@ def _key(x, y, z, voxel):
 
 @njit(cache=True, nogil=True, inline="always")
 def _row(keys, cells, count, key):
-    """Which row of the sums is a cell's, and how many there are."""
+    """The row of a cell in the sums, and the number of rows; a new cell gets a new row."""
     at = _slot(keys, key)
     if keys[at] == -1:
         keys[at], cells[at] = key, count
@@ -62,8 +62,8 @@ def _add(sums, row, x, y, z):
 
 @njit(cache=True, nogil=True)
 def gather_cloud(points, reach, spheres, voxel, keys, cells, sums, count):
-    """Add a cloud to cells; as `gather_image`."""
-    box, balls = _box(spheres), _parted(spheres)
+    """Adds a point cloud to the cells; arguments and result as in `gather_image`."""
+    box, columns = _box(spheres), _columns(spheres)
     before, row = np.int64(-1), np.int32(0)
     for p in range(len(points)):
         if count >= len(sums):
@@ -71,10 +71,10 @@ def gather_cloud(points, reach, spheres, voxel, keys, cells, sums, count):
         x, y, z = np.float32(points[p, 0]), np.float32(points[p, 1]), np.float32(points[p, 2])
         if not x * x + y * y + z * z <= reach * reach:
             continue
-        if _boxed(box, x, y, z) and _within(x, y, z, *balls):
+        if _in_box(box, x, y, z) and _within(x, y, z, *columns):
             continue
         key = _key(x, y, z, voxel)
-        if key != before:  # most points are in the cell of the one before
+        if key != before:  # most points are in the cell of the previous point
             before = key
             row, count = _row(keys, cells, count, key)
         _add(sums, row, x, y, z)
@@ -83,20 +83,21 @@ def gather_cloud(points, reach, spheres, voxel, keys, cells, sums, count):
 
 @njit(cache=True, nogil=True)
 def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums, count):
-    """Add a depth image to cells `voxel` wide; how many cells there are, -1 if `sums` has no room for them.
+    """Adds a depth image to cells `voxel` wide. Returns the number of cells; -1 if `sums` is too small.
 
-    depth [h, w], intrinsics fx, fy, cx, cy, T [4, 4] of the camera; what is beyond `reach` of the origin, in
-    one of the spheres [n, 4] or a flying pixel is left out. keys int64 and cells int32 are an open
-    table, keys -1 where it is empty; sums [m, 4] are sums of coordinates and numbers of points by cell.
+    depth [h, w], intrinsics fx, fy, cx, cy, T: T_base_camera [4, 4]. Points beyond `reach` of the origin,
+    points inside one of the spheres [n, 4] and flying pixels are left out. keys, int64, and cells, int32, are
+    an open-addressing hash table, with keys of -1 in empty slots; sums [m, 4] are the sums of coordinates and
+    the number of points of each cell.
     """
     h, w = depth.shape
     fx, fy, cx, cy = intrinsics
-    box, balls = _box(spheres), _parted(spheres)
+    box, columns = _box(spheres), _columns(spheres)
     around = np.full((h + 2, w + 2), np.nan, np.float32)
     around[1:-1, 1:-1] = depth
     x, y, z = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
     kept, cell = np.empty(w, np.bool_), np.empty(w, np.int64)
-    # of the pixels above: most points are in the cell of a neighbour's
+    # cells of the row of pixels above: most points are in the cell of a neighbouring pixel
     known, rows = np.full(w + 1, -1, np.int64), np.zeros(w + 1, np.int32)
     for v in range(h):
         b = (np.float32(v) - cy) / fy
@@ -106,7 +107,7 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
                 continue
             if count >= len(sums):
                 return -1
-            if _boxed(box, x[u], y[u], z[u]) and _within(x[u], y[u], z[u], *balls):
+            if _in_box(box, x[u], y[u], z[u]) and _within(x[u], y[u], z[u], *columns):
                 continue
             if known[u] == cell[u]:
                 rows[u + 1] = rows[u]
@@ -119,34 +120,34 @@ def gather_image(depth, intrinsics, T, reach, spheres, voxel, keys, cells, sums,
 
 @njit(cache=True, nogil=True)
 def _place_row(around, b, fx, cx, T, reach, voxel, x, y, z, kept, cell):
-    """Where the points of a row of pixels are, in which cells, and which of them count.
+    """Computes the points of a row of pixels, their cells, and which of them to keep.
 
-    Those within reach do that are no flying pixels. Of these fewer than two of the eight neighbours are on
-    the same surface: at edges, sensors mix the depths of the near and the far one.
-    around [3, w + 2]: the row between those above and below, with a pixel more at either end.
+    Points within reach are kept, except flying pixels: those with fewer than two of their eight neighbours on
+    the same surface. At edges, sensors mix the depths of the near and the far surface.
+    around [3, w + 2]: the row above, the row and the row below, with one more pixel at either end.
     """
     above, middle, below = around[0], around[1], around[2]
     rx, ry, rz = T[0, 1] * b + T[0, 2], T[1, 1] * b + T[1, 2], T[2, 1] * b + T[2, 2]
-    pixel, most = PIXELS / fx, reach * reach
+    pixel, most = SAME_SURFACE_PIXELS / fx, reach * reach
     for u in range(len(x)):
         d, a = middle[u + 1], (np.float32(u) - cx) / fx
         px = (T[0, 0] * a + rx) * d + T[0, 3]
         py = (T[1, 0] * a + ry) * d + T[1, 3]
         pz = (T[2, 0] * a + rz) * d + T[2, 3]
-        jump = max(pixel, SHARE) * d
+        jump = max(pixel, SAME_SURFACE_FRACTION) * d
         alike = np.int32(0)
         for row in (above, middle, below):
             alike += np.int32(abs(row[u] - d) < jump)
             alike += np.int32(abs(row[u + 1] - d) < jump)
             alike += np.int32(abs(row[u + 2] - d) < jump)
         x[u], y[u], z[u], cell[u] = px, py, pz, _key(px, py, pz, voxel)
-        # the pixel itself is the third
-        kept[u] = (alike > 2) & (d > _ZERO) & (d < FARTHEST) & (px * px + py * py + pz * pz <= most)
+        # the pixel itself is one of three
+        kept[u] = (alike > 2) & (d > _ZERO) & (d < MAX_DEPTH) & (px * px + py * py + pz * pz <= most)
 
 
 @njit(cache=True, nogil=True)
 def supported(keys, cells, sums, count, least):
-    """Which cells hold at least so many points, or are next to one that does."""
+    """Which cells hold at least `least` points, or are next to one that does."""
     out = np.empty(count, np.bool_)
     for at in range(len(keys)):
         if keys[at] == -1:
@@ -164,7 +165,7 @@ def supported(keys, cells, sums, count, least):
 
 @njit(cache=True, nogil=True)
 def _box(spheres):
-    """Low and high corner of a box around spheres, one after the other."""
+    """Lower and upper corner of a box around spheres, in one array."""
     box = np.zeros(6, np.float32)
     for axis in range(3):
         for s in range(len(spheres)):
@@ -175,21 +176,21 @@ def _box(spheres):
 
 
 @njit(cache=True, nogil=True)
-def _parted(spheres):
-    """The columns of spheres [n, 4], each by itself in memory."""
+def _columns(spheres):
+    """The columns of spheres [n, 4], each contiguous in memory."""
     return spheres[:, 0].copy(), spheres[:, 1].copy(), spheres[:, 2].copy(), spheres[:, 3].copy()
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _boxed(box, x, y, z):
+def _in_box(box, x, y, z):
     return box[0] < x < box[3] and box[1] < y < box[4] and box[2] < z < box[5]
 
 
 @njit(cache=True, nogil=True)
 def sphere_distances(points, spheres):
-    """Signed distance of each point [n, 3] to the nearest sphere [m, 4], infinite where there is none."""
+    """Signed distance of each point [n, 3] to the nearest sphere [m, 4]; infinite without spheres."""
     out = np.empty(len(points), np.float32)
-    x, y, z, radii = _parted(spheres)
+    x, y, z, radii = _columns(spheres)
     for p in range(len(points)):
         at = np.float32(points[p, 0]), np.float32(points[p, 1]), np.float32(points[p, 2])
         out[p] = _nearest(at, x, y, z, radii)
@@ -207,7 +208,7 @@ def _nearest(at, x, y, z, radii):
 
 @njit(cache=True, nogil=True)
 def near_scene(scene, points, limit):
-    """Whether each point [n, 3] is in an obstacle of SceneArrays or nearer than `limit` [m]."""
+    """Whether each point [n, 3] is inside an obstacle of SceneArrays, or nearer to one than `limit` [m]."""
     out = np.empty(len(points), np.bool_)
     for p in range(len(points)):
         x, y, z = points[p, 0], points[p, 1], points[p, 2]

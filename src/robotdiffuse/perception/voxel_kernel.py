@@ -1,4 +1,4 @@
-"""Which voxels of a grid lie in shapes, by compiled code."""
+"""Numba kernel of `ray_caster.voxels_within`: finds the voxels of a grid that lie in shapes."""
 
 import numpy as np
 from numba import njit
@@ -9,8 +9,8 @@ _ZERO, _HALF = np.float32(0.0), np.float32(0.5)
 
 
 @njit(cache=True)
-def _beyond(kind, x, y, z, a, b, c):
-    """Squared distance of a point from a shape at the origin; 0 inside."""
+def _squared_distance(kind, x, y, z, a, b, c):
+    """Squared distance of a point to a shape at the origin; 0 inside it."""
     if kind == SPHERE:
         out = max(np.sqrt(x * x + y * y + z * z) - a, _ZERO)
         return out * out
@@ -26,10 +26,11 @@ def _beyond(kind, x, y, z, a, b, c):
 
 
 @njit(cache=True)
-def fill(kinds, rows, low, voxel, margin, out):
-    """Sets the voxels [nx ny nz] whose centre is in a shape, or no further than `margin` from it.
+def fill_voxels(kinds, rows, low, voxel, margin, out):
+    """Sets the voxels of out [nx ny nz] whose centre is in a shape, or at most `margin` [m] from it.
 
-    rows as `ray_kernel.draw` has them; low: corner of the grid. All of float32 but for kinds and `out`, bool.
+    rows: as in `ray_kernel.render_depth`; low: lower corner of the grid. All arrays are float32, except kinds
+    and `out`, bool.
     """
     nx, ny, nz = out.shape
     for s in range(len(kinds)):
@@ -55,5 +56,5 @@ def fill(kinds, rows, low, voxel, margin, out):
                     x = row[3] * px + row[4] * py + row[5] * pz
                     y = row[6] * px + row[7] * py + row[8] * pz
                     z = row[9] * px + row[10] * py + row[11] * pz
-                    if _beyond(kinds[s], x, y, z, row[12], row[13], row[14]) <= margin * margin:
+                    if _squared_distance(kinds[s], x, y, z, row[12], row[13], row[14]) <= margin * margin:
                         out[i, j, k] = True

@@ -274,8 +274,8 @@ class PlanningContext:
         """Limits on timing besides the joint limits: speeds that constraints bound, torques with a
         payload."""
         constraints, pace = self.validator.constraints, None
-        if constraints is not None and len(constraints.paced):
-            pace = FrameSpeedLimits(constraints.speeds, constraints.most_speeds)
+        if constraints is not None and len(constraints.speed_limited):
+            pace = FrameSpeedLimits(constraints.speeds, constraints.speed_limits)
         if pace is None and self.validator.dynamics is None:
             return NO_EXTRA_LIMITS
         return ExtraLimits(pace, self.validator.dynamics)

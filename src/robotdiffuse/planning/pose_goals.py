@@ -88,7 +88,7 @@ def _with_constraints(
     found = np.zeros((0, problem.robot.dof))
 
     def keeps(q: ndarray) -> ndarray:
-        kept = constraints.kept(q)
+        kept = constraints.satisfied(q)
         return kept if accept is None else kept & accept(q)
 
     def reached(T_base_frame: ndarray, count: int, accept: Accept | None) -> ndarray:
@@ -112,7 +112,7 @@ def _with_constraints(
     within = PathConstraints(replace(problem, constraints=(*problem.constraints, box)))
     for i in range(SAMPLED_POSES):
         few = reached(goal.draw(rng) if i else goal.T_base_frame, CONFIGURATIONS_PER_POSE, None)
-        few = np.concatenate([few[constraints.kept(few)], within.projected(few, TOLERANCE_FRACTION)])
+        few = np.concatenate([few[constraints.satisfied(few)], within.projected(few, TOLERANCE_FRACTION)])
         at_goal = [goal_error(problem.robot, goal, q) is None for q in few]
         few = few[np.array(at_goal, bool)]
         found = np.concatenate([found, few if accept is None or not len(few) else few[accept(few)]])

@@ -161,7 +161,7 @@ def retreat(
     robot, at = checker.robot, q.copy()
     for _ in range(RETREAT_STEPS):
         if checker.free(at[None])[0]:
-            return at if constraints is None or constraints.kept(at[None])[0] else None
+            return at if constraints is None or constraints.satisfied(at[None])[0] else None
         gradient = checker.cost_gradients(at[None], margin=0.005)[1][0].astype(np.float64)
         norm = np.linalg.norm(gradient)
         if norm < 1e-9:
@@ -197,7 +197,7 @@ def _usable_goals(
         if collision is not None:
             return context.fail(Status.INVALID_START, f"the start is in collision: {collision}")
     constraints = context.validator.constraints
-    wrong = None if constraints is None else constraints.worst(start)
+    wrong = None if constraints is None else constraints.worst_violation(start)
     if wrong is not None:
         return context.fail(Status.INVALID_START, f"the start does not keep the constraints: {wrong.message}")
     heavy = _too_heavy(context, start)
@@ -240,10 +240,10 @@ def _free_goals(
 ) -> Float[ndarray, "k dof"] | PlanResult:
     positions, constraints = goal.positions, context.validator.constraints
     if constraints is not None:
-        kept = constraints.kept(positions)
+        kept = constraints.satisfied(positions)
         if not kept.any():
             what = "the goal does" if len(kept) == 1 else f"all {len(kept)} goal configurations do"
-            wrong = constraints.worst(positions[0])
+            wrong = constraints.worst_violation(positions[0])
             assert wrong is not None
             reason = f"{what} not keep the constraints: {wrong.message}"
             return context.fail(Status.INVALID_GOAL, reason)
@@ -286,7 +286,7 @@ def _pose_goals(
     of_poses = "the pose of " + " and of ".join(f"{frame} at {place}" for frame, place in named.items())
     if not collisions and constraints is not None:
         any_of_it = pose_configurations(replace(problem, constraints=()), goal, None, rng)
-        wrong = constraints.worst(any_of_it[0]) if len(any_of_it) else None
+        wrong = constraints.worst_violation(any_of_it[0]) if len(any_of_it) else None
         if wrong is not None:
             what = f"no configuration was found for {of_poses} that keeps the"
             return context.fail(Status.INVALID_GOAL, f"{what} constraints, e.g. {wrong.message}")

@@ -1,4 +1,8 @@
-"""The path constraints of a problem, made ready: what they say of configurations, and proofs of motions."""
+"""PathConstraints: the constraints of a problem as arrays; evaluates, proves and projects with the Numba
+kernel.
+
+The compiled functions are in `constraint_kernel.py`; this file builds their arrays and interprets results.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,69 +31,71 @@ from robotdiffuse.robots.inverse_kinematics import KINDS
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
 
-FINEST = 1e-7
-"""Share of a segment down to which a proof splits it."""
-EPISODE_STEP, EPISODE_STEPS = 0.01, 1000
-"""Step [rad] and number of the configurations at which the greatest excess is looked for."""
-INNER = 0.5
-"""Share of a tolerance that projection goes to."""
-EXACT = 2e-6
-"""What a projected link may be off its pose [m], [rad]."""
-SHORTEST = 1e-3
-"""A Cartesian line is at least so long [m]."""
-ONE_POSE = 1e-3
-"""Goal configurations may put the frame of a line at most so far apart [m], [rad]."""
+MIN_SEGMENT_FRACTION = 1e-7
+"""Fraction of a segment down to which a proof splits it."""
+VIOLATION_STEP, VIOLATION_STEPS = 0.01, 1000
+"""Step [rad] and number of the configurations at which the maximum of a violation is searched for."""
+PROJECTION_FRACTION = 0.5
+"""Fraction of a tolerance that projection aims for."""
+POSE_TOLERANCE = 2e-6
+"""Tolerance of the pose of a projected link [m], [rad]."""
+MIN_LINE_LENGTH = 1e-3
+"""Minimum length of a Cartesian line [m]."""
+SAME_POSE_TOLERANCE = 1e-3
+"""Maximum difference of the poses of a line's link at the goal configurations [m], [rad]."""
 
 
 @dataclass(frozen=True)
-class Excess:
-    """Where a motion first is not proved to keep a constraint."""
+class ConstraintViolation:
+    """The first place on a motion where a constraint is violated, or not proved."""
 
     constraint: Constraint
     at: float
     """Waypoint index plus fraction."""
     value: float
-    """The greatest value until it is kept again [m] or [rad]."""
+    """Maximum value until the constraint is satisfied again [m] or [rad]."""
     limit: float
+    """Largest allowed value [m] or [rad]."""
     angular: bool
+    """Whether value and limit are angles."""
 
     @property
     def excess(self) -> float:
-        """Beyond the limit; 0 where it was only not proved to be kept."""
+        """Amount beyond the limit; 0 if the constraint was only not proved."""
         return max(self.value - self.limit, 0.0)
 
     @property
     def message(self) -> str:
-        """Which constraint and by how much, in words."""
+        """A message with the constraint and the amount."""
         name = f"{self.constraint.kind} of {self.constraint.frame}"
         unit, scale = ("degrees", np.degrees(1.0)) if self.angular else ("mm", 1e3)
         if self.excess == 0.0:
-            return f"{name} cannot be proved to be kept: the motion comes within rounding of its limit"
+            return f"{name} cannot be proved: the motion comes within rounding error of its limit"
         if self.limit <= 0.0:
-            return f"{name} is left by {scale * self.excess:.3g} {unit}"
+            return f"{name} is violated by {scale * self.excess:.3g} {unit}"
         return f"{name} is exceeded: {scale * self.value:.4g} {unit}, of {scale * self.limit:.4g} allowed"
 
 
 class _Row(NamedTuple):
-    """Of `Rows`, for one frame."""
+    """One row of `Rows`, for one frame."""
 
-    what: int
+    row_kind: int
     limit: float
-    room: float
-    place: ndarray = np.eye(4)
-    half: ndarray = np.zeros(3)
-    core: ndarray = np.zeros(3)
+    tolerance: float
+    reference_pose: ndarray = np.eye(4)
+    half_size: ndarray = np.zeros(3)
+    inner_half_size: ndarray = np.zeros(3)
     a: ndarray = np.zeros(3)
     b: ndarray = np.zeros(3)
 
 
 class PathConstraints:
-    """Rows of all constraints of a problem."""
+    """All path constraints of a problem, as rows of scalar constraints."""
 
     def __init__(self, problem: Problem, poses: Sequence[PoseGoal] = ()) -> None:
-        """`poses`: beside them, links that are to be at these very poses, for projection.
+        """poses: poses that links must reach exactly, as additional rows for projection.
 
-        Raises InputError where a Cartesian line has no ends.
+        Raises InputError if a Cartesian line has no unique end pose.
         """
         self.robot = problem.robot
         each = [(constraint, row) for constraint in problem.constraints for row in _rows(problem, constraint)]
@@ -101,86 +107,92 @@ class PathConstraints:
         self._paced = [
             (m, owner.speed)
             for m, owner in enumerate(self.owners)
-            if isinstance(owner, CartesianLine) and owner.speed is not None and each[m][1].what == DISTANCE
+            if isinstance(owner, CartesianLine)
+            and owner.speed is not None
+            and each[m][1].row_kind == DISTANCE
         ]
 
     def values(self, q: Float[ndarray, "n dof"]) -> Float[ndarray, "n rows"]:
-        """Of each row [m] or [rad]."""
+        """The value of each row [m] or [rad]."""
         return kernel.values(self.rows, for_kernels(q))
 
-    def limits(self, share: float) -> Float[ndarray, "rows"]:
-        """Of the values, with a share of the tolerances [m] or [rad]."""
-        return self.rows.limit - (1 - share) * self.rows.room
+    def limits(self, tolerance_fraction: float) -> Float[ndarray, "rows"]:
+        """The largest allowed values with a fraction of the tolerances [m] or [rad]."""
+        return self.rows.limit - (1 - tolerance_fraction) * self.rows.tolerance
 
-    def kept(self, q: Float[ndarray, "n dof"], share: float = 1.0) -> Bool[ndarray, "n"]:
-        """Which configurations keep all constraints; with less than a share of 1, and room beside."""
-        return np.all(self.values(q) <= self.limits(share), axis=1)
+    def satisfied(self, q: Float[ndarray, "n dof"], tolerance_fraction: float = 1.0) -> Bool[ndarray, "n"]:
+        """Which configurations satisfy all constraints within a fraction of their tolerances."""
+        return np.all(self.values(q) <= self.limits(tolerance_fraction), axis=1)
 
-    def projected(self, q: Float[ndarray, "n dof"], share: float) -> Float[ndarray, "k dof"]:
-        """Configurations near those given that keep a share of the tolerances, of each that leads to one."""
-        limits, work = self.limits(share), kernel.make_work(self.rows)
+    def projected(self, q: Float[ndarray, "n dof"], tolerance_fraction: float) -> Float[ndarray, "k dof"]:
+        """The configurations projected onto a fraction of the tolerances; failed projections are left out."""
+        limits, work = self.limits(tolerance_fraction), kernel.make_work(self.rows)
         rows = [row for row in q.astype(np.float64) if kernel.project(self.rows, limits, row, work)]
         return np.stack(rows) if rows else np.zeros((0, self.robot.dof))
 
-    def worst(self, q: Float[ndarray, "dof"]) -> Excess | None:
-        """The constraint that a configuration exceeds most, by its room; None if it keeps all."""
+    def worst_violation(self, q: Float[ndarray, "dof"]) -> ConstraintViolation | None:
+        """The largest violation of a configuration, relative to the tolerances; None if there is none."""
         [values] = self.values(q[None])
-        over = (values - self.rows.limit) / self.rows.room
+        over = (values - self.rows.limit) / self.rows.tolerance
         row = int(over.argmax())
-        return self._excess(row, 0.0, float(values[row])) if over[row] > 0 else None
+        return self._violation(row, 0.0, float(values[row])) if over[row] > 0 else None
 
-    def first(self, q: Float[ndarray, "n dof"], chord: float = 0.0, share: float = 1.0) -> Excess | None:
-        """Where the straight lines through waypoints first are not proved to keep the constraints; None if
-        they are proved to all along.
+    def first_violation(
+        self, q: Float[ndarray, "n dof"], chord: float = 0.0, tolerance_fraction: float = 1.0
+    ) -> ConstraintViolation | None:
+        """Where the straight segments through waypoints first violate a constraint, or are not proved to
+        satisfy it; None if all constraints are proved along all segments.
 
-        chord: what the motion may leave them by, each joint [rad] or [m], is taken from the limits.
-        share: of their tolerances, which are taken whole.
+        chord: bound of the motion's deviation from the segments in each joint [rad] or [m]; limits are
+        tightened to cover it. tolerance_fraction: the fraction of the tolerances that must suffice.
         """
         q, rows = for_kernels(q), self.rows
-        around = np.where(rows.what == DISTANCE, rows.reach.sum(axis=1), rows.last)
-        turning = (rows.what == TURN) * np.linalg.norm(rows.a, axis=1) * np.linalg.norm(rows.b, axis=1)
-        slack = chord * (around + turning * rows.reach.sum(axis=1))
-        limits = self.limits(share) - slack
-        segment, part, row = kernel.first_unproved(rows, limits, q, FINEST)
+        around = np.where(rows.row_kind == DISTANCE, rows.lever_bounds.sum(axis=1), rows.chain_length)
+        turning = (rows.row_kind == TURN) * np.linalg.norm(rows.a, axis=1) * np.linalg.norm(rows.b, axis=1)
+        slack = chord * (around + turning * rows.lever_bounds.sum(axis=1))
+        limits = self.limits(tolerance_fraction) - slack
+        segment, fraction, row = kernel.first_unproved(rows, limits, q, MIN_SEGMENT_FRACTION)
         if row < 0:
             return None
-        return self._excess(row, segment + part, self._greatest(q, segment, part, row))
+        return self._violation(row, segment + fraction, self._maximum(q, segment, fraction, row))
 
-    def speeds(self, q: Float[ndarray, "n dof"], rates: Float[ndarray, "n dof"]) -> Float[ndarray, "n paced"]:
-        """Speeds of the frames that have a greatest one [m/s], one column each, for rates of the joints."""
+    def speeds(
+        self, q: Float[ndarray, "n dof"], rates: Float[ndarray, "n dof"]
+    ) -> Float[ndarray, "n limited"]:
+        """Speeds of the frames with a speed limit [m/s], one column each, at joint velocities `rates`."""
         columns = [kernel.speeds(self.rows, m, for_kernels(q), for_kernels(rates)) for m, _ in self._paced]
         return np.stack(columns, axis=1) if columns else np.zeros((len(q), 0))
 
     @property
-    def most_speeds(self) -> Float[ndarray, "paced"]:
-        """Greatest speeds of those frames [m/s]."""
+    def speed_limits(self) -> Float[ndarray, "limited"]:
+        """Speed limits of these frames [m/s]."""
         return np.array([speed for _, speed in self._paced])
 
     @property
-    def paced(self) -> list[Constraint]:
-        """The constraints that they are of."""
+    def speed_limited(self) -> list[Constraint]:
+        """The constraints that set these limits."""
         return [self.owners[m] for m, _ in self._paced]
 
-    def _greatest(self, q: ndarray, segment: int, part: float, row: int) -> float:
-        """The greatest value of a row from a place on, until it is kept again."""
+    def _maximum(self, q: ndarray, segment: int, fraction: float, row: int) -> float:
+        """The maximum value of a row from a place on the motion until it is satisfied again."""
         following = min(segment + 1, len(q) - 1)
-        at = q[segment] + part * (q[following] - q[segment])
+        at = q[segment] + fraction * (q[following] - q[segment])
         way = np.concatenate([at[None], q[following:]])
         lengths = np.linalg.norm(np.diff(way, axis=0), axis=1)
         knots = np.concatenate([[0.0], np.cumsum(lengths)])
-        near = np.geomspace(FINEST, EPISODE_STEP, 64)
-        s = np.unique(np.concatenate([near, EPISODE_STEP * np.arange(EPISODE_STEPS), knots]))
-        s = s[s <= min(knots[-1], EPISODE_STEP * EPISODE_STEPS)]
+        near = np.geomspace(MIN_SEGMENT_FRACTION, VIOLATION_STEP, 64)
+        s = np.unique(np.concatenate([near, VIOLATION_STEP * np.arange(VIOLATION_STEPS), knots]))
+        s = s[s <= min(knots[-1], VIOLATION_STEP * VIOLATION_STEPS)]
         places = np.stack([np.interp(s, knots, column) for column in way.T], axis=1)
         values = self.values(places)[:, row]
         over = values > self.rows.limit[row]
-        begun = int(over.argmax())
-        back = np.flatnonzero(~over[begun:])
-        return float(values[: begun + (back[0] if len(back) and over[begun] else len(values))].max())
+        start = int(over.argmax())
+        end = np.flatnonzero(~over[start:])
+        return float(values[: start + (end[0] if len(end) and over[start] else len(values))].max())
 
-    def _excess(self, row: int, at: float, value: float) -> Excess:
-        limit, angular = float(self.rows.limit[row]), bool(self.rows.what[row] != DISTANCE)
-        return Excess(self.owners[row], at, value, limit, angular)
+    def _violation(self, row: int, at: float, value: float) -> ConstraintViolation:
+        limit, angular = float(self.rows.limit[row]), bool(self.rows.row_kind[row] != DISTANCE)
+        return ConstraintViolation(self.owners[row], at, value, limit, angular)
 
 
 def _rows(problem: Problem, constraint: Constraint) -> list[_Row]:
@@ -189,10 +201,10 @@ def _rows(problem: Problem, constraint: Constraint) -> list[_Row]:
         return [_Row(CONE, angle, angle, a=constraint.axis, b=constraint.direction)]
     if isinstance(constraint, PositionBox):
         half, T = (constraint.high - constraint.low) / 2, constraint.T_base_box
-        assert T is not None  # the constructor sees to it
+        assert T is not None  # set by the constructor
         place = T @ transform((constraint.high + constraint.low) / 2)
-        room = float(half.min())
-        return [_Row(DISTANCE, 0.0, room, place, half, half - INNER * room)]
+        tolerance = float(half.min())
+        return [_Row(DISTANCE, 0.0, tolerance, place, half, half - PROJECTION_FRACTION * tolerance)]
     tolerance = constraint.tolerance
     if isinstance(constraint, CartesianLine):
         return _line_rows(problem, constraint)
@@ -206,10 +218,10 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
     T_start, T_goal = link_pose(problem.robot, problem.start, line.frame), line_end(problem, line)
     way = T_goal[:3, 3] - T_start[:3, 3]
     length = float(np.linalg.norm(way))
-    if length < SHORTEST:
+    if length < MIN_LINE_LENGTH:
         raise InputError(
-            f"cartesian_line: {line.frame} is {1e3 * length:.2g} mm from where the goal has it; a line is at "
-            f"least {1e3 * SHORTEST:g} mm long"
+            f"cartesian_line: {line.frame} is {1e3 * length:.2g} mm from its goal position; a line must be at "
+            f"least {1e3 * MIN_LINE_LENGTH:g} mm long"
         )
     place = transform(T_start[:3, 3] + way / 2, rotation_z_to(way / length))
     half = np.array([0.0, 0.0, length / 2])
@@ -221,34 +233,37 @@ def _line_rows(problem: Problem, line: CartesianLine) -> list[_Row]:
 
 
 def line_end(problem: Problem, line: CartesianLine) -> Float[ndarray, "4 4"]:
-    """T_base_frame where the goal has the frame of a line; InputError where it does not say one pose."""
+    """T_base_frame of the link of a line at the goal. Raises InputError if the goal does not determine it."""
     robot, goal = problem.robot, problem.goal
     if isinstance(goal, JointGoal):
         poses = [link_pose(robot, q, line.frame) for q in goal.positions]
         off = [inverse(poses[0]) @ T for T in poses[1:]]
-        if all(np.linalg.norm(T[:3, 3]) < ONE_POSE and rotation_angle(T[:3, :3]) < ONE_POSE for T in off):
+        if all(
+            np.linalg.norm(T[:3, 3]) < SAME_POSE_TOLERANCE and rotation_angle(T[:3, :3]) < SAME_POSE_TOLERANCE
+            for T in off
+        ):
             return poses[0]
-        why = f"its {len(poses)} configurations have {line.frame} at different poses"
+        why = f"its {len(poses)} configurations put {line.frame} at different poses"
     elif poses := poses_of(goal):
         for pose in poses:
             if robot.link_frame(pose.frame) == robot.link_frame(line.frame) and not pose.tolerant:
                 between = inverse(robot.T_frame_link(pose.frame)) @ robot.T_frame_link(line.frame)
                 return pose.T_base_frame @ between
         what = " and of ".join(pose.frame for pose in poses)
-        why = f"it is a pose of {what}, which does not move with {line.frame}"
+        why = f"it is a pose of {what}, which is not rigidly connected to {line.frame}"
         if any(robot.link_frame(pose.frame) == robot.link_frame(line.frame) for pose in poses):
-            why = "it leaves room"
+            why = "it has tolerances"
     else:
-        why = "it is any of several"
-    raise InputError(f"cartesian_line of {line.frame}: the goal must say one pose of it, but {why}")
+        why = "it is any of several goals"
+    raise InputError(f"cartesian_line of {line.frame}: the goal must determine its pose, but {why}")
 
 
 def _rotation_vector(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
-    """Axis times angle, also near half a turn."""
+    """Axis times angle; accurate also near half a turn."""
     angle = rotation_angle(rotation)
     if angle < 1e-12:
         return np.zeros(3)
-    # the axis is the eigenvector of eigenvalue 1, its sign that of the skew part
+    # the axis is the eigenvector of eigenvalue 1, with the sign of the skew part
     axis = np.linalg.eigh(rotation + rotation.T)[1][:, -1]
     skew = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0]])
     skew = np.append(skew, rotation[1, 0] - rotation[0, 1])
@@ -256,9 +271,9 @@ def _rotation_vector(rotation: Float[ndarray, "3 3"]) -> Float[ndarray, "3"]:
 
 
 def _pose_rows(pose: PoseGoal) -> list[_Row]:
-    """Position and orientation, without their tolerances."""
-    T, nothing = pose.T_base_frame, np.zeros(3)
-    return [_Row(what, EXACT, EXACT, T, nothing, nothing) for what in (DISTANCE, TURN)]
+    """Rows for the position and the orientation of a pose, whose tolerances are ignored."""
+    T, zero = pose.T_base_frame, np.zeros(3)
+    return [_Row(kind, POSE_TOLERANCE, POSE_TOLERANCE, T, zero, zero) for kind in (DISTANCE, TURN)]
 
 
 def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
@@ -269,31 +284,31 @@ def _arrays(robot: Robot, frames: list[str], rows: list[_Row]) -> Rows:
     kinds = np.array([KINDS[joint.kind] for joint in robot.planned_joints])
     tools = [robot.T_frame_link(frame) for frame in frames]
     return Rows(
-        joints=joints,
+        chain=joints,
         offsets=robot.frame_offsets[joints],
-        kinds=kinds[joints],
-        endless=for_kernels(robot.continuous, np.bool_),
+        joint_kinds=kinds[joints],
+        continuous=for_kernels(robot.continuous, np.bool_),
         lower=for_kernels(robot.lower),
         upper=for_kernels(robot.upper),
-        what=np.array([row.what for row in rows]),
-        last=np.array([len(chain) for chain in chains]),
-        again=np.array([False, *(a == b for a, b in pairwise(frames))]),
-        tool=np.stack(tools),
-        place=np.stack([row.place for row in rows]),
-        half=np.stack([row.half for row in rows]),
-        core=np.stack([row.core for row in rows]),
+        row_kind=np.array([row.row_kind for row in rows]),
+        chain_length=np.array([len(chain) for chain in chains]),
+        same_frame=np.array([False, *(a == b for a, b in pairwise(frames))]),
+        T_joint_frame=np.stack(tools),
+        reference_pose=np.stack([row.reference_pose for row in rows]),
+        half_size=np.stack([row.half_size for row in rows]),
+        inner_half_size=np.stack([row.inner_half_size for row in rows]),
         a=np.stack([row.a for row in rows]),
         b=np.stack([row.b for row in rows]),
         limit=np.array([row.limit for row in rows]),
-        inner=np.array([INNER * row.limit for row in rows]),
-        room=np.array([row.room for row in rows]),
-        reach=np.stack([_reach(robot, frame) for frame in frames]),
+        inner_limit=np.array([PROJECTION_FRACTION * row.limit for row in rows]),
+        tolerance=np.array([row.tolerance for row in rows]),
+        lever_bounds=np.stack([_lever_bounds(robot, frame) for frame in frames]),
     )
 
 
-def _reach(robot: Robot, frame: str) -> Float[ndarray, "dof"]:
-    """Bounds of the distance from the axis of each joint that moves a frame to its origin [m], in order; 1
-    for prismatic joints, 0 after the last one."""
+def _lever_bounds(robot: Robot, frame: str) -> Float[ndarray, "dof"]:
+    """For each joint that moves a frame, in order, a bound of the distance from its axis to the frame's
+    origin [m]; 1 for prismatic joints, 0 after the last joint."""
     out, length = np.zeros(robot.dof), float(np.linalg.norm(robot.T_frame_link(frame)[:3, 3]))
     for i, k in reversed([*enumerate(robot.chain(frame))]):
         joint = robot.planned_joints[k]

@@ -1,18 +1,21 @@
-"""Compiled path constraints: values of their rows, what a straight motion keeps, and projection onto them.
+"""Numba kernel of path constraints: evaluates them, proves them along straight motions, and projects onto
+them.
 
-A row is a scalar function of the pose of a frame that must not exceed its limit:
+`compiled_constraints.py` builds the arrays that this file reads (`Rows`) from the constraints of a problem. A
+row is a scalar function of the pose of a link, its frame, whose value must not exceed a limit:
 
-- DISTANCE: from the frame's origin to a box [m], negative within. Lines, planes and segments are boxes
-  without extent, or without end, along some of their axes.
+- DISTANCE: from the frame's origin to a box [m], negative inside. Lines, planes and segments are boxes of
+  zero or infinite size along some of their axes.
 - CONE: the angle between an axis of the frame and a direction [rad].
-- TURN: the angle from the frame's orientation to the one that belongs to its share of a segment [rad].
+- TURN: the angle from the frame's orientation to the orientation interpolated at its position on a segment
+  [rad].
 
-What a piece of a motion keeps is proved from the poses at its two ends. Joints move by dq along it at
-constant rates, so the frame's origin p leaves the straight line between its ends by at most an eighth of the
-greatest second derivative, which is at most sum_jk |dq_j dq_k| r_max(j,k), r_k being the distance from the
-axis of joint k to p. Distance to a box is convex with slope 1, hence DISTANCE is at most the greater of its
-two ends and that. The cosine of CONE is linear in the axis, whose second derivative is at most
-(sum_j |dq_j|)². TURN grows no faster than the frame and its reference turn.
+A piece of a motion is proved to satisfy a row from the poses at its two ends. Along the piece, the joints
+move by dq at constant rates, so the frame's origin p leaves the straight line between its end positions by at
+most an eighth of the maximum second derivative, which is at most sum_jk |dq_j dq_k| r_max(j,k), where r_k is
+the distance from the axis of joint k to p. Distance to a box is convex with slope 1, hence DISTANCE is at
+most this deviation plus the larger value at the two ends. The cosine of CONE is linear in the axis, whose
+second derivative is at most (sum_j |dq_j|)². TURN grows no faster than the frame and its reference rotate.
 """
 
 from typing import NamedTuple
@@ -24,65 +27,67 @@ from robotdiffuse.robots.ik_kernel import PRISMATIC, damped_step, forward, pose_
 
 DISTANCE, CONE, TURN = 0, 1, 2
 ANGLE_WEIGHT = 0.3
-"""Metres that one radian counts as in projection."""
-DAMPING, MOST_STEP, ITERATIONS = 1e-5, 1.0, 30
-"""Of projection: squared singular values well above it are inverted; longest step [rad]; steps."""
+"""Metres that correspond to one radian in projection."""
+DAMPING, MAX_STEP, MAX_ITERATIONS = 1e-5, 1.0, 30
+"""For projection: damping (squared singular values well above it are inverted), longest step [rad], and
+number of steps."""
 
 
 class Rows(NamedTuple):
-    """Constraints of one robot as rows, each with the chain of joints that move its frame."""
+    """Constraints of one robot as m rows, each with the chain of joints that move its frame."""
 
-    joints: np.ndarray
-    """[m, dof] the joints of the chain, `last` of them."""
+    chain: np.ndarray
+    """[m, dof] indices of the joints that move the frame, `chain_length` of them."""
     offsets: np.ndarray
-    """[m, dof, 4, 4] of these, of `Robot.frame_offsets`."""
-    kinds: np.ndarray
-    """[m, dof] of these, as in `robots.ik_kernel`."""
-    endless: np.ndarray
+    """[m, dof, 4, 4] `Robot.frame_offsets` of these joints."""
+    joint_kinds: np.ndarray
+    """[m, dof] kinds of these joints, as in `robots.ik_kernel`."""
+    continuous: np.ndarray
     """[dof] whether a joint turns without limits."""
     lower: np.ndarray
     upper: np.ndarray
-    what: np.ndarray
+    row_kind: np.ndarray
     """[m] DISTANCE, CONE or TURN."""
-    last: np.ndarray
-    """[m] joints that move the frame."""
-    again: np.ndarray
-    """[m] whether the frame is that of the row before."""
-    tool: np.ndarray
-    """[m, 4, 4] of the frame in that of its last joint."""
-    place: np.ndarray
-    """[m, 4, 4] DISTANCE: T_base_box; TURN: the pose at the start."""
-    half: np.ndarray
-    """[m, 3] DISTANCE: half edges, may be infinite."""
-    core: np.ndarray
-    """[m, 3] DISTANCE: half edges of the box that projection goes to."""
+    chain_length: np.ndarray
+    """[m] number of joints that move the frame."""
+    same_frame: np.ndarray
+    """[m] whether the row has the same frame as the row before."""
+    T_joint_frame: np.ndarray
+    """[m, 4, 4] pose of the frame relative to the last joint of its chain."""
+    reference_pose: np.ndarray
+    """[m, 4, 4] DISTANCE: T_base_box; TURN: pose of the frame at the start."""
+    half_size: np.ndarray
+    """[m, 3] DISTANCE: half edge lengths of the box, may be infinite."""
+    inner_half_size: np.ndarray
+    """[m, 3] DISTANCE: half edge lengths of the box that projection aims for."""
     a: np.ndarray
-    """[m, 3] CONE: the axis in the frame; TURN: rotation vector from start to goal."""
+    """[m, 3] CONE: the axis in the frame; TURN: the rotation vector from start to goal."""
     b: np.ndarray
-    """[m, 3] CONE: the direction; TURN: the segment over its squared length."""
+    """[m, 3] CONE: the direction; TURN: the segment divided by its squared length."""
     limit: np.ndarray
-    """[m]"""
-    inner: np.ndarray
-    """[m] what projection goes to."""
-    room: np.ndarray
-    """[m] size of the range of values, for shares of it."""
-    reach: np.ndarray
-    """[m, dof] of the chain's joints, bounds of the distance from each one's axis to the frame's origin, 1
-    for sliding joints."""
+    """[m] largest allowed value [m] or [rad]."""
+    inner_limit: np.ndarray
+    """[m] value that projection aims for."""
+    tolerance: np.ndarray
+    """[m] size of the allowed range of values, for fractions of it."""
+    lever_bounds: np.ndarray
+    """[m, dof] for each joint of the chain, a bound of the distance from its axis to the frame's origin; 1
+    for prismatic joints."""
 
 
 class Work(NamedTuple):
-    """Memory."""
+    """Preallocated arrays of one thread."""
 
     T: np.ndarray
+    """[3, 4] pose of the frame."""
     q: np.ndarray
-    """[dof] values of a chain's joints."""
+    """[dof] values of the joints of a chain."""
     axes: np.ndarray
     origins: np.ndarray
     values: np.ndarray
-    """[2, m] at the ends of a piece."""
+    """[2, m] values of the rows at the two ends of a piece."""
     levers: np.ndarray
-    """[2, m, dof]"""
+    """[2, m, dof] distances from the joint axes to the frame's origin at the two ends."""
     limits: np.ndarray
     target: np.ndarray
     error: np.ndarray
@@ -97,7 +102,7 @@ class Work(NamedTuple):
 
 @njit(cache=True)
 def make_work(rows):
-    m, dof = rows.reach.shape
+    m, dof = rows.lever_bounds.shape
     most = 3 * m
     return Work(
         np.empty((3, 4)),
@@ -121,18 +126,25 @@ def make_work(rows):
 
 @njit(cache=True)
 def _pose(rows, m, q, work):
-    """The pose of the frame of row m into work.T, with the axes and origins of the joints before it."""
-    for k in range(rows.last[m]):
-        work.q[k] = q[rows.joints[m, k]]
+    """Writes the pose of the frame of row m to work.T, and the joint axes and origins of its chain."""
+    for k in range(rows.chain_length[m]):
+        work.q[k] = q[rows.chain[m, k]]
     forward(
-        work.q, rows.offsets[m], rows.tool[m], rows.kinds[m], rows.last[m], work.T, work.axes, work.origins
+        work.q,
+        rows.offsets[m],
+        rows.T_joint_frame[m],
+        rows.joint_kinds[m],
+        rows.chain_length[m],
+        work.T,
+        work.axes,
+        work.origins,
     )
 
 
 @njit(cache=True)
 def _in_box(rows, m, T, r):
-    """Coordinate r of the frame's origin in the box."""
-    place, out = rows.place[m], 0.0
+    """Coordinate r of the frame's origin in the frame of the box."""
+    place, out = rows.reference_pose[m], 0.0
     for i in range(3):
         out += place[i, r] * (T[i, 3] - place[i, 3])
     return out
@@ -140,7 +152,7 @@ def _in_box(rows, m, T, r):
 
 @njit(cache=True)
 def _cone(rows, m, T, normal):
-    """The angle of a CONE; into normal[3] the direction in which to turn the axis, of length sin(angle)."""
+    """The angle of a CONE; writes to normal[3] the rotation axis that reduces it, of length sin(angle)."""
     a, b = rows.a[m], rows.b[m]
     x = T[0, 0] * a[0] + T[0, 1] * a[1] + T[0, 2] * a[2]
     y = T[1, 0] * a[0] + T[1, 1] * a[1] + T[1, 2] * a[2]
@@ -152,17 +164,17 @@ def _cone(rows, m, T, normal):
 
 @njit(cache=True)
 def _turn(rows, m, T, target, error):
-    """The angle of a TURN; into error[3:6] the rotation vector to the orientation that belongs there."""
-    place, share = rows.place[m], 0.0
+    """The angle of a TURN; writes to error[3:6] the rotation vector to the interpolated orientation."""
+    place, fraction = rows.reference_pose[m], 0.0
     for i in range(3):
-        share += rows.b[m, i] * (T[i, 3] - place[i, 3])
-    share = min(max(share, 0.0), 1.0)
-    x, y, z = share * rows.a[m, 0], share * rows.a[m, 1], share * rows.a[m, 2]
+        fraction += rows.b[m, i] * (T[i, 3] - place[i, 3])
+    fraction = min(max(fraction, 0.0), 1.0)
+    x, y, z = fraction * rows.a[m, 0], fraction * rows.a[m, 1], fraction * rows.a[m, 2]
     angle = np.sqrt(x * x + y * y + z * z)
     c, s, v = np.cos(angle), 1.0, 0.5
     if angle > 1e-9:
         s, v = np.sin(angle) / angle, (1 - c) / (angle * angle)
-    for k in range(3):  # Rodrigues, times the orientation at the start
+    for k in range(3):  # Rodrigues' formula, times the orientation at the start
         p, q, r = place[0, k], place[1, k], place[2, k]
         along = v * (x * p + y * q + z * r)
         target[0, k] = c * p + s * (y * r - z * q) + along * x
@@ -176,13 +188,13 @@ def _turn(rows, m, T, target, error):
 @njit(cache=True)
 def _value(rows, m, work):
     """The value of row m at the pose in work.T."""
-    if rows.what[m] == CONE:
+    if rows.row_kind[m] == CONE:
         return _cone(rows, m, work.T, work.error)
-    if rows.what[m] == TURN:
+    if rows.row_kind[m] == TURN:
         return _turn(rows, m, work.T, work.target, work.error)
     outside, deepest = 0.0, -np.inf
     for r in range(3):
-        d = abs(_in_box(rows, m, work.T, r)) - rows.half[m, r]
+        d = abs(_in_box(rows, m, work.T, r)) - rows.half_size[m, r]
         outside += max(d, 0.0) ** 2
         deepest = max(deepest, d)
     return np.sqrt(outside) + min(deepest, 0.0)
@@ -190,14 +202,14 @@ def _value(rows, m, work):
 
 @njit(cache=True)
 def evaluate(rows, q, end, work):
-    """Values at a configuration into work.values[end], and the distances from the joints' axes to the frame's
-    origin into work.levers[end]."""
-    for m in range(len(rows.what)):
-        if not rows.again[m]:
+    """Writes the values at a configuration to work.values[end], and the distances from the joint axes to the
+    frame's origin to work.levers[end]."""
+    for m in range(len(rows.row_kind)):
+        if not rows.same_frame[m]:
             _pose(rows, m, q, work)
         work.values[end, m] = _value(rows, m, work)
-        if rows.what[m] != CONE:
-            for k in range(rows.last[m]):
+        if rows.row_kind[m] != CONE:
+            for k in range(rows.chain_length[m]):
                 velocity = work.y
                 velocity[0] = velocity[1] = velocity[2] = 0.0
                 _add_velocity(rows, m, k, 1.0, work, velocity)
@@ -208,7 +220,7 @@ def evaluate(rows, q, end, work):
 def values(rows, q):
     """Values of the rows [n, m] at configurations [n, dof]."""
     work = make_work(rows)
-    out = np.empty((len(q), len(rows.what)))
+    out = np.empty((len(q), len(rows.row_kind)))
     for i in range(len(q)):
         evaluate(rows, q[i], 0, work)
         out[i] = work.values[0]
@@ -223,17 +235,17 @@ def speeds(rows, m, q, rates):
     for i in range(len(q)):
         _pose(rows, m, q[i], work)
         total = np.zeros(3)
-        for k in range(rows.last[m]):
-            _add_velocity(rows, m, k, rates[i, rows.joints[m, k]], work, total)
+        for k in range(rows.chain_length[m]):
+            _add_velocity(rows, m, k, rates[i, rows.chain[m, k]], work, total)
         out[i] = np.sqrt((total * total).sum())
     return out
 
 
 @njit(cache=True)
 def _add_velocity(rows, m, k, rate, work, total):
-    """Adds the velocity of the origin of the frame of row m by joint k of its chain."""
+    """Adds to `total` the velocity of the frame's origin of row m that joint k of its chain causes."""
     a, b, c = work.axes[k, 0], work.axes[k, 1], work.axes[k, 2]
-    if rows.kinds[m, k] == PRISMATIC:
+    if rows.joint_kinds[m, k] == PRISMATIC:
         x, y, z = a, b, c
     else:
         dx, dy = work.T[0, 3] - work.origins[k, 0], work.T[1, 3] - work.origins[k, 1]
@@ -245,35 +257,37 @@ def _add_velocity(rows, m, k, rate, work, total):
 
 
 @njit(cache=True)
-def _unproved(rows, limits, a, b, share, first, second, work):
-    """The first row that the share of the motion from a to b between two ends, evaluated as `first` and
-    `second`, is not proved to keep; -1 if there is none."""
-    for m in range(len(rows.what)):
+def _unproved(rows, limits, a, b, fraction, first, second, work):
+    """The first row that is not proved along a piece of the motion from a to b; -1 if all are proved.
+
+    The piece is `fraction` of the motion, and its ends are evaluated as `first` and `second`.
+    """
+    for m in range(len(rows.row_kind)):
         u, v = work.values[first, m], work.values[second, m]
         turn = 0.0
-        for k in range(rows.last[m]):
-            if rows.kinds[m, k] != PRISMATIC:
-                j = rows.joints[m, k]
-                turn += share * abs(b[j] - a[j])
-        if rows.what[m] == CONE:
+        for k in range(rows.chain_length[m]):
+            if rows.joint_kinds[m, k] != PRISMATIC:
+                j = rows.chain[m, k]
+                turn += fraction * abs(b[j] - a[j])
+        if rows.row_kind[m] == CONE:
             if limits[m] < np.pi and min(np.cos(u), np.cos(v)) - turn * turn / 8 < np.cos(limits[m]):
                 return m
             continue
         beyond, before, travel, bend = 0.0, 0.0, 0.0, 0.0
-        for k in range(rows.last[m]):
-            j = rows.joints[m, k]
-            beyond += rows.reach[m, k] * share * abs(b[j] - a[j])
-        for k in range(rows.last[m]):
-            j = rows.joints[m, k]
-            d = share * abs(b[j] - a[j])
-            beyond -= rows.reach[m, k] * d
+        for k in range(rows.chain_length[m]):
+            j = rows.chain[m, k]
+            beyond += rows.lever_bounds[m, k] * fraction * abs(b[j] - a[j])
+        for k in range(rows.chain_length[m]):
+            j = rows.chain[m, k]
+            d = fraction * abs(b[j] - a[j])
+            beyond -= rows.lever_bounds[m, k] * d
             lever = max(work.levers[first, m, k], work.levers[second, m, k])
-            if rows.kinds[m, k] != PRISMATIC:
+            if rows.joint_kinds[m, k] != PRISMATIC:
                 lever += 0.5 * max(beyond, 0.0)
             travel += lever * d
             bend += lever * d * (d + 2 * before)
             before += d
-        if rows.what[m] == DISTANCE:
+        if rows.row_kind[m] == DISTANCE:
             if max(u, v) + bend / 8 > limits[m]:
                 return m
             continue
@@ -285,93 +299,100 @@ def _unproved(rows, limits, a, b, share, first, second, work):
 
 
 @njit(cache=True)
-def proved(rows, limits, a, b, least, work):
-    """Up to which share the straight motion from a to b is proved to keep the limits, and the row that it is
-    not proved to keep there, -1 for none. Pieces are split down to the share `least`."""
-    done, share, end = 0.0, 1.0, 0
+def proved(rows, limits, a, b, min_fraction, work):
+    """The fraction of the straight motion from a to b up to which the limits are proved, and the row that is
+    not proved there; 1.0 and -1 if all are proved. Pieces are split down to the fraction `min_fraction`."""
+    done, fraction, end = 0.0, 1.0, 0
     evaluate(rows, a, 0, work)
     while done < 1.0:
-        share = min(share, 1.0 - done)
+        fraction = min(fraction, 1.0 - done)
         for k in range(len(a)):
-            work.trial[k] = a[k] + (done + share) * (b[k] - a[k])
+            work.trial[k] = a[k] + (done + fraction) * (b[k] - a[k])
         evaluate(rows, work.trial, 1 - end, work)
-        row = _unproved(rows, limits, a, b, share, end, 1 - end, work)
+        row = _unproved(rows, limits, a, b, fraction, end, 1 - end, work)
         if row < 0:
-            done, end, share = done + share, 1 - end, 2 * share
-        elif share <= least:
+            done, end, fraction = done + fraction, 1 - end, 2 * fraction
+        elif fraction <= min_fraction:
             return done, row
         else:
-            share *= 0.5
+            fraction *= 0.5
     return 1.0, -1
 
 
 @njit(cache=True)
-def first_unproved(rows, limits, q, least):
-    """The segment of the motion through q[n, dof], the share of it and the row at which the limits are first
-    not proved to be kept; row -1 if they are all along."""
+def first_unproved(rows, limits, q, min_fraction):
+    """Where the limits are first not proved along the motion through q[n, dof]: the segment, the fraction of
+    it, and the row. The row is -1 if all are proved."""
     work = make_work(rows)
     evaluate(rows, q[0], 0, work)
-    for m in range(len(rows.what)):
+    for m in range(len(rows.row_kind)):
         if work.values[0, m] > limits[m]:
             return 0, 0.0, m
     for i in range(len(q) - 1):
-        share, row = proved(rows, limits, q[i], q[i + 1], least, work)
+        fraction, row = proved(rows, limits, q[i], q[i + 1], min_fraction, work)
         if row >= 0:
-            return i, share, row
+            return i, fraction, row
     return len(q) - 1, 0.0, -1
 
 
 @njit(cache=True)
 def _residuals(rows, limits, q, work):
-    """Of the rows beyond their limits, what is left to where projection goes, into work.e, and its Jacobian
-    into work.J; returns their number."""
+    """The number of residuals of the rows that exceed their limits.
+
+    Writes to work.e the residuals to the values that projection aims for, and to work.J their Jacobian.
+    """
     count, dof = 0, len(q)
-    for m in range(len(rows.what)):
-        if not rows.again[m]:
+    for m in range(len(rows.row_kind)):
+        if not rows.same_frame[m]:
             _pose(rows, m, q, work)
         value = _value(rows, m, work)
         if value <= limits[m]:
             continue
-        lines = 1 if rows.what[m] == CONE else 3
-        keep = 1.0 - rows.inner[m] / value if value > 0 else 1.0
+        lines = 1 if rows.row_kind[m] == CONE else 3
+        keep = 1.0 - rows.inner_limit[m] / value if value > 0 else 1.0
         sine = np.sqrt(work.error[0] ** 2 + work.error[1] ** 2 + work.error[2] ** 2)
         for r in range(lines):
-            if rows.what[m] == DISTANCE:
+            if rows.row_kind[m] == DISTANCE:
                 x = _in_box(rows, m, work.T, r)
-                off = min(max(x, -rows.core[m, r]), rows.core[m, r]) - x
+                off = min(max(x, -rows.inner_half_size[m, r]), rows.inner_half_size[m, r]) - x
                 if off == 0.0:
                     continue
                 work.e[count] = off * keep
-            elif rows.what[m] == CONE:
-                work.e[count] = ANGLE_WEIGHT * (value - rows.inner[m])
+            elif rows.row_kind[m] == CONE:
+                work.e[count] = ANGLE_WEIGHT * (value - rows.inner_limit[m])
             else:
                 work.e[count] = ANGLE_WEIGHT * work.error[3 + r] * keep
             for j in range(dof):
                 work.J[count, j] = 0.0
-            for k in range(rows.last[m]):
+            for k in range(rows.chain_length[m]):
                 entry = 0.0
-                if rows.what[m] == DISTANCE:
+                if rows.row_kind[m] == DISTANCE:
                     moved = work.y
                     moved[0] = moved[1] = moved[2] = 0.0
                     _add_velocity(rows, m, k, 1.0, work, moved)
                     for i in range(3):
-                        entry += rows.place[m, i, r] * moved[i]
-                elif rows.kinds[m, k] != PRISMATIC and rows.what[m] == TURN:
+                        entry += rows.reference_pose[m, i, r] * moved[i]
+                elif rows.joint_kinds[m, k] != PRISMATIC and rows.row_kind[m] == TURN:
                     entry = ANGLE_WEIGHT * work.axes[k, r]
-                elif rows.kinds[m, k] != PRISMATIC and sine > 1e-9:
+                elif rows.joint_kinds[m, k] != PRISMATIC and sine > 1e-9:
                     for i in range(3):
                         entry += ANGLE_WEIGHT * work.axes[k, i] * work.error[i] / sine
-                elif rows.kinds[m, k] != PRISMATIC:  # opposite: any way to turn
+                elif (
+                    rows.joint_kinds[m, k] != PRISMATIC
+                ):  # axis and direction are opposite: any rotation axis serves
                     entry = ANGLE_WEIGHT * work.axes[k, 0]
-                work.J[count, rows.joints[m, k]] = entry
+                work.J[count, rows.chain[m, k]] = entry
             count += 1
     return count
 
 
 @njit(cache=True)
 def step(rows, limits, q, most, work):
-    """Moves q by a damped Newton step, at most so long [rad], towards where it keeps the limits, within the
-    joints' limits; how many residuals there were, 0 for none and so no step, -1 where no step helps."""
+    """Moves q by one damped Newton step towards the limits, within the joint limits.
+
+    most: longest step [rad]. Returns the number of residuals before the step: 0 if q satisfied all limits and
+    was not moved, -1 if no step helps.
+    """
     dof = len(q)
     count = _residuals(rows, limits, q, work)
     if count == 0:
@@ -381,7 +402,7 @@ def step(rows, limits, q, most, work):
     again = False
     for k in range(dof):
         low, high = q[k] <= rows.lower[k], q[k] >= rows.upper[k]
-        if not rows.endless[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
+        if not rows.continuous[k] and ((low and work.step[k] < 0.0) or (high and work.step[k] > 0.0)):
             work.held[k] = again = True
     if again:
         damped_step(work.J, work.e, DAMPING, count, dof, work.held, work.A, work.y, work.step)
@@ -391,17 +412,19 @@ def step(rows, limits, q, most, work):
         return -1
     for k in range(dof):
         q[k] += scale * work.step[k]
-        if not rows.endless[k]:
+        if not rows.continuous[k]:
             q[k] = min(max(q[k], rows.lower[k]), rows.upper[k])
     return count
 
 
 @njit(cache=True)
 def project(rows, limits, q, work):
-    """Moves q to a configuration near by that keeps the limits, by damped Newton steps within the joints'
-    limits; whether it got there."""
-    for _ in range(ITERATIONS):
-        left = step(rows, limits, q, MOST_STEP, work)
+    """Projects q in place onto the limits by damped Newton steps, within the joint limits.
+
+    Returns whether q satisfies the limits.
+    """
+    for _ in range(MAX_ITERATIONS):
+        left = step(rows, limits, q, MAX_STEP, work)
         if left <= 0:
             return left == 0
     return _residuals(rows, limits, q, work) == 0

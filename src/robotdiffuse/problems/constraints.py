@@ -1,7 +1,7 @@
-"""Path constraints: what holds all along a motion, each of one frame of the arm.
+"""Path constraints: conditions on the pose of a link that hold along the whole motion.
 
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
-Places and directions are in the frame of the base.
+Positions and directions are in the frame of the base.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -16,33 +16,33 @@ from numpy.typing import ArrayLike
 from robotdiffuse.core.bounds import MAX_COORDINATE, Value, numbers, read_only, rigid_transform, vector
 from robotdiffuse.core.errors import InputError, shown
 
-LEAST_TOLERANCE, LEAST_ANGLE = 1e-4, 1e-3
-"""The tightest constraints [m], [rad]."""
-SIZES = {
-    "angle": (LEAST_ANGLE, np.pi, "rad"),
-    "tolerance": (LEAST_TOLERANCE, MAX_COORDINATE, "m"),
+MIN_TOLERANCE, MIN_ANGLE = 1e-4, 1e-3
+"""Tolerances of the tightest constraints [m], [rad]."""
+SCALAR_BOUNDS = {
+    "angle": (MIN_ANGLE, np.pi, "rad"),
+    "tolerance": (MIN_TOLERANCE, MAX_COORDINATE, "m"),
     "speed": (1e-4, MAX_COORDINATE, "m/s"),
 }
-"""Fields that are sizes: least, greatest, unit."""
-DIRECTIONS = ("axis", "direction", "normal")
-"""Fields whose length does not matter."""
-AROUND = read_only(np.eye(4))
+"""Scalar fields: minimum, maximum, unit."""
+DIRECTION_FIELDS = ("axis", "direction", "normal")
+"""Vector fields that are normalised."""
+BASE_FRAME = read_only(np.eye(4))
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class AxisCone(Value):
-    """An axis of a frame stays within an angle of a direction: a cup upright."""
+    """An axis of a link stays within an angle of a direction, e.g. to keep a cup upright."""
 
     kind: ClassVar[str] = "axis_cone"
     frame: str
     """Name of the link."""
     axis: Float[ndarray, "3"]
-    """In the link's frame; its length does not matter."""
+    """In the link's frame, of any length."""
     direction: Float[ndarray, "3"]
-    """In the base's frame; neither does this one's."""
+    """In the base's frame, of any length."""
     angle: float
-    """The largest angle between them [rad], up to pi."""
+    """Maximum angle between the axis and the direction [rad], up to pi."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -52,14 +52,14 @@ class AxisCone(Value):
         def __init__(self, frame: str, axis: ArrayLike, direction: ArrayLike, angle: float) -> None: ...
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "AxisCone":
-        """After a rigid motion of the base's surroundings."""
+        """The constraint after the rigid motion T."""
         return replace(self, direction=T[:3, :3] @ self.direction)
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class PositionBox(Value):
-    """The origin of a frame stays in a box."""
+    """The origin of a link stays in a box."""
 
     kind: ClassVar[str] = "position_box"
     frame: str
@@ -69,16 +69,20 @@ class PositionBox(Value):
     high: Float[ndarray, "3"]
     """Upper corner [m]."""
     T_base_box: Float[ndarray, "4 4"] | None = None
-    """None: the frame of the base."""
+    """Pose of the box; None: the frame of the base."""
 
     def __post_init__(self) -> None:
         _check(self)
-        if not (self.high - self.low >= 2 * LEAST_TOLERANCE).all():
+        if not (self.high - self.low >= 2 * MIN_TOLERANCE).all():
             raise InputError(
-                f"{self.kind}.low is {shown(self.low)} and its high {shown(self.high)}; each high must be "
-                f"above its low by at least {2 * LEAST_TOLERANCE:g} m"
+                f"{self.kind}.low is {shown(self.low)} and high {shown(self.high)}; each high must be "
+                f"above its low by at least {2 * MIN_TOLERANCE:g} m"
             )
-        T = AROUND if self.T_base_box is None else rigid_transform(f"{self.kind}.T_base_box", self.T_base_box)
+        T = (
+            BASE_FRAME
+            if self.T_base_box is None
+            else rigid_transform(f"{self.kind}.T_base_box", self.T_base_box)
+        )
         object.__setattr__(self, "T_base_box", read_only(T))
 
     if TYPE_CHECKING:
@@ -88,24 +92,24 @@ class PositionBox(Value):
         ) -> None: ...
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "PositionBox":
-        """After a rigid motion of the base's surroundings."""
+        """The constraint after the rigid motion T."""
         return replace(self, T_base_box=T @ self.T_base_box)
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class OnPlane(Value):
-    """The origin of a frame stays on a plane."""
+    """The origin of a link stays on a plane."""
 
     kind: ClassVar[str] = "on_plane"
     frame: str
     """Name of the link."""
     point: Float[ndarray, "3"]
-    """Of the plane [m]."""
+    """A point of the plane [m]."""
     normal: Float[ndarray, "3"]
-    """Its length does not matter."""
+    """Of any length."""
     tolerance: float
-    """Largest distance from it, on either side [m]."""
+    """Maximum distance from the plane, on either side [m]."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -115,24 +119,24 @@ class OnPlane(Value):
         def __init__(self, frame: str, point: ArrayLike, normal: ArrayLike, tolerance: float) -> None: ...
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "OnPlane":
-        """After a rigid motion of the base's surroundings."""
+        """The constraint after the rigid motion T."""
         return replace(self, point=T[:3, :3] @ self.point + T[:3, 3], normal=T[:3, :3] @ self.normal)
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class OnLine(Value):
-    """The origin of a frame stays on a line without ends."""
+    """The origin of a link stays on an infinite line."""
 
     kind: ClassVar[str] = "on_line"
     frame: str
     """Name of the link."""
     point: Float[ndarray, "3"]
-    """Of the line [m]."""
+    """A point of the line [m]."""
     direction: Float[ndarray, "3"]
-    """Its length does not matter."""
+    """Of any length."""
     tolerance: float
-    """Largest distance from it [m]."""
+    """Maximum distance from the line [m]."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -142,29 +146,29 @@ class OnLine(Value):
         def __init__(self, frame: str, point: ArrayLike, direction: ArrayLike, tolerance: float) -> None: ...
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "OnLine":
-        """After a rigid motion of the base's surroundings."""
+        """The constraint after the rigid motion T."""
         return replace(self, point=T[:3, :3] @ self.point + T[:3, 3], direction=T[:3, :3] @ self.direction)
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class CartesianLine(Value):
-    """The origin of a frame moves on the straight segment from where it starts to where the goal has it.
+    """The origin of a link moves on the straight segment from its start position to its goal position.
 
-    So the goal must say one pose of the frame: one configuration, or a pose without tolerances of a link that
-    moves with it. The orientation follows the shortest turn from that of the start to that of the goal, by
-    the share of the segment.
+    The goal must therefore determine the pose of the link: one configuration, or a pose without tolerances of
+    a link that is rigidly connected to it. The orientation follows the shortest rotation from start to goal,
+    in proportion to the fraction of the segment travelled.
     """
 
     kind: ClassVar[str] = "cartesian_line"
     frame: str
     """Name of the link."""
     tolerance: float = 1e-3
-    """Largest distance from the segment [m]."""
+    """Maximum distance from the segment [m]."""
     angle: float | None = 0.05
-    """Largest angle from the orientation that belongs to the place [rad]; None: any orientation."""
+    """Maximum angle from the interpolated orientation [rad]; None: any orientation."""
     speed: float | None = None
-    """Most speed of the frame's origin [m/s]; None: as fast as the joints can."""
+    """Maximum speed of the link's origin [m/s]; None: limited by the joints alone."""
 
     def __post_init__(self) -> None:
         _check(self)
@@ -180,7 +184,7 @@ class CartesianLine(Value):
         ) -> None: ...
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "CartesianLine":
-        """Itself: start and goal move."""
+        """The constraint itself, which start and goal determine."""
         return self
 
 
@@ -191,25 +195,25 @@ CONSTRAINTS: dict[str, type[Constraint]] = {
 
 
 def _check(constraint: Constraint) -> None:
-    """Each field by its name: the frame, vectors, directions of any length, and sizes within bounds."""
+    """Checks each field by its name: link, vectors, directions, and scalars within their bounds."""
     for field in fields(constraint):
         name = field.name
         given: Any = getattr(constraint, name)
         where = f"{constraint.kind}.{name}"
         if name == "frame" and not isinstance(given, str):
             raise InputError(f"{where} is {shown(given)}; it must be the name of a link")
-        if name in ("point", "low", "high", *DIRECTIONS):
+        if name in ("point", "low", "high", *DIRECTION_FIELDS):
             row = vector(constraint.kind, name, given, 3)
             length = float(np.linalg.norm(row))
-            if name in DIRECTIONS and length < 1e-6:
+            if name in DIRECTION_FIELDS and length < 1e-6:
                 raise InputError(f"{where} is {shown(row)}; it must not be zero")
-            given = row if name not in DIRECTIONS or abs(length - 1) < 1e-15 else row / length
-        if name in SIZES and not (given is None and NoneType in get_args(field.type)):
-            least, most, unit = SIZES[name]
+            given = row if name not in DIRECTION_FIELDS or abs(length - 1) < 1e-15 else row / length
+        if name in SCALAR_BOUNDS and not (given is None and NoneType in get_args(field.type)):
+            low, high, unit = SCALAR_BOUNDS[name]
             value = numbers(given)
-            if value is None or value.ndim != 0 or not least <= value <= most:
+            if value is None or value.ndim != 0 or not low <= value <= high:
                 raise InputError(
-                    f"{where} is {shown(given)}; it must be a number from {least:g} to {most:.6g} [{unit}]"
+                    f"{where} is {shown(given)}; it must be a number from {low:g} to {high:.6g} [{unit}]"
                 )
             given = float(value)
         object.__setattr__(constraint, name, read_only(given))

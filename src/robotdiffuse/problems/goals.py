@@ -1,5 +1,4 @@
-"""Where a motion is to end: configurations, poses of links with what they may be off, poses of several
-links at once, or any of several.
+"""Goals: configurations, poses of one or several links with tolerances, or any of several goals.
 
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
 """
@@ -17,8 +16,9 @@ from robotdiffuse.core.bounds import Value, numbers, rigid_transform
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.transforms import rotation_from_rpy, transform
 
-INWARDS = 1e-3
-"""Poses are drawn within tolerances less this share: inverse kinematics has an error of its own."""
+SAMPLING_MARGIN = 1e-3
+"""Fraction by which tolerances are reduced for sampling, because inverse kinematics has an error of its
+own."""
 
 
 @no_type_check
@@ -45,20 +45,23 @@ class JointGoal(Value):
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class PoseGoal(Value):
-    """A pose of a link. Without tolerances, the path must end within 1 cm and 15 degrees of it (the paper's).
+    """A pose of a link. Without tolerances, the path must end within 1 cm and 15 degrees of it, as in the
+    paper.
 
-    With them, the pose where the link ends, seen from the goal, has xyz and rpy within plus and minus these:
-    a box along the goal's axes, and roll, pitch and yaw about its x, y and z in the order of URDFs, so that a
-    yaw of pi is any turn about z. Any pose within is as good.
+    With tolerances, the final pose of the link, in the frame of the goal, must have xyz and rpy within plus
+    and minus the tolerances. xyz is a box along the goal's axes; rpy are roll, pitch and yaw about its x, y
+    and z in the order of URDFs, so that a yaw tolerance of pi allows any turn about z. All poses within the
+    tolerances are equally good.
     """
 
     frame: str
     """Name of the link."""
     T_base_frame: Float[ndarray, "4 4"]
     xyz_tolerance: Float[ndarray, "3"] | None = None
-    """Along the axes of the goal [m]; None: the very position, validated to 1 cm."""
+    """Along the axes of the goal [m]; None: the exact position, validated to 1 cm."""
     rpy_tolerance: Float[ndarray, "3"] | None = None
-    """About them [rad], pi for any angle; None: the very orientation, validated to 15 degrees."""
+    """About the axes of the goal [rad], pi for any angle; None: the exact orientation, validated to 15
+    degrees."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.frame, str):
@@ -87,23 +90,23 @@ class PoseGoal(Value):
 
     @property
     def tolerant(self) -> bool:
-        """Whether more than one pose will do."""
+        """Whether more than one pose reaches the goal."""
         return any(t is not None and t.max() > 0 for t in (self.xyz_tolerance, self.rpy_tolerance))
 
     def draw(self, rng: np.random.Generator) -> Float[ndarray, "4 4"]:
-        """T_base_frame of a pose within the tolerances, uniformly by each of the six."""
-        free = np.zeros((2, 3))
+        """A random T_base_frame within the tolerances, uniform in each of the six coordinates."""
+        ranges = np.zeros((2, 3))
         for i, tolerance in enumerate((self.xyz_tolerance, self.rpy_tolerance)):
             if tolerance is not None:
-                free[i] = np.minimum(tolerance, np.inf if i == 0 else np.pi) * (1 - INWARDS)
-        xyz, rpy = rng.uniform(-1.0, 1.0, (2, 3)) * free
+                ranges[i] = np.minimum(tolerance, np.inf if i == 0 else np.pi) * (1 - SAMPLING_MARGIN)
+        xyz, rpy = rng.uniform(-1.0, 1.0, (2, 3)) * ranges
         return self.T_base_frame @ transform(xyz, rotation_from_rpy(*rpy))
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class PosesGoal(Value):
-    """A pose for each of several links at once, for each hand of two arms say, each with its tolerances."""
+    """A pose for each of several links at once, e.g. for both hands of two arms, each with its tolerances."""
 
     poses: tuple[PoseGoal, ...]
 
@@ -123,14 +126,14 @@ class PosesGoal(Value):
 
     @property
     def tolerant(self) -> bool:
-        """Whether more than one pose of any link will do."""
+        """Whether any link has more than one pose that reaches the goal."""
         return any(pose.tolerant for pose in self.poses)
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class AnyGoal(Value):
-    """Any of several goals."""
+    """Several goals, any of which may be reached."""
 
     goals: "tuple[OneGoal, ...]"
 
@@ -149,14 +152,14 @@ Goal = OneGoal | AnyGoal
 
 
 def poses_of(goal: Goal) -> tuple[PoseGoal, ...]:
-    """The poses that a goal asks for together; none of configurations, or of any of several goals."""
+    """The poses that must be reached together; empty for configurations and for AnyGoal."""
     if isinstance(goal, PosesGoal):
         return goal.poses
     return (goal,) if isinstance(goal, PoseGoal) else ()
 
 
 def moved_goal(goal: Any, T: Float[ndarray, "4 4"]) -> Any:
-    """The goal after a rigid motion: poses move, configurations do not."""
+    """The goal after the rigid motion T: poses are moved, configurations are not."""
     if isinstance(goal, AnyGoal):
         return AnyGoal(tuple(moved_goal(one, T) for one in goal.goals))
     if isinstance(goal, PosesGoal):

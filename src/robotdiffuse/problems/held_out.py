@@ -1,8 +1,9 @@
-"""Problems to be validated by: those of the families by number, none of them in any data set; kept in files.
+"""Held-out problems for evaluation: numbered problems of the families that are in no data set, and their
+files.
 
-One rule says what a problem is worth: it is trivial if the straight line from the start to a goal
-configuration passes the validator, and hard if it is not and a search finds a path. One form of file keeps
-problems with what is known of them: JSON lines, which every benchmark reads.
+A problem is trivial if the straight line from the start to a goal configuration passes the validator. It is
+hard if it is not trivial and a search solves it. Problems are stored with these results as JSON lines, which
+every benchmark reads.
 """
 
 import itertools
@@ -24,94 +25,97 @@ from robotdiffuse.problems.problem import JointGoal, Problem
 from robotdiffuse.robots import load_robot
 
 SEED = 20261121
-"""Of the held-out problems; data are drawn from other seed sequences."""
+"""Seed of the held-out problems; data sets use other seed sequences."""
 
 Validator = Callable[[Problem, Path], bool]
 """Whether a path solves a problem."""
 Search = Callable[[Problem], float | None]
-"""The length of the shortest path that a search finds [rad]; None if it finds none."""
+"""Length of the shortest path that a search finds [rad]; None if it finds none."""
 Report = Callable[[str], None]
+"""Receives progress messages."""
 REPORT_EVERY = 20
+"""Problems between two progress messages."""
 
 
 def goal_of(problem: Problem) -> Float[ndarray, "dof"]:
-    """The goal configuration."""
+    """The first goal configuration of a problem whose goal is a JointGoal."""
     assert isinstance(problem.goal, JointGoal)
     return problem.goal.positions[0]
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """A problem to be validated by, and what is known of it."""
+    """A problem of an evaluation, with what is known about its solutions."""
 
     name: str
-    """Its own in the set: rop/17 is number 17 of a family."""
+    """Unique name in the problem set; rop/17 is number 17 of the family rop."""
     family: str
-    """What bars and tables group by: the random family, or the folder or file it comes from."""
+    """Group in plots and tables: the random family, or the folder or file of the problem."""
     problem: Problem
     trivial: bool
-    """The straight line to a goal configuration passes the validator."""
+    """Whether the straight line to a goal configuration passes the validator."""
     reference: float | None = None
-    """Length of the shortest path that is known [rad]; None if none was looked for, or none was found."""
+    """Length of the shortest known path [rad]; None if no search ran, or none found a path."""
     problem_set: str = ""
-    """As asked for: the name of a family, or the stem of a file or folder."""
+    """Name of the problem set: that of a family, or the stem of a file or folder."""
 
     @property
     def key(self) -> tuple[str, str]:
+        """Unique among several problem sets."""
         return self.problem_set, self.name
 
     @property
     def hard(self) -> bool:
-        """Not trivial, and a search solves it."""
+        """Whether the problem is not trivial and a search solves it."""
         return not self.trivial and self.reference is not None
 
 
 def held_out_problem(family: str, number: int) -> Problem:
-    """Each number is a problem for the Panda, trivial and unsolvable ones among them."""
-    place = list(FAMILIES).index(family)
-    rng = np.random.default_rng([SEED, number] if place == 0 else [SEED, 10 + place, number])
-    if place > 1:
-        rng.random()  # as when the first figures were reported
+    """The Panda's problem of this number. Some problems are trivial, others unsolvable."""
+    index = list(FAMILIES).index(family)
+    rng = np.random.default_rng([SEED, number] if index == 0 else [SEED, 10 + index, number])
+    if index > 1:
+        rng.random()  # keeps the problems of the first published figures
     robot = load_robot("panda")
     return load_family(family).draw(robot, rng).problem(robot)
 
 
 def line_length(problem: Problem, validator: Validator) -> float | None:
-    """Of the shortest straight line from the start to a goal configuration that passes the validator [rad]; None
-    if none of them does."""
+    """Length of the shortest straight line from the start to a goal configuration that passes the validator
+    [rad]; None if none does."""
     goals = problem.goal.positions if isinstance(problem.goal, JointGoal) else ()
     lines = [Path(problem.robot.joint_names, np.stack([problem.start, goal])) for goal in goals]
     return min((line.length for line in lines if validator(problem, line)), default=None)
 
 
-FIELDS = {"name", "family", "trivial", "searched", "reference", "problem"}
-"""Of a line: what a case has, whether a search has looked for a reference, and the problem as in its file."""
+ROW_FIELDS = {"name", "family", "trivial", "searched", "reference", "problem"}
+"""Fields of a line: those of a case, whether a search for the reference has run, and the problem's record."""
 
 
 class CaseFile:
-    """Cases by name, in the order that they were added in; kept in a file or, without one, in memory."""
+    """Cases by name, in the order of their addition, stored in a file or, without one, in memory."""
 
     def __init__(self, file: FilePath | None) -> None:
-        """Raises InputError, naming file and line, for a damaged file."""
+        """Reads the file. Raises InputError, which names file and line, if it is damaged."""
         self._lines = JsonLines(file)
         self._rows: dict[str, dict[str, Any]] = {}
         for number, row in enumerate(self._lines.rows, start=1):
-            if row.keys() != FIELDS:
+            if row.keys() != ROW_FIELDS:
                 raise InputError(
-                    f"{file}, line {number} has {', '.join(row)} in place of {', '.join(FIELDS)}; remove the "
-                    "file, and its problems are drawn again"
+                    f"{file}, line {number} has {', '.join(row)} instead of {', '.join(ROW_FIELDS)}; remove "
+                    "the file to generate its problems again"
                 )
-            self._rows[row["name"]] = row  # a later line on the same problem knows more
+            self._rows[row["name"]] = row  # a later line on the same problem contains more
 
     def __len__(self) -> int:
         return len(self._rows)
 
     def cases(self, hard: bool = False) -> list[Case]:
-        """All that are known; `hard`: known to be that."""
+        """All cases, or those that are known to be hard."""
         return [_case(row) for row in self._rows.values() if not hard or _is_hard(row)]
 
     def fill(self, cases: list[Case]) -> None:
-        """Put these in place of what is there, all or none. Raises InputError if two have the same name."""
+        """Replaces all cases atomically. Raises InputError if two have the same name."""
         names = [case.name for case in cases]
         twice = [name for name in names if names.count(name) > 1]
         if twice:
@@ -127,9 +131,9 @@ class CaseFile:
         search: Search | None = None,
         report: Report = lambda text: None,
     ) -> list[Case]:
-        """The first `count` held-out problems of a family; with a search, of those that are hard.
+        """The first `count` held-out problems of a family; with a search, the first hard ones.
 
-        What is not known yet is drawn, validated, searched and added.
+        Problems that are not in the file yet are generated, validated, searched and added.
         """
         found: list[dict[str, Any]] = []
         numbers = itertools.count()

@@ -1,13 +1,13 @@
-"""Problem: a robot, a scene, a start and a goal; and what cameras saw of the scene.
+"""Problem: a robot, a scene, a start and a goal, and optionally depth views of the scene.
 
 As with shapes, the constructors check their arguments themselves: see `no_type_check` in scenes/shapes.py.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from dataclasses import replace as dataclass_replace
 from pathlib import PurePath
-from typing import TYPE_CHECKING, ClassVar, no_type_check
+from typing import TYPE_CHECKING, Any, ClassVar, TypedDict, Unpack, no_type_check
 
 import numpy as np
 from jaxtyping import Float
@@ -31,127 +31,119 @@ from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 
 LIMIT_SLACK = 1e-5
-"""Configurations that exceed a joint limit by no more than this are clamped, with a note [rad]."""
-LEAST_BLEND, MOST_BLEND = 1e-3, 10.0
-"""Of `Problem.blend`, but for 0 [rad] or [m]."""
+"""Configurations beyond a joint limit by at most this are clamped to it, with a note [rad] or [m]."""
+MIN_BLEND, MAX_BLEND = 1e-3, 10.0
+"""Bounds of a `Problem.blend` that is not 0 [rad] or [m]."""
 OPTIMISTIC, PADDED, PREDICTED, OCCUPIED = "optimistic", "padded", "predicted", "occupied"
-UNSEEN = (OPTIMISTIC, PADDED, PREDICTED, OCCUPIED)
-"""What space that no view saw is taken for: free; free but near what was seen; as the completing network
-predicts it; occupied. See `planning/pipeline/unknown_space.py`."""
+UNKNOWN_POLICIES = (OPTIMISTIC, PADDED, PREDICTED, OCCUPIED)
+"""Policies for space that no view observed. It is assumed to be: free; free, except near observed surfaces;
+occupied where the occupancy completion network predicts obstacles; occupied. See
+`planning/pipeline/unknown_space.py`."""
+EXCLUSIVE_FIELDS = (
+    ("cartesian_line", "waypoints", ": plan from one waypoint to the next"),
+    ("waypoints", "views", ": plan from one waypoint to the next"),
+    ("start_velocity", "views", ""),
+    ("start_velocity", "waypoints", ""),
+    ("start_velocity", "constraints", ""),
+    ("start_velocity", "moving", ""),
+    ("start_velocity", "payload", ""),
+    ("moving", "views", ""),
+    ("moving", "blend", ": the motion stops at waypoints"),
+)
+"""Pairs of fields that cannot be combined, and advice for the message."""
+
+
+class ProblemOptions(TypedDict, total=False):
+    """What the constructors accept for the optional fields of `Problem`."""
+
+    notes: tuple[str, ...]
+    clearance: float | None
+    views: Sequence[DepthView]
+    unknown: str
+    waypoints: Sequence[ArrayLike | Goal | Sequence[OneGoal]]
+    constraints: Sequence[Constraint]
+    moving: Sequence[MovingObstacle]
+    start_velocity: ArrayLike | None
+    blend: ArrayLike
+    payload: Payload | None
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Problem(Value):
-    """`goal` may be given as a configuration, a list of them, a JointGoal, a PoseGoal or a PosesGoal, or a
-    list of those, of which any is to be reached; so may each of the waypoints.
+    """A planning problem. Lengths in [m], angles in [rad], poses in the frame of the robot's base.
 
-    Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note; those of continuous joints are
-    kept as they are, and whole turns of a goal do not matter. Raises InputError for everything else that no
-    planner could work with: wrong lengths, values that are not finite or out of limits, a goal frame that the
-    robot does not move. Collisions of start and goal are found by the planners.
+    `goal` accepts a configuration, a list of configurations, a JointGoal, a PoseGoal, a PosesGoal, or a list
+    of goals, any of which may be reached. Each waypoint accepts the same.
 
-    With views, the problem's scene is the given one and what they saw beside it, as points (`SeenPoints`).
+    Values up to `LIMIT_SLACK` beyond a joint limit are clamped, with a note. Values of continuous joints are
+    not changed; a goal may be reached at any number of their full turns. Raises InputError for everything
+    else that no planner could work with: wrong lengths, values that are not finite or out of limits, a goal
+    frame that no planned joint moves. Collisions of start and goal are detected by the planners.
+
+    With views, `scene` holds the given shapes and the points that the views observed (`SeenPoints`).
     """
 
     robot: Robot
     scene: Scene
     start: Float[ndarray, "dof"]
     goal: Goal
+    _: KW_ONLY
     notes: tuple[str, ...] = ()
-    """What was changed in the input, e.g. a start clamped to a limit."""
+    """Changes that were made to the input, e.g. a start that was clamped to a limit."""
     clearance: float | None = None
-    """Distance to obstacles that is to be kept where start, goal and passages allow it [m]; None: what the
-    call of the planner says."""
+    """Distance to obstacles [m] that is kept where start, goal and passages allow it; None: the planning
+    call's default."""
     views: tuple[DepthView, ...] = ()
-    """Pictures that depth cameras took of the scene."""
+    """Depth images of the scene."""
     unknown: str = OPTIMISTIC
-    """What space that no view saw is taken for, one of UNSEEN; of no account without views."""
+    """Policy for space that no view observed, one of UNKNOWN_POLICIES; ignored without views."""
     T_world_base: Float[ndarray, "4 4"] | None = None
-    """Where the base stands in the world, for files and pictures: scene, goal and views are in the base's
-    frame all the same. `in_world` takes them in the world's. None: the base's frame is the world's."""
+    """Pose of the base in the world, for files and pictures; None: the base's frame is the world's. Scene,
+    goal and views of a Problem are always in the base's frame; `in_world` accepts them in the world's."""
     waypoints: tuple[Goal, ...] = ()
-    """Where the motion stops on its way, in this order, or what it passes by: see `blend`."""
+    """Where the motion stops on its way, in this order, or what it passes: see `blend`."""
     constraints: tuple[Constraint, ...] = ()
-    """What holds all along the motion."""
+    """Path constraints, which hold along the whole motion."""
     moving: tuple[MovingObstacle, ...] = ()
-    """Obstacles that move, from time 0 of the motion on; `scene` holds those that stand still."""
+    """Moving obstacles; the motion begins at their time 0. `scene` holds the static obstacles."""
     start_velocity: Float[ndarray, "dof"] | None = None
-    """Of the joints when the motion begins [rad/s] or [m/s]; None, and all below 1e-6: it begins at rest."""
+    """Joint velocities at the start [rad/s] or [m/s]; None, or all below 1e-6: the motion starts at rest."""
     blend: tuple[float, ...] = ()
-    """For each waypoint, within what distance of it the motion may pass without stopping: of configurations
-    in joint space [rad, L2], of the position of a pose, or the box that it may be in [m]; 0: it stops there.
-    May be given as one number for all; empty: it stops at all."""
+    """For each waypoint, the distance within which the motion may pass it without stopping: for
+    configurations in joint space [rad, L2], for poses from the position or its box of tolerances [m]. 0: the
+    motion stops there. One number stands for all waypoints; empty: it stops at all of them."""
     payload: Payload | None = None
-    """What a link carries: the timed motion keeps within the effort limits, which None does not look at."""
+    """Load on a link, with which the timed motion keeps effort limits; None: effort limits are ignored."""
 
     def __post_init__(self) -> None:
         if self.clearance is not None:
             check_clearance("clearance", self.clearance)
+        check_unknown("unknown", self.unknown)
         if not isinstance(self.robot, Robot):
             raise InputError(f"robot is {shown(self.robot)}; it must be a Robot, e.g. rd.load_robot('panda')")
         if not isinstance(self.scene, Scene):
             raise InputError(f"scene is {shown(self.scene)}; it must be a Scene, e.g. rd.Scene([shape, ...])")
         notes = list(self.notes)
-        start = _configuration(self.robot, "start", self.start, notes)
-        goal = _goal(self.robot, "goal", self.goal, notes)
-        if not isinstance(self.waypoints, list | tuple):
-            raise InputError(f"waypoints is {shown(self.waypoints)}; it must be a list of goals")
-        fields = (f"waypoints[{i}]" for i in range(len(self.waypoints)))
-        waypoints = tuple(_goal(self.robot, *of, notes) for of in zip(fields, self.waypoints, strict=True))
-        if self.payload is not None:
-            _check_payload(self.robot, self.payload)
-        blend = _blend(self.blend, len(waypoints))
-        constraints = _constraints(self.robot, self.constraints)
-        if waypoints and any(isinstance(one, CartesianLine) for one in constraints):
-            raise InputError("cartesian_line goes from start to goal: plan from one waypoint to the next")
-        views = _views(self.robot, self.views)
-        if views and waypoints:
-            raise InputError("waypoints cannot be had beside views: plan from one to the next")
-        moving = _moving(self.moving, self.scene)
-        start_velocity = _velocity(self.robot, self.start_velocity)
-        beside = {
-            "views": views,
-            "waypoints": waypoints,
-            "constraints": constraints,
-            "moving": moving,
-            "start_velocity": () if start_velocity is None else (start_velocity,),
-            "payload": () if self.payload is None else (self.payload,),
-        }
-        others = [name for name, given in beside.items() if name != "start_velocity" and given]
-        if start_velocity is not None and others:
-            raise InputError(f"start_velocity cannot be had beside {others[0]}")
-        if moving and views:
-            raise InputError("moving cannot be had beside views")
-        if moving and any(blend):
-            raise InputError("moving cannot be had beside blend: the motion stops at waypoints")
-        check_unknown("unknown", self.unknown)
-        T_world_base = self.T_world_base
-        if T_world_base is not None:
-            T_world_base = rigid_transform("T_world_base", T_world_base)
-        scene = self.scene
-        if views:
-            from robotdiffuse.perception.seen_points import (
-                seen_shapes,  # compiled code, which only views need
-            )
-
-            scene = self.known_scene
-            ends = goal.positions if isinstance(goal, JointGoal) else start[None]
-            scene = Scene([*scene.shapes, *seen_shapes(views, self.robot, scene, start, ends)])
-        for key, value in {
-            "scene": scene,
-            "start": start,
-            "goal": goal,
+        checked: dict[str, Any] = {
+            "start": _configuration(self.robot, "start", self.start, notes),
+            "goal": _goal(self.robot, "goal", self.goal, notes),
+            "waypoints": _waypoints(self.robot, self.waypoints, notes),
+            "payload": _payload(self.robot, self.payload),
+            "constraints": _constraints(self.robot, self.constraints),
+            "views": _views(self.robot, self.views),
+            "moving": _moving(self.moving, self.scene),
+            "start_velocity": _start_velocity(self.robot, self.start_velocity),
+            "T_world_base": _base(self.T_world_base),
             "notes": tuple(notes),
-            "views": views,
-            "T_world_base": T_world_base,
-            "waypoints": waypoints,
-            "constraints": constraints,
-            "moving": moving,
-            "start_velocity": start_velocity,
-            "blend": blend,
-        }.items():
-            object.__setattr__(self, key, value)
+        }
+        checked["blend"] = _blend(self.blend, len(checked["waypoints"]))
+        _check_combinations(checked)
+        if checked["views"]:
+            start, goal = checked["start"], checked["goal"]
+            checked["scene"] = _scene_with_views(self.robot, self.known_scene, checked["views"], start, goal)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
         super().__post_init__()
 
     if TYPE_CHECKING:
@@ -162,17 +154,9 @@ class Problem(Value):
             scene: Scene,
             start: ArrayLike,
             goal: ArrayLike | Goal | Sequence[OneGoal],
-            notes: tuple[str, ...] = (),
-            clearance: float | None = None,
-            views: Sequence[DepthView] = (),
-            unknown: str = OPTIMISTIC,
+            *,
             T_world_base: ArrayLike | None = None,
-            waypoints: Sequence[ArrayLike | Goal | Sequence[OneGoal]] = (),
-            constraints: Sequence[Constraint] = (),
-            moving: Sequence[MovingObstacle] = (),
-            start_velocity: ArrayLike | None = None,
-            blend: ArrayLike = (),
-            payload: Payload | None = None,
+            **options: Unpack[ProblemOptions],
         ) -> None: ...
 
     @classmethod
@@ -183,49 +167,35 @@ class Problem(Value):
         scene: Scene,
         start: ArrayLike,
         goal: "ArrayLike | Goal | Sequence[OneGoal]",
-        notes: tuple[str, ...] = (),
-        clearance: float | None = None,
-        views: "Sequence[DepthView]" = (),
-        unknown: str = OPTIMISTIC,
-        waypoints: "Sequence[ArrayLike | Goal | Sequence[OneGoal]]" = (),
-        constraints: "Sequence[Constraint]" = (),
-        moving: "Sequence[MovingObstacle]" = (),
-        start_velocity: ArrayLike | None = None,
-        blend: ArrayLike = (),
-        payload: Payload | None = None,
+        **options: Unpack[ProblemOptions],
     ) -> "Problem":
-        """The problem of a robot whose base stands somewhere in the world, in whose frame scene, views,
-        obstacles that move, constraints and the poses of goals are given.
+        """The problem of a robot whose base is at `T_world_base`, in the frame of the base.
 
-        They are moved into the base's frame, where planning is. Raises InputError as the constructor does.
+        Scene, poses of goals and waypoints, views, constraints and moving obstacles are given in the world's
+        frame and moved into the base's. Raises InputError as the constructor does.
         """
         T = rigid_transform("T_world_base", T_world_base)
         T_base_world = inverse(T)
-        goal = moved_goal(goal, T_base_world)
-        waypoints = [moved_goal(waypoint, T_base_world) for waypoint in waypoints]
-        if isinstance(scene, Scene):
-            scene = scene.moved(T_base_world)
-        views = tuple(view.moved(T_base_world) if isinstance(view, DepthView) else view for view in views)
-        kinds = tuple(CONSTRAINTS.values())
-        constraints = [one.moved(T_base_world) if isinstance(one, kinds) else one for one in constraints]
-        moving = [one.moved(T_base_world) if isinstance(one, MovingObstacle) else one for one in moving]
-        asked = robot, scene, start, goal, notes, clearance, views, unknown, T, waypoints
-        return cls(*asked, constraints, moving, start_velocity, blend, payload)
+        moved: dict[str, Any] = dict(options)
+        for name in ("waypoints", "views", "constraints", "moving"):
+            if name in moved:
+                moved[name] = _moved(moved[name], T_base_world)
+        scene, goal = _moved(scene, T_base_world), _moved(goal, T_base_world)
+        return cls(robot, scene, start, goal, T_world_base=T, **moved)
 
     def standing(self) -> tuple[Robot, Scene]:
-        """Robot and scene as they stand in the world, for pictures and simulators: the robot's base is the
-        world then."""
+        """The robot and the scene in the world's frame, for pictures and simulators."""
         T = self.T_world_base
         return (self.robot, self.scene) if T is None else (self.robot.standing(T), self.scene.moved(T))
 
     @property
     def known_scene(self) -> Scene:
-        """The scene as it was given: without what the views saw."""
+        """The scene as it was given: without the points that the views observed."""
         known = [shape for shape in self.scene.shapes if not isinstance(shape, SeenPoints)]
         return self.scene if len(known) == len(self.scene.shapes) else Scene(known)
 
     load: ClassVar[Callable[..., "Problem"]]
-    """`problems.files.load_problem`, put here by the package: files know problems, not the reverse."""
+    """`problems.files.load_problem`, assigned by the package: files import problems, not the reverse."""
 
 
 def check_problem(problem: object, field: str = "problem") -> None:
@@ -245,10 +215,55 @@ def check_clearance(field: str, value: object) -> float:
 
 
 def check_unknown(field: str, value: object) -> str:
-    """The value as one of UNSEEN; InputError for anything else."""
-    if not isinstance(value, str) or value not in UNSEEN:
-        raise unknown_name(f"policy in {field}:", str(value), UNSEEN)
+    """The value as one of UNKNOWN_POLICIES; InputError for anything else."""
+    if not isinstance(value, str) or value not in UNKNOWN_POLICIES:
+        raise unknown_name(f"policy in {field}:", str(value), UNKNOWN_POLICIES)
     return value
+
+
+def _check_combinations(checked: dict[str, Any]) -> None:
+    """Raises InputError for fields that cannot be combined."""
+    given = {name for name, value in checked.items() if value is not None and not _is_empty(value)}
+    if not any(checked["blend"]):
+        given.discard("blend")
+    if any(isinstance(constraint, CartesianLine) for constraint in checked["constraints"]):
+        given.add("cartesian_line")
+    for one, other, advice in EXCLUSIVE_FIELDS:
+        if one in given and other in given:
+            raise InputError(f"{one} cannot be combined with {other}{advice}")
+
+
+def _is_empty(value: object) -> bool:
+    return isinstance(value, tuple) and not value
+
+
+def _moved(value: Any, T: Float[ndarray, "4 4"]) -> Any:
+    """The value, or each of a list, after the rigid motion T; what has no pose is returned unchanged."""
+    if isinstance(value, list | tuple):
+        return [_moved(one, T) for one in value]
+    if isinstance(value, Scene | DepthView | MovingObstacle | Constraint):
+        return value.moved(T)
+    return moved_goal(value, T)
+
+
+def _scene_with_views(
+    robot: Robot, known: Scene, views: tuple[DepthView, ...], start: Float[ndarray, "dof"], goal: Goal
+) -> Scene:
+    """The known scene and the points that the views observed."""
+    from robotdiffuse.perception.seen_points import seen_shapes  # compiled code, which only views need
+
+    goals = goal.positions if isinstance(goal, JointGoal) else start[None]
+    return Scene([*known.shapes, *seen_shapes(views, robot, known, start, goals)])
+
+
+def _base(T_world_base: object) -> Float[ndarray, "4 4"] | None:
+    return None if T_world_base is None else rigid_transform("T_world_base", T_world_base)
+
+
+def _waypoints(robot: Robot, waypoints: object, notes: list[str]) -> tuple[Goal, ...]:
+    if not isinstance(waypoints, list | tuple):
+        raise InputError(f"waypoints is {shown(waypoints)}; it must be a list of goals")
+    return tuple(_goal(robot, f"waypoints[{i}]", goal, notes) for i, goal in enumerate(waypoints))
 
 
 def _views(robot: Robot, views: object) -> tuple[DepthView, ...]:
@@ -269,48 +284,51 @@ def _constraints(robot: Robot, constraints: object) -> tuple[Constraint, ...]:
         known = ", ".join(f"rd.{kind.__name__}" for kind in kinds)
         raise InputError(f"constraints is {shown(constraints)}; it must be a list of {known}")
     for i, one in enumerate(constraints):
-        _check_moved(robot, f"constraints[{i}].frame", one.frame)
+        _check_planned_joint_moves(robot, f"constraints[{i}].frame", one.frame)
     return tuple(constraints)
 
 
-def _check_payload(robot: Robot, payload: object) -> None:
+def _payload(robot: Robot, payload: object) -> Payload | None:
+    if payload is None:
+        return None
     if not isinstance(payload, Payload):
         raise InputError(f"payload is {shown(payload)}; it must be a rd.Payload")
     check_dynamics(robot)
-    _check_moved(robot, "payload.link", robot.tip if payload.link is None else payload.link)
+    _check_planned_joint_moves(robot, "payload.link", robot.tip if payload.link is None else payload.link)
+    return payload
 
 
 def _blend(value: object, count: int) -> tuple[float, ...]:
-    """One for each waypoint."""
+    """One blend for each of `count` waypoints."""
     blends = numbers(value)
     if blends is not None and blends.ndim == 0 and count:
         blends = np.full(count, blends)
     given = blends is not None and blends.size > 0
     if given and not count:
         raise InputError(f"blend is {shown(value)}; there are no waypoints")
-    if blends is None or (given and blends.shape != (count,)) or not _may_blend(blends).all():
+    if blends is None or (given and blends.shape != (count,)) or not _is_blend(blends).all():
         raise InputError(
-            f"blend is {shown(value)}; it must be a number for all of {count} waypoints, or one for each: 0 "
-            f"to stop there, or from {LEAST_BLEND:g} to {MOST_BLEND:g}"
+            f"blend is {shown(value)}; it must be one number for all {count} waypoints, or one for each: 0 "
+            f"to stop there, or from {MIN_BLEND:g} to {MAX_BLEND:g}"
         )
     return tuple(blends.tolist()) if given else (0.0,) * count
 
 
-def _may_blend(blends: ndarray) -> ndarray:
-    return (blends == 0) | ((blends >= LEAST_BLEND) & (blends <= MOST_BLEND))
+def _is_blend(blends: ndarray) -> ndarray:
+    return (blends == 0) | ((blends >= MIN_BLEND) & (blends <= MAX_BLEND))
 
 
-def _check_moved(robot: Robot, field: str, frame: str) -> None:
-    """InputError unless a planned joint moves the link."""
+def _check_planned_joint_moves(robot: Robot, field: str, frame: str) -> None:
+    """Raises InputError unless a planned joint moves the link."""
     moved = [link for link in robot.link_names if robot.link_frame(link) > 0]
     if frame not in robot.link_names:
         raise unknown_name(f"link in {field}:", frame, moved)
     if frame not in moved:
-        raise InputError(f"{field} {frame!r} is moved by no planned joint; these are: {', '.join(moved)}")
+        raise InputError(f"{field}: no planned joint moves {frame!r}; they move {', '.join(moved)}")
 
 
 def _moving(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]:
-    """With names that nothing else in the scene has."""
+    """The obstacles, renamed where a shape of the scene has the same name."""
     if not isinstance(moving, list | tuple) or not all(isinstance(one, MovingObstacle) for one in moving):
         raise InputError(f"moving is {shown(moving)}; it must be a list of rd.MovingObstacle")
     shapes = Scene([*scene.shapes, *(one.shape for one in moving)]).shapes[len(scene.shapes) :]
@@ -320,8 +338,8 @@ def _moving(moving: object, scene: Scene) -> tuple[MovingObstacle, ...]:
     )
 
 
-def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
-    """A velocity within limits; None for rest, and what is nearly that."""
+def _start_velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
+    """A velocity within limits; None if it is zero, or nearly."""
     if value is None:
         return None
     velocity = numbers(value)
@@ -341,7 +359,7 @@ def _velocity(robot: Robot, value: object) -> Float[ndarray, "dof"] | None:
 
 
 def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
-    """The goal as one of its classes, its configurations within limits."""
+    """The goal as an object of its class, with its configurations within limits."""
     if isinstance(goal, list | tuple) and any(isinstance(one, OneGoal) for one in goal):
         goal = AnyGoal(tuple(goal))
     if isinstance(goal, AnyGoal):
@@ -349,21 +367,21 @@ def _goal(robot: Robot, field: str, goal: object, notes: list[str]) -> Goal:
         each = [_goal(robot, *of, notes) for of in zip(fields, goal.goals, strict=True)]
         return AnyGoal(tuple(each))  # type: ignore[arg-type]
     if isinstance(goal, PoseGoal):
-        _check_moved(robot, f"{field}.frame", goal.frame)
+        _check_planned_joint_moves(robot, f"{field}.frame", goal.frame)
         return goal
     if isinstance(goal, PosesGoal):
-        _check_apart(robot, field, goal)
+        _check_independent_links(robot, field, goal)
         return goal
     rows = goal.positions if isinstance(goal, JointGoal) else JointGoal(goal).positions  # type: ignore[arg-type]
     fields = [field] if len(rows) == 1 else [f"{field}[{i}]" for i in range(len(rows))]
     return JointGoal(np.stack([_configuration(robot, *row, notes) for row in zip(fields, rows, strict=True)]))
 
 
-def _check_apart(robot: Robot, field: str, goal: PosesGoal) -> None:
-    """InputError unless planned joints move each link, and any two of them against each other."""
+def _check_independent_links(robot: Robot, field: str, goal: PosesGoal) -> None:
+    """Raises InputError unless planned joints move each link, and any two relative to each other."""
     parts = dict[int, str]()
     for pose in goal.poses:
-        _check_moved(robot, f"{field}.poses", pose.frame)
+        _check_planned_joint_moves(robot, f"{field}.poses", pose.frame)
         other = parts.setdefault(robot.link_frame(pose.frame), pose.frame)
         if other != pose.frame:
             raise InputError(
@@ -372,7 +390,7 @@ def _check_apart(robot: Robot, field: str, goal: PosesGoal) -> None:
 
 
 def _configuration(robot: Robot, field: str, value: object, notes: list[str]) -> Float[ndarray, "dof"]:
-    """The configuration within limits; appends to `notes` what was changed."""
+    """The configuration, clamped where it is within LIMIT_SLACK of the limits; `notes` says where."""
     q = numbers(value)
     names = ", ".join(robot.joint_names)
     if q is None or q.ndim != 1:

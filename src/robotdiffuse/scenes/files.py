@@ -1,4 +1,4 @@
-"""Scenes in problem files: plain dictionaries to shapes and back."""
+"""Reads and writes the scenes of problem files: plain dictionaries to shapes and back."""
 
 from collections.abc import Iterable
 from dataclasses import MISSING, fields
@@ -16,14 +16,14 @@ from robotdiffuse.scenes.shapes import IDENTITY, Box, Capsule, Cylinder, Mesh, P
 SHAPES: dict[str, type[Shape]] = {
     shape.kind: shape for shape in (Sphere, Box, Cylinder, Capsule, Mesh, PointCloud)
 }
-CONTENT = {"mesh": ("vertices", "faces"), "point_cloud": ("points",)}
-"""The fields that a `file` stands for."""
+FILE_CONTENT = {"mesh": ("vertices", "faces"), "point_cloud": ("points",)}
+"""For each shape that may be read from a file, the fields that the file contains."""
 
 
 def check_fields(
     where: str, data: object, required: Iterable[str], optional: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """`data`, if it is a mapping with all required fields and no unknown ones; InputError otherwise."""
+    """The data itself. Raises InputError unless it is a mapping with all required and no unknown fields."""
     required = tuple(required)
     known = (*required, *optional)
     if not isinstance(data, dict):
@@ -38,10 +38,10 @@ def check_fields(
 
 
 def read_scene(entries: object, folder: Path, field: str = "scene") -> tuple[Scene, tuple[str, ...]]:
-    """A scene from the list in a problem file, and notes on what was changed in it.
+    """The scene of a list in a problem file, and notes on changes to it.
 
-    Files are looked up from `folder`. Raises InputError for an unknown shape or field, for values of the
-    wrong kind and for files that cannot be read; the message starts with the place, e.g. scene[2].
+    File names are relative to `folder`. Raises InputError for unknown shapes and fields, values of the wrong
+    type and files that cannot be read; the message starts with the place in the file, e.g. scene[2].
     """
     if not isinstance(entries, list):
         raise InputError(
@@ -68,7 +68,7 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
     required = [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]  # type: ignore[arg-type]
     optional = [f.name for f in fields(kind) if f.name not in required]  # type: ignore[arg-type]
     if isinstance(values, dict) and "file" in values:
-        content = CONTENT.get(kind.kind, ())
+        content = FILE_CONTENT.get(kind.kind, ())
         required, optional = ["file"], [name for name in optional if name != "file"]
         values = dict(check_fields(where, values, required, optional))
         if not isinstance(values["file"], str) or not values["file"]:
@@ -88,19 +88,20 @@ def _shape(where: str, kind: type[Shape], values: object, folder: Path, notes: l
 
 
 def _points(file: str, notes: list[str]) -> tuple[ndarray]:
-    points, more = read_points(file)
-    notes.extend(more)
+    points, new_notes = read_points(file)
+    notes.extend(new_notes)
     return (points,)
 
 
 def scene_entries(scene: Scene, folder: Path | None) -> list[dict[str, dict[str, object]]]:
-    """The scene as `read_scene` takes it: exact. Shapes read from files are written as their file's name."""
+    """The scene as `read_scene` reads it, exactly. Shapes that were read from files are written as file
+    names."""
     return [{shape.kind: _values(shape, folder)} for shape in scene.shapes]
 
 
 def _values(shape: Shape, folder: Path | None) -> dict[str, object]:
     file = getattr(shape, "file", None)
-    left_out = {"file"} if file is None else {*CONTENT[shape.kind], "file"}
+    left_out = {"file"} if file is None else {*FILE_CONTENT[shape.kind], "file"}
     values: dict[str, object] = {} if file is None else {"file": name_from(folder, Path(file))}
     for f in fields(shape):  # type: ignore[arg-type]
         value = getattr(shape, f.name)
@@ -114,7 +115,7 @@ def _values(shape: Shape, folder: Path | None) -> dict[str, object]:
 
 
 def name_from(folder: Path | None, file: Path) -> str:
-    """Relative for files in the folder and below it, so that the folder can be moved."""
+    """The file's name, relative to the folder if it is in or below it, so that the folder can be moved."""
     file = file.resolve()
     if folder is None:
         return str(file)

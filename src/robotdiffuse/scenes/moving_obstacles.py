@@ -1,4 +1,4 @@
-"""Obstacles that move: along a known trajectory, or in an unknown way no faster than a greatest speed.
+"""Moving obstacles: with a known trajectory, or with an unknown motion of limited speed.
 
 As with shapes, the constructor checks its arguments itself: see `no_type_check` in scenes/shapes.py.
 """
@@ -22,70 +22,60 @@ from robotdiffuse.core.transforms import (
     rotation_from_quaternion,
     transform,
 )
-from robotdiffuse.scenes.shape_transforms import placed
 from robotdiffuse.scenes.shapes import Shape
 
-FASTEST = 100.0
-"""Of any point of an obstacle [m/s]; what is faster between two of its poses is a jump."""
-FOREVER = 1e5
-"""How long a velocity lasts [s], about a day: the longest motion that is validated."""
-SAME = 1e-6
-"""A pose and where its shape stands may be apart by this [m] or [rad]."""
+MAX_POINT_SPEED = 100.0
+"""Speed limit of every point of an obstacle [m/s]; anything faster between two poses is a jump."""
+MAX_DURATION = 1e5
+"""How long a constant velocity lasts [s], about a day: the longest motion that is validated."""
+POSE_TOLERANCE = 1e-6
+"""Tolerance between the first pose and the pose of the shape [m], [rad]."""
 
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class MovingObstacle(Value):
-    """A shape in the frame of the robot's base, standing at time 0 as it says, and one of three ways to move.
+    """A shape with its pose at time 0, in the frame of the robot's base, and one of three motions.
 
-    `velocity`: it keeps its orientation and moves on for ever. `times` and `poses`: its frame is there then,
-    in between on straight lines at constant speed and turning at a constant rate; before the first and after
-    the last time it stands still. `max_speed`: nothing is known but that no point of it is faster.
+    velocity: the shape keeps its orientation and moves at a constant velocity for ever.
+    times and poses: the pose of its frame at each time. In between, it moves on straight lines at constant
+    speed and turns at a constant rate; before the first and after the last time it stands still.
+    max_speed: its motion is unknown, but none of its points is faster than this.
 
-    Raises InputError for none or several of these, values that are not finite, times that do not increase,
-    poses that jump (a point faster than FASTEST) or do not begin where the shape stands, negative speeds, and
-    for clouds of points, which have no frame of their own.
+    Raises InputError for none or several of these motions, values that are not finite, times that do not
+    increase, poses that jump (a point faster than MAX_POINT_SPEED) or do not begin at the pose of the shape,
+    negative speeds, and point clouds, which have no frame of their own.
     """
 
     shape: Shape
     velocity: Float[ndarray, "3"] | None = None
-    """[m/s]"""
+    """Constant velocity [m/s]."""
     times: Float[ndarray, "k"] | None = None
-    """[s], increasing."""
+    """Times of the poses [s], increasing."""
     poses: Float[ndarray, "k 4 4"] | None = None
     """T_base_shape at each time."""
     max_speed: float | None = None
-    """[m/s]"""
+    """Speed limit of all points of an obstacle whose motion is unknown [m/s]."""
 
     def __post_init__(self) -> None:
         if not isinstance(self.shape, Shape):
             raise InputError(f"moving: shape is {shown(self.shape)}; it must be a shape, e.g. rd.Sphere")
-        placed(self.shape)  # an error for shapes that have no frame
-        ways = [
-            name
-            for name, given in (
-                ("velocity", self.velocity is not None),
-                ("times and poses", self.times is not None or self.poses is not None),
-                ("max_speed", self.max_speed is not None),
-            )
-            if given
-        ]
-        if len(ways) != 1:
+        _ = self.shape.T_base_shape  # raises InputError for shapes that have no frame
+        motions = {
+            "velocity": self.velocity is not None,
+            "times and poses": self.times is not None or self.poses is not None,
+            "max_speed": self.max_speed is not None,
+        }
+        given = [name for name, has in motions.items() if has]
+        if len(given) != 1:
             raise InputError(
-                f"moving obstacle {self.name!r} has {' and '.join(ways) or 'no motion'}; it must have "
+                f"moving obstacle {self.name!r} has {' and '.join(given) or 'no motion'}; it must have "
                 "exactly one of velocity, times and poses, max_speed"
             )
         if self.velocity is not None:
-            velocity = vector(self.name, "velocity", self.velocity, 3, FASTEST)
-            self._set(velocity=velocity)
+            self._set(velocity=vector(self.name, "velocity", self.velocity, 3, MAX_POINT_SPEED))
         elif self.max_speed is not None:
-            speed = numbers(self.max_speed)
-            if speed is None or speed.ndim != 0 or not 0 <= speed <= FASTEST:
-                raise InputError(
-                    f"{self.name}.max_speed is {shown(self.max_speed)}; it must be a speed from 0 to "
-                    f"{FASTEST:g} m/s"
-                )
-            self._set(max_speed=float(speed))
+            self._set(max_speed=_speed(self.name, self.max_speed))
         else:
             times = _times(self.name, self.times)
             poses = _poses(self.name, self.poses, len(times))
@@ -109,19 +99,20 @@ class MovingObstacle(Value):
             object.__setattr__(self, key, value)
 
     def _check_track(self, times: ndarray, poses: ndarray) -> None:
-        off = inverse(placed(self.shape)) @ poses[0]
-        if np.linalg.norm(off[:3, 3]) > SAME or rotation_angle(off[:3, :3]) > SAME:
+        """Raises InputError unless the poses begin at the pose of the shape and do not jump."""
+        off = inverse(self.shape.T_base_shape) @ poses[0]
+        if np.linalg.norm(off[:3, 3]) > POSE_TOLERANCE or rotation_angle(off[:3, :3]) > POSE_TOLERANCE:
             raise InputError(
-                f"{self.name}.poses[0] is at {shown(poses[0, :3, 3])}; the shape must stand there, in the "
-                f"same orientation, and stands at {shown(placed(self.shape)[:3, 3])}"
+                f"{self.name}.poses[0] is at {shown(poses[0, :3, 3])}; it must be the pose of the shape, "
+                f"whose position is {shown(self.shape.T_base_shape[:3, 3])}"
             )
         speeds = track_speeds(times, poses, self.radius)
-        jumps = np.flatnonzero(speeds > FASTEST)
+        jumps = np.flatnonzero(speeds > MAX_POINT_SPEED)
         if len(jumps):
             i = int(jumps[0])
             raise InputError(
                 f"{self.name}.poses[{i + 1}] is a jump: from {times[i]:g} s to {times[i + 1]:g} s a point "
-                f"moves at {speeds[i]:.3g} m/s; at most {FASTEST:g} m/s is possible"
+                f"moves at {speeds[i]:.3g} m/s; the limit is {MAX_POINT_SPEED:g} m/s"
             )
 
     @property
@@ -130,54 +121,56 @@ class MovingObstacle(Value):
 
     @property
     def known(self) -> bool:
-        """Whether it is known where it will be."""
+        """Whether its motion is known."""
         return self.max_speed is None
 
     @cached_property
     def radius(self) -> float:
-        """No point of it is further from the origin of its frame [m]."""
+        """Bound of the distance of its points from the origin of its frame [m]."""
         low, high = self.shape.bounds
-        centre = placed(self.shape)[:3, 3]
+        centre = self.shape.T_base_shape[:3, 3]
         return float(np.linalg.norm(np.maximum(np.abs(low - centre), np.abs(high - centre))))
 
     @cached_property
     def track(self) -> tuple[Float[ndarray, "k"], Float[ndarray, "k 4 4"]]:
-        """Times and poses between which it moves evenly, standing still before and after; of one that is not
-        known, where it stands at time 0."""
-        T = placed(self.shape)
+        """Times, and poses between which it moves at constant rates; it stands still before and after.
+
+        If its motion is unknown, only its pose at time 0.
+        """
+        T = self.shape.T_base_shape
         if self.velocity is not None:
-            poses = np.stack([T, transform(self.velocity * FOREVER) @ T])
-            return read_only((np.array([0.0, FOREVER]), poses))
+            poses = np.stack([T, transform(self.velocity * MAX_DURATION) @ T])
+            return read_only((np.array([0.0, MAX_DURATION]), poses))
         if self.times is not None and self.poses is not None:
             return self.times, self.poses
         return read_only((np.zeros(1), T[None]))
 
     @property
-    def greatest_speed(self) -> float:
-        """Of any of its points at any time [m/s]."""
+    def top_speed(self) -> float:
+        """Speed that no point of it exceeds at any time [m/s]."""
         if self.max_speed is not None:
             return self.max_speed
         return float(track_speeds(*self.track, self.radius).max(initial=0.0))
 
     def pose(self, time: float) -> Float[ndarray, "4 4"]:
-        """T_base_shape at a time [s]; of one that is not known, at time 0."""
+        """T_base_shape at a time [s]; the pose at time 0 if the motion is unknown."""
         times, poses = self.track
         i = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, max(len(times) - 2, 0)))
         if len(times) == 1:
             return poses[0]
-        share = float(np.clip((time - times[i]) / (times[i + 1] - times[i]), 0.0, 1.0))
-        xyz = poses[i, :3, 3] + share * (poses[i + 1, :3, 3] - poses[i, :3, 3])
+        fraction = float(np.clip((time - times[i]) / (times[i + 1] - times[i]), 0.0, 1.0))
+        xyz = poses[i, :3, 3] + fraction * (poses[i + 1, :3, 3] - poses[i, :3, 3])
         if np.array_equal(poses[i, :3, :3], poses[i + 1, :3, :3]):
             return transform(xyz, poses[i, :3, :3])
         a, b = (quaternion_from_rotation(poses[k, :3, :3]) for k in (i, i + 1))
-        return transform(xyz, rotation_from_quaternion(_between(a, b, share)))
+        return transform(xyz, rotation_from_quaternion(_slerp(a, b, fraction)))
 
     def at(self, time: float) -> Shape:
-        """The shape where it is at a time [s]; of one that is not known, at time 0."""
-        return self.shape.moved(self.pose(time) @ inverse(placed(self.shape)))
+        """The shape with its pose at a time [s]; the one at time 0 if the motion is unknown."""
+        return self.shape.moved(self.pose(time) @ inverse(self.shape.T_base_shape))
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "MovingObstacle":
-        """The obstacle and its motion after a rigid motion."""
+        """The obstacle and its motion after the rigid motion T."""
         velocity = None if self.velocity is None else T[:3, :3] @ self.velocity
         poses = None if self.poses is None else T @ self.poses
         return replace(self, shape=self.shape.moved(T), velocity=velocity, poses=poses)
@@ -186,26 +179,35 @@ class MovingObstacle(Value):
 def track_speeds(
     times: Float[ndarray, "k"], poses: Float[ndarray, "k 4 4"], radius: float
 ) -> Float[ndarray, "intervals"]:
-    """Bounds on the speed of points up to `radius` [m] from the origin, between the times [m/s]."""
+    """Bounds of the speed between the times [m/s], for points up to `radius` [m] from the origin."""
     apart = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
     turns = [rotation_angle(a.T @ b) for a, b in zip(poses[:-1, :3, :3], poses[1:, :3, :3], strict=True)]
     return (apart + radius * np.array(turns)) / np.diff(times)
 
 
-def _between(a: Float[ndarray, "4"], b: Float[ndarray, "4"], share: float) -> Float[ndarray, "4"]:
-    """The quaternion a share of the shorter way from one to another."""
+def _slerp(a: Float[ndarray, "4"], b: Float[ndarray, "4"], fraction: float) -> Float[ndarray, "4"]:
+    """The quaternion at a fraction of the shorter way from a to b."""
     b = b if a @ b >= 0 else -b
     angle = 2 * np.arctan2(np.linalg.norm(a - b), np.linalg.norm(a + b))
     if angle < 1e-9:
         return b
-    return (np.sin((1 - share) * angle) * a + np.sin(share * angle) * b) / np.sin(angle)
+    return (np.sin((1 - fraction) * angle) * a + np.sin(fraction * angle) * b) / np.sin(angle)
+
+
+def _speed(name: str, value: object) -> float:
+    speed = numbers(value)
+    if speed is None or speed.ndim != 0 or not 0 <= speed <= MAX_POINT_SPEED:
+        raise InputError(
+            f"{name}.max_speed is {shown(value)}; it must be a speed from 0 to {MAX_POINT_SPEED:g} m/s"
+        )
+    return float(speed)
 
 
 def _times(name: str, value: object) -> Float[ndarray, "k"]:
     times = numbers(value)
-    if times is None or times.ndim != 1 or len(times) < 2 or not within(times, FOREVER):
+    if times is None or times.ndim != 1 or len(times) < 2 or not within(times, MAX_DURATION):
         raise InputError(
-            f"{name}.times is {shown(value)}; it must be two or more times within ±{FOREVER:g} s, one for "
+            f"{name}.times is {shown(value)}; it must be two or more times within ±{MAX_DURATION:g} s, one for "
             "each of the poses"
         )
     backwards = np.flatnonzero(np.diff(times) <= 0)
@@ -225,5 +227,5 @@ def _poses(name: str, value: object, count: int) -> Float[ndarray, "k 4 4"]:
         R = T[:3, :3]
         proper = within(T) and np.abs(R.T @ R - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0
         if not proper or np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-9:
-            raise InputError(f"{name}.poses[{i}] is no rigid transform of finite numbers")
+            raise InputError(f"{name}.poses[{i}] is not a rigid transform of finite numbers")
     return poses

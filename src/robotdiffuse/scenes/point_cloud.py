@@ -1,4 +1,4 @@
-"""Point clouds: reading files, thinning, cropping."""
+"""Reads point clouds from files, downsamples and crops them."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +15,9 @@ MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], 
 
 
 def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m 3"]:
-    """The first point of every occupied cell of a grid with cells `voxel` wide [m], in the old order.
+    """The first point of every occupied cell of a grid with cells `voxel` wide [m], in the original order.
 
-    A dropped point is less than sqrt(3) * voxel away from one that was kept.
+    Every removed point is less than sqrt(3) * voxel away from a remaining one.
     """
     if len(points) == 0:
         return points
@@ -26,7 +26,7 @@ def voxel_thin(points: Float[ndarray, "n 3"], voxel: float) -> Float[ndarray, "m
     extent = cells.max(axis=0) + 1
     bits = len(points).bit_length()
     if extent.prod() * 2.0**bits < 2.0**62 and extent.prod() < 2.0**53:
-        # One sort of cell number and point number packed together is several times faster than np.unique.
+        # Sorting cell and point numbers packed into one integer is several times faster than np.unique.
         cell = (cells @ np.array([extent[1] * extent[2], extent[2], 1.0])).astype(np.int64)
         packed = np.sort((cell << bits) | np.arange(len(points)))
         first = np.flatnonzero(np.diff(packed >> bits, prepend=-1))
@@ -56,10 +56,10 @@ def crop(points: Float[ndarray, "n 3"], center: Float[ndarray, "3"], reach: floa
 
 
 def read_points(file: str | Path) -> tuple[Float[ndarray, "n 3"], tuple[str, ...]]:
-    """The points of a .ply, .pcd, .xyz, .csv, .npy or .npz file [m], and notes on what was left out.
+    """The points of a .ply, .pcd, .xyz, .csv, .npy or .npz file [m], and notes on removed points.
 
-    Points that are not finite (a depth camera's misses) are removed, with a note. Columns after the third
-    are ignored. Raises InputError if the file is missing, empty or holds something else.
+    Points that are not finite (missing returns of a depth camera) are removed, with a note. Columns after the
+    third are ignored. Raises InputError if the file is missing, empty or does not contain points.
     """
     file = Path(file)
     reader = READERS.get(file.suffix.lower())
@@ -71,7 +71,7 @@ def read_points(file: str | Path) -> tuple[Float[ndarray, "n 3"], tuple[str, ...
         points = np.asarray(reader(file), dtype=np.float64)
     except InputError:
         raise
-    except Exception as error:  # the readers raise whatever their library does about a damaged file
+    except Exception as error:  # the libraries raise many kinds of errors for damaged files
         raise InputError(f"point cloud file {file} cannot be read: {shortened(str(error))}") from None
     if points.size == 0:
         return np.zeros((0, 3)), (f"{file} holds no points",)
@@ -95,7 +95,7 @@ def _read_ply(file: Path) -> ndarray:
 
 
 def _read_text(file: Path) -> ndarray:
-    """Numbers in columns, parted by commas or blanks; a line of names may come first."""
+    """Columns of numbers, separated by commas or blanks; the first line may be a header of names."""
     with file.open(encoding="utf-8") as stream:
         first = stream.readline()
     delimiter = "," if "," in first else None
@@ -145,7 +145,7 @@ def _read_pcd(file: Path) -> ndarray:
     if storage != "binary":
         raise InputError(f"point cloud file {file} is stored as {shown(storage)}; it must be ascii or binary")
     kinds = [f"<{kind.lower()}{size}" for kind, size in zip(header["TYPE"], header["SIZE"], strict=True)]
-    # Positions as names: PCL writes several padding fields that are all called "_".
+    # Fields are named by position: PCL writes several padding fields that are all called "_".
     record = np.dtype([(str(i), kind, (n,)) for i, (kind, n) in enumerate(zip(kinds, counts, strict=True))])
     points = np.frombuffer(content, record, count=total, offset=at)
     return np.stack([points[str(names.index(axis))][:, 0].astype(np.float64) for axis in "xyz"], axis=1)

@@ -1,4 +1,4 @@
-"""Scene: the obstacles around a robot."""
+"""Scene: the static obstacles around a robot."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from robotdiffuse.scenes.shapes import Shape
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Scene(Value):
-    """Obstacles in the frame of the robot's base. Names are made unique by a number at the end."""
+    """Obstacles in the frame of the robot's base. A number is appended to names that are not unique."""
 
     shapes: tuple[Shape, ...] = ()
 
@@ -42,7 +42,7 @@ class Scene(Value):
         object.__setattr__(self, "shapes", tuple(named))
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Scene":
-        """The scene after a rigid motion."""
+        """The scene after the rigid motion T."""
         return Scene([shape.moved(T) for shape in self.shapes])
 
     def attach(
@@ -53,21 +53,21 @@ class Scene(Value):
         link: str | None = None,
         touch_links: Sequence[str] = (),
     ) -> tuple["Scene", Robot]:
-        """The scene without an obstacle that the robot takes up at a configuration, and the robot holding it.
+        """The scene without an obstacle that the robot grasps at configuration q, and the robot holding it.
 
-        `link` is what it is fixed to, by default the robot's tip; `touch_links` as of `Robot.attach`. Raises
-        InputError for an unknown obstacle, and where `Robot.attach` does.
+        link: the link that it is attached to, by default the robot's tip; touch_links: as in `Robot.attach`.
+        Raises InputError for an unknown obstacle, and where `Robot.attach` does.
         """
         names = [shape.name for shape in self.shapes]
         if name not in names:
             raise unknown_name("obstacle to attach:", name, names)
         link = robot.tip if link is None else link
-        robot.link_frame(link)  # an unknown one is an error that lists those that there are
+        robot.link_frame(link)  # raises InputError, with the known links, for an unknown one
         held = self.shapes[names.index(name)].moved(inverse(link_pose(robot, np.asarray(q, float), link)))
         return Scene([s for s in self.shapes if s.name != name]), robot.attach(held, link, touch_links)
 
     def detach(self, name: str, robot: Robot, q: Float[ndarray, "dof"]) -> tuple["Scene", Robot]:
-        """The scene with an object that the robot lets go of at a configuration, and the robot without it."""
+        """The scene with an object that the robot releases at configuration q, and the robot without it."""
         freed = robot.detach(name)
         [body] = [body for body in robot.attached if body.name == name]
         T_base_link = link_pose(robot, np.asarray(q, float), body.link)

@@ -1,4 +1,4 @@
-"""Scenes of spheres and boxes as arrays: what data sets hold, and what training reads many of at once."""
+"""Scenes of spheres and boxes as arrays, for data sets and for batches in training."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,23 +13,24 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
 NONE, SPHERE, BOX = 0, 1, 2
-"""Kinds of packed shapes: none, for an empty row; a sphere; a box."""
+"""Kinds of packed shapes; NONE is an empty row."""
 PARAMETERS = 10
+"""Parameters of a shape: see `PackedScenes.params`."""
 
 
 @dataclass(frozen=True, eq=False)
 class PackedScenes:
-    """Scenes of at most k spheres and boxes each, and the floors that they stand on. Lengths in [m].
+    """n scenes of at most k spheres and boxes each, and their floors. Lengths in [m].
 
-    Point clouds of them are made by `surface_clouds`.
+    `surface_clouds` makes point clouds of them.
     """
 
     kinds: Int8[ndarray, "n k"]
     params: Float32[ndarray, "n k 10"]
-    """Of a sphere center, radius; of a box center, size, wxyz; filled up with zeros."""
+    """Of a sphere: center, radius; of a box: center, size, wxyz; padded with zeros."""
     floors: Float[ndarray, "n 6"] | None = None
-    """Center and size of each floor, zeros where a scene has none; None: no scene has one. A floor is apart
-    from the obstacles: clouds do not show it, and it does not turn."""
+    """Center and size of each floor, zeros for scenes without a floor; None: no scene has one. Floors are
+    not obstacles: point clouds do not contain them, and `turned` does not turn them."""
 
     def __len__(self) -> int:
         return len(self.kinds)
@@ -40,9 +41,9 @@ class PackedScenes:
 
     @staticmethod
     def pack(scenes: Sequence[Scene], slots: int, floor: bool = False) -> "PackedScenes":
-        """Scenes in so many rows each. floor: whether the first shape of each is the floor.
+        """The scenes as arrays with `slots` rows each. floor: whether the first shape of each is its floor.
 
-        Raises InputError for other shapes, and if there are more of them than slots.
+        Raises InputError for other shapes than spheres and boxes, and for more shapes than slots.
         """
         kinds = np.full((len(scenes), slots), NONE, np.int8)
         params = np.zeros((len(scenes), slots, PARAMETERS), np.float32)
@@ -53,19 +54,19 @@ class PackedScenes:
 
     @staticmethod
     def joined(parts: Sequence["PackedScenes"]) -> "PackedScenes":
-        """One after the other; all with floors, or all without."""
+        """All scenes of the parts, in order. Either all parts or none must have floors."""
         kinds, params = (np.concatenate([getattr(p, name) for p in parts]) for name in ("kinds", "params"))
         floors = [p.floors for p in parts if p.floors is not None]
         return PackedScenes(kinds, params, np.concatenate(floors) if floors else None)
 
     def floor(self, i: int) -> Box | None:
-        """What the scene of this number stands on."""
+        """The floor of scene i; None if it has none."""
         if self.floors is None or not self.floors[i].any():
             return None
         return Box(self.floors[i, :3], self.floors[i, 3:], name="floor")
 
     def scene(self, i: int) -> Scene:
-        """The scene of this number, its floor first; exact up to float32. Names are lost."""
+        """Scene i, its floor first; exact up to float32. Names are lost."""
         floor = self.floor(i)
         shapes: list[Shape] = [] if floor is None else [floor]
         for kind, row in zip(self.kinds[i], self.params[i], strict=True):
@@ -76,19 +77,19 @@ class PackedScenes:
         return Scene(shapes)
 
     def turned(self, angle: Float32[ndarray, "n"]) -> "PackedScenes":
-        """Each scene turned about the z axis [rad], its floor left as it is."""
+        """The scenes, each turned about the z axis by its angle [rad]; floors are not turned."""
         params = self.params.copy()
         c, s = np.cos(angle)[:, None], np.sin(angle)[:, None]
         x, y = params[..., 0].copy(), params[..., 1].copy()
         params[..., 0], params[..., 1] = c * x - s * y, s * x + c * y
-        # the quaternion of the turn, (cos, 0, 0, sin) of half the angle, times that of the obstacle
+        # quaternion of the rotation, (cos, 0, 0, sin) of half the angle, times that of the obstacle
         c, s = np.cos(angle / 2)[:, None], np.sin(angle / 2)[:, None]
         w, i, j, k = np.moveaxis(params[..., 6:].copy(), -1, 0)
         params[..., 6:] = np.stack([c * w - s * k, c * i - s * j, c * j + s * i, c * k + s * w], -1)
         return PackedScenes(self.kinds, params, self.floors)
 
-    def distances(self, at: Float[ndarray, "places 3"]) -> Float[ndarray, "n places"]:
-        """Signed distance [m] of places to the nearest obstacle of each scene; infinite if it has none."""
+    def distances(self, at: Float[ndarray, "points 3"]) -> Float[ndarray, "n points"]:
+        """Signed distance [m] of points to the nearest obstacle of each scene; infinite if it has none."""
         nearest = np.full((len(self), len(at)), np.inf)
         for kind, p in zip(self.kinds.T, self.params.transpose(1, 0, 2).astype(np.float64), strict=True):
             box, some = kind == BOX, kind != NONE
@@ -102,11 +103,11 @@ class PackedScenes:
 
 
 def floor_row(floor: Shape | None) -> Float[ndarray, "6"]:
-    """A row of `PackedScenes.floors`. Raises InputError unless the floor is a box that is not turned."""
+    """A row of `PackedScenes.floors`. Raises InputError unless the floor is a box without rotation."""
     if floor is None:
         return np.zeros(6)
     if not isinstance(floor, Box) or floor.wxyz[0] != 1:
-        raise InputError(f"the floor {floor.name} is a {floor.kind}; it must be a box that is not turned")
+        raise InputError(f"the floor {floor.name} is a {floor.kind}; it must be a box without rotation")
     return np.concatenate([floor.center, floor.size])
 
 

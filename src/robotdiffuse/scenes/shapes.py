@@ -1,11 +1,11 @@
 """Obstacle shapes in the frame of the robot's base.
 
-The constructors check their arguments and say what is wrong, so run-time type checks (tests switch them on)
-are kept off these classes by `no_type_check`.
+The constructors check their arguments themselves and raise InputError. `no_type_check` therefore keeps the
+run-time type checks of the tests off these classes.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, no_type_check
 
@@ -26,7 +26,7 @@ from robotdiffuse.core.bounds import (
     vector,
 )
 from robotdiffuse.core.errors import InputError, shown
-from robotdiffuse.core.transforms import rotation_from_quaternion, transform
+from robotdiffuse.core.transforms import quaternion_from_rotation, rotation_from_quaternion, transform
 from robotdiffuse.robots.bodies import ConvexMesh
 from robotdiffuse.scenes.point_cloud import distinct, voxel_thin
 
@@ -34,9 +34,9 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 class Shape(Value, ABC):
-    """Base of all obstacles. `kind` is its name in problem files.
+    """Base class of all obstacles. `kind` is its name in problem files.
 
-    The constructors take anything that NumPy reads as numbers and raise InputError for the rest.
+    The constructors take anything that NumPy reads as numbers and raise InputError for everything else.
     """
 
     kind: ClassVar[str]
@@ -45,33 +45,46 @@ class Shape(Value, ABC):
     @property
     @abstractmethod
     def area(self) -> float:
-        """Surface [m^2]."""
+        """Surface area [m^2]."""
 
     @property
     @abstractmethod
     def bounds(self) -> Float[ndarray, "2 3"]:
-        """Least and greatest corner of an axis-aligned box that holds the shape [m]."""
+        """Lower and upper corner of an axis-aligned box around the shape [m]."""
+
+    @property
+    def T_base_shape(self) -> Float[ndarray, "4 4"]:
+        """Pose of the shape's own frame. Raises InputError for shapes without one, such as point clouds."""
+        raise InputError(
+            f"{self.name!r} is a {self.kind}; it must be one of sphere, box, cylinder, capsule and mesh"
+        )
 
     def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
-        """The shape after a rigid motion."""
-        from robotdiffuse.scenes.shape_transforms import moved
+        """The shape after the rigid motion T. A point cloud forgets the file that it was read from.
 
-        return moved(self, T)
+        Raises InputError for shapes that do not implement it.
+        """
+        raise InputError(f"a {self.kind} cannot be moved; write it as a mesh")
 
     def solid(self) -> tuple[Float[ndarray, "4 4"], tuple[ConvexMesh, ...]]:
-        """Where it stands, and convex meshes in its own frame that hold it, for a robot that holds it."""
-        from robotdiffuse.scenes.convex_solids import solid
+        """T_base_shape, and convex meshes in the shape's own frame that enclose it, for a robot to hold.
 
-        return solid(self)
+        The mesh of a box is exact; round shapes get a polyhedron around them. Raises InputError for point
+        clouds.
+        """
+        return self.T_base_shape, self._convex_meshes()
+
+    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
+        raise NotImplementedError
 
 
 class Triangulated(Shape):
-    """A shape that is planned around, validated, sampled and drawn as its triangles: a mesh, or a new shape."""
+    """A shape whose triangles are used for planning, validation, sampling and drawing."""
 
     @property
     @abstractmethod
     def mesh(self) -> "Mesh":
-        """Around the shape, in the base frame."""
+        """Triangles around the shape, in the base frame."""
 
     @property
     def area(self) -> float:
@@ -84,7 +97,7 @@ class Triangulated(Shape):
 
 def _set(shape: Shape, **values: object) -> None:
     if not isinstance(shape.name, str) or not shape.name:
-        raise InputError(f"{shape.kind}.name is {shown(shape.name)}; it must be a text, not empty")
+        raise InputError(f"{shape.kind}.name is {shown(shape.name)}; it must be a non-empty string")
     for key, value in values.items():
         object.__setattr__(shape, key, read_only(value))
 
@@ -116,10 +129,41 @@ class Sphere(Shape):
     def bounds(self) -> Float[ndarray, "2 3"]:
         return np.stack([self.center - self.radius, self.center + self.radius])
 
+    @property
+    def T_base_shape(self) -> Float[ndarray, "4 4"]:
+        return transform(self.center)
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+        return replace(self, center=T[:3, :3] @ self.center + T[:3, 3])
+
+    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
+        from robotdiffuse.scenes.convex_solids import capsule_polyhedron  # SciPy, which few problems need
+
+        return (capsule_polyhedron(self.radius, 0.0),)
+
+
+class _Oriented(Shape):
+    """A shape with a centre and an orientation."""
+
+    center: Float[ndarray, "3"]
+    wxyz: Float[ndarray, "4"]
+
+    @cached_property
+    def rotation(self) -> Float[ndarray, "3 3"]:
+        return read_only(rotation_from_quaternion(self.wxyz))
+
+    @property
+    def T_base_shape(self) -> Float[ndarray, "4 4"]:
+        return transform(self.center, self.rotation)
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+        T = T @ self.T_base_shape
+        return replace(self, center=T[:3, 3], wxyz=quaternion_from_rotation(T[:3, :3]))  # type: ignore[type-var]
+
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class Box(Shape):
+class Box(_Oriented):
     center: Float[ndarray, "3"]
     size: Float[ndarray, "3"]
     """Full edge lengths [m]."""
@@ -142,10 +186,6 @@ class Box(Shape):
             self, center: ArrayLike, size: ArrayLike, wxyz: ArrayLike = IDENTITY, name: str = "box"
         ) -> None: ...
 
-    @cached_property
-    def rotation(self) -> Float[ndarray, "3 3"]:
-        return read_only(rotation_from_quaternion(self.wxyz))
-
     @property
     def area(self) -> float:
         x, y, z = self.size
@@ -156,10 +196,17 @@ class Box(Shape):
         half = np.abs(self.rotation) @ self.size / 2
         return np.stack([self.center - half, self.center + half])
 
+    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
+        from robotdiffuse.scenes.convex_solids import box_mesh
+
+        return (box_mesh(self.size),)
+
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
-class _Axial(Shape):
+class _Axial(_Oriented):
+    """A shape about its own z axis."""
+
     center: Float[ndarray, "3"]
     radius: float
     height: float
@@ -173,10 +220,6 @@ class _Axial(Shape):
             height=positive(self.kind, "height", self.height),
             wxyz=unit_quaternion(self.kind, self.wxyz),
         )
-
-    @cached_property
-    def rotation(self) -> Float[ndarray, "3 3"]:
-        return read_only(rotation_from_quaternion(self.wxyz))
 
 
 @no_type_check
@@ -208,11 +251,16 @@ class Cylinder(_Axial):
         half = np.abs(axis) * self.height / 2 + self.radius * np.sqrt(np.clip(1 - axis**2, 0, None))
         return np.stack([self.center - half, self.center + half])
 
+    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
+        from robotdiffuse.scenes.convex_solids import prism
+
+        return (prism(self.radius, self.height),)
+
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Capsule(_Axial):
-    """A cylinder about its own z axis, `height` long, with a half sphere at each end (outside `height`)."""
+    """A cylinder about its own z axis, `height` long, with a half sphere at each end, outside `height`."""
 
     name: str = "capsule"
     kind: ClassVar[str] = "capsule"
@@ -237,11 +285,16 @@ class Capsule(_Axial):
         half = np.abs(self.rotation[:, 2]) * self.height / 2 + self.radius
         return np.stack([self.center - half, self.center + half])
 
+    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
+        from robotdiffuse.scenes.convex_solids import capsule_polyhedron
+
+        return (capsule_polyhedron(self.radius, self.height),)
+
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class Mesh(Triangulated):
-    """A triangle mesh; for collision, its surface."""
+    """A triangle mesh. Only its surface counts for collision."""
 
     vertices: Float[ndarray, "v 3"]
     """In the mesh's own frame [m]."""
@@ -249,7 +302,7 @@ class Mesh(Triangulated):
     xyz: Float[ndarray, "3"] = field(default=(0.0, 0.0, 0.0))  # type: ignore[assignment]
     wxyz: Float[ndarray, "4"] = field(default=IDENTITY)  # type: ignore[assignment]
     file: str | None = None
-    """Where it was read from, for writing it back."""
+    """The file that it was read from, for writing it back."""
     name: str = "mesh"
     kind: ClassVar[str] = "mesh"
 
@@ -303,15 +356,28 @@ class Mesh(Triangulated):
     def bounds(self) -> Float[ndarray, "2 3"]:
         return np.stack([self.world_vertices.min(axis=0), self.world_vertices.max(axis=0)])
 
+    @property
+    def T_base_shape(self) -> Float[ndarray, "4 4"]:
+        return transform(self.xyz, rotation_from_quaternion(self.wxyz))
+
+    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+        T = T @ self.T_base_shape
+        return replace(self, xyz=T[:3, 3], wxyz=quaternion_from_rotation(T[:3, :3]))
+
+    def _convex_meshes(self) -> tuple[ConvexMesh, ...]:
+        from robotdiffuse.scenes.convex_solids import mesh_parts
+
+        return mesh_parts(self.vertices.tobytes(), self.faces.tobytes())
+
 
 @no_type_check
 @dataclass(frozen=True, eq=False)
 class PointCloud(Shape):
-    """Points, each of them a small sphere. May be empty."""
+    """Points, each a small sphere. The cloud may be empty."""
 
     points: Float[ndarray, "n 3"]
     point_radius: float = 0.01
-    """[m]"""
+    """Radius of the sphere around each point [m]."""
     file: str | None = None
     name: str = "point_cloud"
     kind: ClassVar[str] = "point_cloud"
@@ -340,7 +406,7 @@ class PointCloud(Shape):
 
     @cached_property
     def area(self) -> float:
-        """An estimate: one face of each cell, as wide as a point, that holds a point [m^2]."""
+        """An estimate [m^2]: one face of each occupied cell of a grid with cells as wide as a point."""
         width = 2 * self.point_radius
         return len(voxel_thin(self.points, width)) * width**2
 
@@ -351,7 +417,5 @@ class PointCloud(Shape):
         low, high = self.points.min(axis=0), self.points.max(axis=0)
         return read_only(np.stack([low - self.point_radius, high + self.point_radius]))
 
-
-def pose(shape: Box | Cylinder | Capsule) -> Float[ndarray, "4 4"]:
-    """T_base_shape of a shape with a centre and a quaternion."""
-    return transform(shape.center, shape.rotation)
+    def moved(self, T: Float[ndarray, "4 4"]) -> "Shape":
+        return replace(self, points=self.points @ T[:3, :3].T + T[:3, 3], file=None)

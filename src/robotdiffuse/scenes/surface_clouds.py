@@ -1,11 +1,11 @@
-"""Point clouds of many packed scenes at once, on any device: what training makes on the fly.
+"""Samples point clouds of many packed scenes at once, on any device, during training.
 
-The rule is that of `sample_surface`: points uniform by area over the spheres and boxes of a scene. Here it is
-written for speed, in PyTorch: a point is center + M d: on a sphere, d is a direction and M the radius; on a
-box, M has half of a face's normal and edges as columns, and d is (+-1, u, v). What a point needs of its face
-is gathered from a table of faces; there is no array of points times shapes; and scenes are done in parts that
-stay in the processor's cache. For whole surfaces on the CPU, what training needs most, compiled code is three
-times as fast again (`surface_kernel`).
+As in `sample_surface`, points are uniform by area over the spheres and boxes of a scene. This PyTorch version
+is written for speed. A point is center + M d: on a sphere, d is a direction and M the radius; on a box, the
+columns of M are half of a face's normal and edges, and d is (+-1, u, v). The data of a point's face are
+gathered from a table of faces, so that no array of points times shapes is needed, and scenes are processed in
+batches that fit the processor's cache. For whole surfaces on the CPU, the most frequent case in training, the
+Numba code in `surface_clouds_kernel` is three times faster still.
 """
 
 import math
@@ -20,18 +20,20 @@ from robotdiffuse.scenes.scene_arrays import BOX, NONE, SPHERE, PackedScenes
 from robotdiffuse.scenes.surface_clouds_kernel import fill_clouds
 from robotdiffuse.scenes.surface_points import VisibleRegion
 
-PART = 1 << 15
-"""Points that are done at once on the CPU: their arrays fit the second-level cache."""
-PART_ELSEWHERE = 1 << 22
+CPU_BATCH_POINTS = 1 << 15
+"""Points that are processed at once on the CPU: their arrays fit the second-level cache."""
+DEVICE_BATCH_POINTS = 1 << 22
+"""Points that are processed at once on other devices."""
 OVERSAMPLING = 1.5
-"""Points drawn for each that is wanted, where some may be hidden or out of the region."""
-BITS = 21
-"""Of each coordinate in an integer of 63 bits that clouds are sorted by."""
-SLACK = 1e-4
-"""A shape hides what is behind more than this share of it: points do not hide themselves by rounding."""
-TINY = 1e-12
-COMPILED_ON = ("cpu",)
-"""Devices on which whole surfaces are done by compiled code."""
+"""Points sampled for each requested one, if some may be occluded or outside the region."""
+COORDINATE_BITS = 21
+"""Bits of each coordinate in the 63-bit integers by which clouds are sorted."""
+OCCLUSION_MARGIN = 1e-4
+"""Relative depth inside a shape beyond which it occludes a point, so that rounding errors do not count."""
+EPSILON = 1e-12
+"""Lower bound of divisors."""
+COMPILED_DEVICES = ("cpu",)
+"""Devices on which Numba code samples whole surfaces."""
 
 
 def surface_clouds(
@@ -43,24 +45,27 @@ def surface_clouds(
     camera: Float32[Tensor, "n 3"] | None = None,
     ordered: bool = False,
 ) -> Float32[Tensor, "n count 3"]:
-    """`count` points on the obstacles of each scene, independent and uniform by area, on the generator's
-    device [m].
+    """`count` points on the obstacles of each scene [m], independent and uniform by area.
 
-    `region`: only points in it. `camera`: a position for each scene [m]; only points that it sees, on faces
-    turned to it and neither behind nor within another shape. Where few of the drawn points count, they
-    repeat; a scene of which none does is all zeros. `ordered`: sorted by x, then y, then z, and rounded to a
-    millionth of the scene's largest coordinate, for encoders to which the order matters.
+    The result is on the generator's device. Points repeat if few of the samples qualify; a scene without any
+    is all zeros.
+
+    region: only points inside it.
+    camera: a position for each scene [m]; only points that are visible from it, on faces turned towards it
+        and neither behind nor inside another shape.
+    ordered: sorted by x, then y, then z, and rounded to a millionth of the scene's largest coordinate, for
+        encoders that depend on the order.
     """
     kinds, params = np.ascontiguousarray(scenes.kinds), np.ascontiguousarray(scenes.params)
     n, k = kinds.shape
     clouds = torch.empty(n, count, 3, device=generator.device)
     if not n or not k or not count:
         return clouds.zero_()
-    if region is None and camera is None and clouds.device.type in COMPILED_ON:
+    if region is None and camera is None and clouds.device.type in COMPILED_DEVICES:
         seeds = torch.randint(2**62, (n,), generator=generator).numpy().view(np.uint64)
         fill_clouds(kinds, params, seeds, clouds.numpy())
         if ordered:
-            for part in clouds.split(max(1, PART // count)):
+            for part in clouds.split(max(1, CPU_BATCH_POINTS // count)):
                 sort_points(list(part.unbind(-1)))
         return clouds
     kinds, params = (torch.from_numpy(array).to(clouds.device) for array in (kinds, params))
@@ -76,15 +81,15 @@ def _by_tensors(
     camera: Float32[Tensor, "n 3"] | None,
     ordered: bool,
 ) -> Float32[Tensor, "n count 3"]:
-    """`surface_clouds` by PyTorch alone: with a region or a camera, and on other devices."""
+    """`surface_clouds` in PyTorch: with a region or a camera, and on other devices."""
     n, count = clouds.shape[:2]
-    # empty rows last, and scenes with as many shapes together: a part takes as long as its fullest scene
+    # empty rows last, and scenes sorted by number of shapes: a batch takes as long as its largest scene
     slots = (kinds == NONE).byte().argsort(stable=True, dim=1)
     number, order = (kinds != NONE).sum(1).sort(stable=True)
     shapes = _Shapes.of(kinds.gather(1, slots)[order], params[order[:, None], slots[order]])
     eyes = None if camera is None else camera[order]
     table, area = _faces(shapes, region, eyes)
-    part = max(1, (PART if params.device.type == "cpu" else PART_ELSEWHERE) // count)
+    part = max(1, (CPU_BATCH_POINTS if params.device.type == "cpu" else DEVICE_BATCH_POINTS) // count)
     most = number.tolist()
     for i in range(0, n, part):
         rows = slice(i, i + part)
@@ -94,10 +99,10 @@ def _by_tensors(
             cloud = _draw(*faces, count, generator, False)[0]
         else:
             cloud, shape = _draw(*faces, math.ceil(OVERSAMPLING * count), generator, eyes is not None)
-            counts = torch.ones_like(shape, dtype=torch.bool) if region is None else _within(region, cloud)
+            counts = torch.ones_like(shape, dtype=torch.bool) if region is None else _inside(region, cloud)
             if eyes is not None:
-                counts &= ~_hidden(shapes.some(rows, used), cloud, shape, eyes[rows])
-            cloud = _first(cloud, counts, count)
+                counts &= ~_occluded(shapes.some(rows, used), cloud, shape, eyes[rows])
+            cloud = _first_selected(cloud, counts, count)
         if ordered:
             sort_points(cloud)
         clouds[order[rows]] = torch.stack(cloud, -1)
@@ -105,17 +110,17 @@ def _by_tensors(
 
 
 Points = list[Tensor]
-"""x, y and z, each [b, m]."""
+"""The coordinates x, y and z, each of shape [b, m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Shapes:
-    """Spheres and boxes of some scenes."""
+    """The spheres and boxes of b scenes."""
 
     sphere: Bool[Tensor, "b k"]
     center: Float32[Tensor, "b k 3"]
     half: Float32[Tensor, "b k 3"]
-    """Half sizes, or the radius three times [m]; zero for empty rows."""
+    """Half edge lengths of boxes, or three times the radius of spheres [m]; zero for empty rows."""
     rotation: Float32[Tensor, "b k 3 3"]
 
     @staticmethod
@@ -134,10 +139,12 @@ class _Shapes:
         )
 
     def local(self, points: Points) -> Points:
-        """Points in the frames of the shapes, in units of their half sizes; x, y, z are [b, 1] or, if there
-        is one shape per scene, [b, m]."""
+        """Points in the frames of the shapes, in units of their half sizes.
+
+        The coordinates have shape [b, 1] or, with one shape per scene, [b, m].
+        """
         p = [points[s] - self.center[..., s] for s in range(3)]
-        scaled = self.rotation / self.half.clamp(min=TINY)[..., None, :]
+        scaled = self.rotation / self.half.clamp(min=EPSILON)[..., None, :]
         return [_dot(p, list(scaled[..., r].unbind(-1))) for r in range(3)]
 
 
@@ -158,9 +165,11 @@ def _rotation(wxyz: Float32[Tensor, "b k 4"]) -> Float32[Tensor, "b k 3 3"]:
 def _faces(
     shapes: _Shapes, region: VisibleRegion | None, eye: Tensor | None
 ) -> tuple[Float32[Tensor, "13 b k 3"], Float32[Tensor, "b k 3"]]:
-    """Three faces per shape, and their areas, up to a factor. A face is center, M by rows, and the height in
-    radii of the cap for a sphere, which is the first of its faces. Of a box, two opposite faces are one; with
-    an eye, only what is turned to it counts."""
+    """Three faces per shape, and their areas up to a common factor.
+
+    A face is a center, the rows of M, and for a sphere the height of its cap in radii. A sphere uses only its
+    first face. Two opposite faces of a box are one; with an eye, only the side turned towards it counts.
+    """
     sphere = shapes.sphere[..., None]
     axes = shapes.rotation * shapes.half[..., None, :]
     a, b, c = shapes.half.unbind(-1)
@@ -177,17 +186,18 @@ def _faces(
         cap[..., 0] = torch.where(shapes.sphere & (far > 1), 1 - 1 / far, 0.0)
     area = torch.where(sphere, math.pi / 4 * cap * (a * a)[..., None], area)
     if region is not None:
-        area = area * _may_be_seen(region, shapes.center, axes.abs().sum(-1))[..., None]
+        area = area * _may_intersect(region, shapes.center, axes.abs().sum(-1))[..., None]
     turns = torch.tensor([[0, 1, 2], [1, 2, 0], [2, 0, 1]], device=area.device)
     matrix = axes[..., turns].movedim((2, 4), (0, 1))
     center = shapes.center.movedim(-1, 0)[..., None].expand(3, *area.shape)
-    # a face without area is drawn only from a scene without any, whose points must be zero
+    # faces without area are sampled only in scenes without any area, whose points must be zero
     return torch.cat([center, matrix.flatten(0, 1), cap[None]]) * (area > 0), area
 
 
 def _basis(direction: Float32[Tensor, "b k 3"]) -> Float32[Tensor, "b k 3 3"]:
-    """Rotations whose first column points there (Duff et al., "Building an orthonormal basis, revisited")."""
-    z = direction / direction.norm(dim=-1, keepdim=True).clamp(min=TINY)
+    """Rotations whose first column is the direction (Duff et al., "Building an orthonormal basis,
+    revisited")."""
+    z = direction / direction.norm(dim=-1, keepdim=True).clamp(min=EPSILON)
     x, y, z = z.unbind(-1)
     sign = torch.where(z < 0, -1.0, 1.0)
     a = -1 / (sign + z)
@@ -197,7 +207,7 @@ def _basis(direction: Float32[Tensor, "b k 3"]) -> Float32[Tensor, "b k 3 3"]:
     return torch.stack([torch.stack([x, y, z], -1), second, third], -1)
 
 
-def _may_be_seen(
+def _may_intersect(
     region: VisibleRegion, center: Float32[Tensor, "b k 3"], half: Float32[Tensor, "b k 3"]
 ) -> Bool[Tensor, "b k"]:
     gap = ((center - center.new_tensor(region.center)).abs() - half).clamp(min=0)
@@ -215,7 +225,7 @@ def _draw(
     n, faces = area.shape
     ends = area.cumsum(1)
     pick, u, v = torch.rand(3, n, count, generator=generator, device=area.device)
-    pick *= ends[:, -1:]  # less than the end: 1 - 2^-24, the greatest number drawn, rounds nothing up to it
+    pick *= ends[:, -1:]  # less than the end: 1 - 2^-24, the largest random number, is not rounded up to it
     shape = torch.zeros(n, count, dtype=torch.int64, device=area.device)
     for j in range(2, faces - 1, 3):
         shape += pick >= ends[:, j, None]
@@ -226,7 +236,7 @@ def _draw(
     of = [part.index_select(0, rows).view(n, count) for part in table]
 
     cap = of[12]
-    if not one_sided:  # the side of the box, and where on it, from one number
+    if not one_sided:  # one random number gives both the side of the box and the coordinate on it
         height = u.mul_(2).sub_(1)
         side = torch.ones_like(u).copysign_(u)
         across = u.abs().mul_(2).sub_(1)
@@ -236,7 +246,7 @@ def _draw(
         across = u.mul_(2).sub_(1)
     ring, angle = (height * height).neg_().add_(1).clamp_(min=0).sqrt_(), v * (2 * math.pi)
     along = v.mul_(2).sub_(1)
-    on_sphere = (cap > 0).float()  # to blend by it is several times as fast as torch.where
+    on_sphere = (cap > 0).float()  # interpolating with it is several times faster than torch.where
     d = (
         torch.lerp(side, height, on_sphere),
         torch.lerp(across, ring * angle.cos(), on_sphere),
@@ -249,21 +259,21 @@ def _draw(
     return points, shape
 
 
-def _within(region: VisibleRegion, points: Points) -> Bool[Tensor, "b m"]:
+def _inside(region: VisibleRegion, points: Points) -> Bool[Tensor, "b m"]:
     x, y, z = (points[i] - region.center[i] for i in range(3))
     return (points[2] > region.floor) & (x * x + y * y + z * z < region.reach**2)
 
 
-def _hidden(
+def _occluded(
     shapes: _Shapes, points: Points, shape: Tensor, eye: Float32[Tensor, "b 3"]
 ) -> Bool[Tensor, "b m"]:
-    """Which points lie behind, or within, another shape than their own, as seen from the eye."""
+    """Which points are occluded from the eye by another shape than their own, or lie inside one."""
     hidden = torch.zeros_like(shape, dtype=torch.bool)
     for j in range(shapes.sphere.shape[1]):
         other = shapes.some(slice(None), slice(j, j + 1))
         at = other.local(points)
         way = [e - p for e, p in zip(other.local([eye[:, s, None] for s in range(3)]), at, strict=True)]
-        # sphere: the least distance of the segment from the centre
+        # sphere: the minimum distance of the segment from the centre
         along, long = _dot(at, way), _dot(way, way)
         t = (-along / long).clamp_(0, 1)
         near = _dot(at, at) + t * (2 * along + t * long)
@@ -274,13 +284,15 @@ def _hidden(
             middle, width = a * inverse, inverse.abs_()
             enter = torch.maximum(enter, -middle - width)
             leave = torch.minimum(leave, width - middle)
-        behind = ((near < 1 - SLACK) & other.sphere) | ((enter < leave - SLACK) & ~other.sphere)
+        behind = ((near < 1 - OCCLUSION_MARGIN) & other.sphere) | (
+            (enter < leave - OCCLUSION_MARGIN) & ~other.sphere
+        )
         hidden |= behind & (shape != j) & (other.half[..., 0] > 0)
     return hidden
 
 
-def _first(points: Points, counts: Bool[Tensor, "b m"], count: int) -> Points:
-    """The first `count` points that count, over and over where there are fewer; zeros where there is none."""
+def _first_selected(points: Points, counts: Bool[Tensor, "b m"], count: int) -> Points:
+    """The first `count` selected points, repeated if there are fewer; zeros if there are none."""
     rank = counts.long().cumsum(1)
     total = rank[:, -1:].clone()
     place = rank.sub_(1).masked_fill_(~counts, count).clamp_(max=count)
@@ -293,19 +305,19 @@ def _first(points: Points, counts: Bool[Tensor, "b m"], count: int) -> Points:
 
 
 def sort_points(points: Points) -> None:
-    """Sort each scene's points in place by x, then y, then z: as integers that hold one after the other.
+    """Sorts each scene's points in place by x, then y, then z, using integers that contain all three.
 
-    Coordinates are rounded to a millionth of the scene's largest.
+    Coordinates are rounded to a millionth of the scene's largest one.
     """
-    middle = 1 << (BITS - 1)
+    middle = 1 << (COORDINATE_BITS - 1)
     largest = torch.stack([p.abs().amax(1) for p in points]).amax(0)
-    scale = ((middle - 1) / largest.clamp(min=TINY))[:, None]
+    scale = ((middle - 1) / largest.clamp(min=EPSILON))[:, None]
     key = torch.zeros_like(points[0], dtype=torch.int64)
     for p in points:
-        key = (key << BITS) | ((p * scale).round_().long() + middle)
+        key = (key << COORDINATE_BITS) | ((p * scale).round_().long() + middle)
     if key.device.type == "cpu":
-        key.numpy().sort(axis=1)  # several times as fast as PyTorch's, which also makes the indices
+        key.numpy().sort(axis=1)  # several times faster than PyTorch's sort, which also computes indices
     else:
         key = key.sort(1).values
     for i, p in enumerate(points):
-        torch.div(((key >> (2 - i) * BITS) & ((1 << BITS) - 1)) - middle, scale, out=p)
+        torch.div(((key >> (2 - i) * COORDINATE_BITS) & ((1 << COORDINATE_BITS) - 1)) - middle, scale, out=p)

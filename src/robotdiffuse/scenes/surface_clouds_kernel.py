@@ -1,4 +1,4 @@
-"""Point clouds of packed scenes by compiled code: `surface_clouds` on the CPU, for whole surfaces."""
+"""Numba kernel of `surface_clouds`: samples whole surfaces of packed scenes on the CPU."""
 
 import numpy as np
 from numba import njit
@@ -21,9 +21,9 @@ def _next(x):
 
 @njit(cache=True, nogil=True)
 def fill_clouds(kinds, params, seeds, out):
-    """Points uniform by area over the shapes of each scene, in out[n, count, 3]; zeros where there is none.
+    """Writes points that are uniform by area over the shapes of each scene to out[n, count, 3].
 
-    kinds [n, k] and params [n, k, 10] of `PackedScenes`; seeds uint64[n].
+    Scenes without shapes get zeros. kinds [n, k] and params [n, k, 10] as in `PackedScenes`; seeds uint64[n].
     """
     n, k = kinds.shape
     count = out.shape[1]
@@ -38,7 +38,7 @@ def fill_clouds(kinds, params, seeds, out):
             out[i] = np.float32(0.0)
             continue
         x = seeds[i] | np.uint64(1)
-        for _ in range(8):  # seeds that differ in a few bits part
+        for _ in range(8):  # mixes seeds that differ in few bits
             x = _next(x)
         for p in range(count):
             x = _next(x)
@@ -57,19 +57,19 @@ def fill_clouds(kinds, params, seeds, out):
                     a = np.float32(x >> np.uint64(40)) * _UNIT * _TWO - _ONE
                     b = np.float32((x >> np.uint64(16)) & _MASK) * _UNIT * _TWO - _ONE
                     s = a * a + b * b
-                # G. Marsaglia 1972: a direction from a point of the disc
+                # G. Marsaglia 1972: a direction from a point of the unit disc
                 ring, radius = _TWO * np.sqrt(_ONE - s), params[i, j, 3]
                 out[i, p, 0] = params[i, j, 0] + radius * ring * a
                 out[i, p, 1] = params[i, j, 1] + radius * ring * b
                 out[i, p, 2] = params[i, j, 2] + radius * (_ONE - _TWO * s)
                 continue
             start = ends[j - 1] if j > 0 else np.float32(0.0)
-            share = pick - start
+            offset = pick - start
             side = _HALF if x & np.uint64(1) else -_HALF
             u, v = u - _HALF, v - _HALF
-            if share < faces[j, 0]:
+            if offset < faces[j, 0]:
                 a, b, c = side, u, v
-            elif share < faces[j, 1]:
+            elif offset < faces[j, 1]:
                 a, b, c = u, side, v
             else:
                 a, b, c = u, v, side
@@ -79,7 +79,8 @@ def fill_clouds(kinds, params, seeds, out):
 
 @njit(cache=True)
 def _prepare(kind, row, faces, turn):
-    """Area of a shape [m^2]; of a box also where its pairs of faces end in it, and axes times sizes."""
+    """Area of a shape [m^2]. For boxes, also writes the cumulative areas of face pairs and axes times
+    sizes."""
     if kind == SPHERE:
         return np.float32(4.0 * np.pi) * row[3] * row[3]
     if kind != BOX:

@@ -1,5 +1,7 @@
-"""Points on the surfaces of obstacles: what the encoder sees of a scene. Of many scenes at once, see
-`surface_clouds`."""
+"""Samples points on the surfaces of obstacles, the network input of a scene.
+
+See `surface_clouds` for many scenes at once.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,18 +16,20 @@ from robotdiffuse.core.settings import Positive, Settings
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud, Shape, Sphere, Triangulated
 
-ROUNDS = 6
-"""How often `sample_surface` draws before it repeats points that it has."""
+MAX_SAMPLING_ROUNDS = 6
+"""Rounds of sampling in `sample_surface` before it repeats points."""
 
 
 @dataclass(frozen=True)
 class VisibleRegion(Settings, name="region"):
-    """Where points on obstacles count: within reach of the arm and above the plane that it stands on."""
+    """The region whose surface points are network inputs: within the arm's reach, above its mounting
+    plane."""
 
     floor: float = 0.02
-    """Points must be higher than this [m]: the mounting plane is part of every scene and tells nothing."""
+    """Points must be higher than this [m]: every scene contains the mounting plane, which carries no
+    information."""
     center: tuple[float, float, float] = (0.0, 0.0, 0.3)
-    """In the base frame [m]: on the base axis, about at a Panda's shoulder."""
+    """Centre of the region in the base frame [m]: on the base axis, near a Panda's shoulder."""
     reach: Positive = 1.2
     """Points must be within this distance of the centre [m]; a Panda's flange reaches 0.86."""
 
@@ -37,6 +41,7 @@ class VisibleRegion(Settings, name="region"):
             )
 
     def holds(self, points: Float[ndarray, "*b 3"]) -> ndarray:
+        """Which points are in the region."""
         x, y, z = (points[..., i] - self.center[i] for i in range(3))
         return (points[..., 2] > self.floor) & (x * x + y * y + z * z < self.reach**2)
 
@@ -103,7 +108,8 @@ DRAWS: dict[type[Shape], Callable[..., ndarray]] = {
     Mesh: _triangles,
     PointCloud: _point_cloud,
 }
-"""By shape: n points, uniform by area, in the base frame; of a shape that is not here, on its triangles."""
+"""For each shape class, a function that samples n points uniformly by area, in the base frame. For classes
+that are not listed, the triangles are sampled."""
 
 
 def _draw_of(shape: Shape) -> Callable[..., ndarray]:
@@ -115,23 +121,24 @@ def sample_surface(
 ) -> Float[ndarray, "count 3"]:
     """`count` points on the shapes, in random order, uniform by area within the region [m].
 
-    Where hardly anything of a surface lies in the region, points repeat. If nothing does: no points, an
-    array of shape (0, 3).
+    Points repeat if only a small part of the surface lies in the region. If no part does, the array has shape
+    (0, 3).
     """
-    shapes = [shape for shape in scene.shapes if shape.area > 0 and _may_be_seen(shape, region)]
+    shapes = [shape for shape in scene.shapes if shape.area > 0 and _may_intersect(shape, region)]
     if not shapes or count == 0:
         return np.zeros((0, 3))
     areas = np.array([shape.area for shape in shapes])
     shares = areas / areas.sum()
     found: list[ndarray] = []
     missing, draw = count, 2 * count
-    for _ in range(ROUNDS):
+    for _ in range(MAX_SAMPLING_ROUNDS):
         parts = rng.multinomial(draw, shares)
         draws = [_draw_of(shape) for shape in shapes]
         drawn = [f(s, int(n), rng) for f, s, n in zip(draws, shapes, parts, strict=True) if n > 0]
         points = np.concatenate(drawn)
         points = points[region.holds(points)]
-        # The points come shape by shape; any first few of them would be of the first shape alone.
+        # The points are ordered by shape: without the permutation, the first ones would all be on the first
+        # shape.
         points = points[rng.permutation(len(points))[:missing]]
         found.append(points)
         missing -= len(points)
@@ -144,7 +151,7 @@ def sample_surface(
     return points
 
 
-def _may_be_seen(shape: Shape, region: VisibleRegion) -> bool:
+def _may_intersect(shape: Shape, region: VisibleRegion) -> bool:
     low, high = shape.bounds
     if high[2] <= region.floor:
         return False

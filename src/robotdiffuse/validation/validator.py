@@ -173,7 +173,7 @@ class Verifier:
         """Whether a path is certified free of collision and keeps the path constraints. Start, goal and
         limits are not checked."""
         self._check_shape(path.joint_names, path.positions)
-        if self.constraints is not None and self.constraints.first(path.positions) is not None:
+        if self.constraints is not None and self.constraints.first_violation(path.positions) is not None:
             return False
         return self._continuous.sweep(path.positions).contact is None
 
@@ -261,7 +261,7 @@ class Verifier:
             return None
         chord = 0.0 if along is None else self.settings.constraint_chord
         clock, q = (clock, q) if along is None else along
-        wrong = self.constraints.first(q, chord)
+        wrong = self.constraints.first_violation(q, chord)
         if wrong is None:
             return None
         at = float(np.interp(wrong.at, np.arange(len(clock)), clock))
@@ -272,13 +272,13 @@ class Verifier:
         """The first place where a frame is faster than its constraint allows."""
         assert self.constraints is not None
         speeds = self.constraints.speeds(trajectory.positions, trajectory.velocities)
-        excess = speeds - self.constraints.most_speeds * (1 + self.settings.rate_slack)
+        excess = speeds - self.constraints.speed_limits * (1 + self.settings.rate_slack)
         bad = np.flatnonzero((excess > 0).any(axis=1))
         if not len(bad):
             return []
         i, k = int(bad[0]), int(excess[bad[0]].argmax())
-        one, at = self.constraints.paced[k], float(trajectory.times[bad[0]])
-        most = self.constraints.most_speeds[k]
+        one, at = self.constraints.speed_limited[k], float(trajectory.times[bad[0]])
+        most = self.constraints.speed_limits[k]
         message = f"{one.frame} moves at {speeds[i, k]:.4g} m/s; {one.kind} allows {most:.4g} m/s"
         return [Violation("speed", at, message, one.frame, one.kind, float(excess[:, k].max()))]
 

@@ -14,7 +14,7 @@ from robotdiffuse.perception.depth_view import AssumedPoints, SeenPoints
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.robots.visual_meshes import load_visual
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated, pose
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, PointCloud, Shape, Sphere, Triangulated
 
 START, GOAL = (0x4F, 0x7F, 0xD9), (0x10, 0xA3, 0x7F)
 """sRGB colours of the start and goal of a motion; the trace fades from one to the other."""
@@ -172,14 +172,14 @@ def shape_surface(shape: Shape, color: tuple[int, int, int]) -> Surface:
         solid = trimesh.creation.icosphere(subdivisions=4, radius=shape.radius)
         T[:3, 3] = shape.center
     elif isinstance(shape, Box):
-        solid, T = trimesh.creation.box(shape.size), pose(shape)
+        solid, T = trimesh.creation.box(shape.size), shape.T_base_shape
     elif isinstance(shape, Cylinder):
         solid = trimesh.creation.cylinder(shape.radius, shape.height, sections=72)
-        T = pose(shape)
+        T = shape.T_base_shape
     elif isinstance(shape, Capsule):
         solid = trimesh.creation.capsule(shape.height, shape.radius, count=(48, 32))
         solid.apply_translation([0, 0, -solid.bounds.mean(axis=0)[2]])
-        T = pose(shape)
+        T = shape.T_base_shape
     elif isinstance(shape, PointCloud):
         return _point_surface(shape, color)
     else:

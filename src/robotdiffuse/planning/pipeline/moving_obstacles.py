@@ -154,7 +154,7 @@ def _timed(
     count = int(DURATION_FACTOR * longest + EXTRA_TIME / GRID_STEP)
     check_timing(f"a grid of {count} times", CELL_SECONDS * count * len(configurations))
     times = GRID_STEP * np.arange(count)
-    speed = max(one.greatest_speed for one in problem.moving)
+    speed = max(one.top_speed for one in problem.moving)
     asked = clearance + (GRID_TRAVEL + speed * GRID_STEP) / 2
     clear = free_at_times(links, collision.tracks, configurations, times, asked)
     cells = list[ndarray]()

@@ -39,7 +39,6 @@ from robotdiffuse.problems.problem import Problem, check_problem
 from robotdiffuse.robots.robot import Robot
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shape_transforms import placed
 from robotdiffuse.scenes.shapes import Shape
 from robotdiffuse.validation.validator import verifier
 
@@ -199,7 +198,7 @@ class Replanner:
     def _predict(self) -> "_MovingObstacles":
         """The predicted obstacles, with the largest safety margin that the arm keeps now."""
         moving = [seen.straight_on(self._now) for seen in self._seen.values()]
-        speeds = np.array([seen.obstacle.greatest_speed for seen in self._seen.values()])
+        speeds = np.array([seen.obstacle.top_speed for seen in self._seen.values()])
         here = self._path.at(float(self._motion.s[0]))
         predicted = _MovingObstacles(self._robot, moving, self._now)
         for share in MARGIN_FRACTIONS:
@@ -331,13 +330,13 @@ class _Observed:
 
     def again(self, value: ArrayLike, now: float) -> "_Observed":
         """The obstacle after a new observation."""
-        name, T_before = self.obstacle.name, placed(self.obstacle.shape)
+        name, T_before = self.obstacle.name, self.obstacle.shape.T_base_shape
         xyz = numbers(value)
         if xyz is not None and xyz.shape == (3,) and within(xyz):
             T = transform(xyz, T_before[:3, :3])
         else:
             T = rigid_transform(f"observation[{name!r}]", value)
-        most = self.obstacle.greatest_speed
+        most = self.obstacle.top_speed
         velocity = self.obstacle.velocity
         if np.isfinite(self.time):
             passed = now - self.time
@@ -354,7 +353,7 @@ class _Observed:
 
     def anywhere(self) -> MovingObstacle:
         """The obstacle moving in any way from when it was last seen."""
-        return MovingObstacle(self.obstacle.shape, max_speed=self.obstacle.greatest_speed)
+        return MovingObstacle(self.obstacle.shape, max_speed=self.obstacle.top_speed)
 
     def straight_on(self, now: float) -> MovingObstacle:
         """The obstacle keeping the velocity last seen, from now on."""

@@ -124,7 +124,7 @@ def _straight(limits, a, b, memory):
     evaluate(rows, a, 0, work)
     evaluate(rows, b, 1, work)
     for m in range(len(limits.kept)):
-        most = max(work.values[0, m], work.values[1, m]) + MAX_GROWTH * rows.room[m]
+        most = max(work.values[0, m], work.values[1, m]) + MAX_GROWTH * rows.tolerance[m]
         memory.growing[m] = min(limits.kept[m], most)
     return proved(rows, memory.growing, a, b, MIN_PROOF_PIECE, work)[1] < 0
 

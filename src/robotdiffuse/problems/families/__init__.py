@@ -1,4 +1,4 @@
-"""Families of random problems by name: ROP, the paper's, its dense variant, and furniture."""
+"""Families of random problems by name: ROP (the paper's), its dense variant, and furniture."""
 
 from typing import TYPE_CHECKING
 
@@ -12,17 +12,17 @@ FAMILIES = Registry(
     "family",
     {
         "rop": Entry(f"{HERE}.rop:ROP", "the paper's: two spheres or cubes around the arm, and a floor"),
-        "rop_dense": Entry(f"{HERE}.rop_dense:ROP_DENSE", "3 to 12 smaller ones of varied size"),
+        "rop_dense": Entry(f"{HERE}.rop_dense:ROP_DENSE", "3 to 12 smaller spheres or cubes of varied size"),
         "shelf": Entry(f"{HERE}.shelf:SHELF", "from one compartment of a bookcase to another"),
         "crate": Entry(f"{HERE}.crate:CRATE", "in and out of open-topped boxes on the ground"),
-        "table": Entry(f"{HERE}.table:TABLE", "between the things on a table, and beneath it"),
-        "clutter": Entry(f"{HERE}.clutter:CLUTTER", "between many small things on a table"),
-        "kitchen": Entry(f"{HERE}.kitchen:KITCHEN", "in ovens, cupboards and on a counter"),
+        "table": Entry(f"{HERE}.table:TABLE", "between the objects on a table, and beneath it"),
+        "clutter": Entry(f"{HERE}.clutter:CLUTTER", "between many small objects on a table"),
+        "kitchen": Entry(f"{HERE}.kitchen:KITCHEN", "in ovens and cupboards and on a counter"),
     },
 )
-"""New ones at the end: the seeds of held-out problems go by the place in this table."""
+"""Append new families at the end: the seeds of held-out problems depend on the position in this table."""
 
 
 def load_family(name: str) -> "Family":
-    """Raises InputError, listing the known names, for an unknown one."""
+    """The family of this name. Raises InputError, which lists the known names, for an unknown one."""
     return FAMILIES.load(name)

@@ -1,4 +1,4 @@
-"""A table of many small things, close together: most of what stands in the second row is hidden."""
+"""A table with many small objects close together; those in front hide most of those behind."""
 
 from robotdiffuse.problems.families.table import Table
 

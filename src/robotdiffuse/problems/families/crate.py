@@ -1,4 +1,4 @@
-"""Open-topped boxes on the ground or on blocks, and things around them."""
+"""Open crates on the ground or on blocks, with loose objects around them."""
 
 from dataclasses import dataclass
 
@@ -10,13 +10,13 @@ from robotdiffuse.problems.families.family import PositiveRange
 from robotdiffuse.problems.families.furniture import (
     DOWN,
     PLACE_TRIES,
-    Built,
+    Build,
     Furniture,
+    FurnitureFrame,
+    LooseObject,
     NoRoomError,
+    Rectangle,
     Region,
-    Square,
-    Standing,
-    Thing,
     count,
     is_free,
 )
@@ -25,34 +25,36 @@ from robotdiffuse.scenes.shapes import Box, Sphere
 
 @dataclass(frozen=True)
 class Crate(Furniture):
-    """Open-topped boxes on the ground or on blocks, and things around them. Regions are the insides of the
-    crates and free spots on the ground; the hand points down. Lengths in [m]."""
+    """Open crates on the ground or on blocks, with loose objects around them. Lengths in [m].
+
+    Regions are the insides of the crates and free spots on the ground; the hand points down.
+    """
 
     object_height: PositiveRange = (0.1, 0.5)
     crates: tuple[Count, Count] = (1, 2)
     distance: PositiveRange = (0.4, 0.65)
-    """From the base to the middle of a crate, of a thing or of a spot."""
+    """From the base to the middle of a crate, a loose object or a spot."""
     length: PositiveRange = (0.25, 0.45)
-    """Inside, along and across."""
+    """Inner length and width of a crate."""
     height: PositiveRange = (0.12, 0.3)
-    """Of the walls, inside."""
+    """Inner height of the walls."""
     thickness: PositiveRange = (0.01, 0.03)
-    """Of walls and bottom of a crate."""
+    """Thickness of the walls and the bottom of a crate."""
     raised_share: Share = 0.4
-    """Share of the crates that stand on a block."""
+    """Fraction of the crates that stand on a block."""
     block_height: PositiveRange = (0.05, 0.3)
     spots: tuple[Natural, Natural] = (1, 2)
     """Number of free spots on the ground."""
     spot_size: PositiveRange = (0.12, 0.2)
 
     @property
-    def most_obstacles(self) -> int:
+    def max_obstacles(self) -> int:
         return 6 * self.crates[1] + self.objects[1]
 
-    def build(self, rng: Generator) -> Built:
+    def build(self, rng: Generator) -> Build:
         shapes: list[Box | Sphere] = []
         regions: list[Region] = []
-        taken: list[Square] = []
+        taken: list[Rectangle] = []
         for _ in range(count(self.crates, rng)):
             x, y = rng.uniform(*self.length, 2) / 2
             h, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
@@ -74,16 +76,19 @@ class Crate(Furniture):
             frame = _free_place(self, float(np.sqrt(2) * half), taken, rng)
             regions.append(frame.region((-half, -half, 0.0), (half, half, 2 * half), DOWN))
         for _ in range(count(self.objects, rng)):
-            thing = Thing(self, rng)
-            frame = _free_place(self, thing.half, taken, rng)
-            shapes.append(thing.placed(frame, 0.0, 0.0, 0.0))
+            loose = LooseObject(self, rng)
+            frame = _free_place(self, loose.half, taken, rng)
+            shapes.append(loose.placed(frame, 0.0, 0.0, 0.0))
         return shapes, regions
 
 
-def _free_place(crate: Crate, half: float, taken: list[Square], rng: Generator) -> Standing:
-    """A free place on the ground for a thing of this half width, which is taken then; raises NoRoomError."""
+def _free_place(crate: Crate, half: float, taken: list[Rectangle], rng: Generator) -> FurnitureFrame:
+    """A free place on the ground for an object of this half width, which is then marked as taken.
+
+    Raises NoRoomError.
+    """
     for _ in range(PLACE_TRIES):
-        frame = Standing(crate, crate.distance, rng)
+        frame = FurnitureFrame(crate, crate.distance, rng)
         square = (float(frame.xy[0]), float(frame.xy[1]), half, half)
         if is_free(square, taken):
             taken.append(square)

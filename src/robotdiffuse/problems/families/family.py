@@ -1,4 +1,4 @@
-"""What a family of random problems is, and how all of them draw starts and goals."""
+"""Family: the protocol of random problem generators, and how they sample starts and goals."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -21,14 +21,14 @@ from robotdiffuse.scenes.shapes import Box, Sphere
 
 Range = tuple[float, float]
 PositiveRange = tuple[Positive, Positive]
-"""Drawn from uniformly; equal ends fix the value."""
+"""A range that is sampled uniformly; equal bounds fix the value."""
 
 
 class Ranges(Settings):
-    """Settings whose pairs of numbers are ranges that are drawn from."""
+    """Settings whose pairs of numbers are ranges to sample from."""
 
     def __post_init__(self) -> None:
-        """Raises InputError, too, for a range whose first number is the greater one."""
+        """Raises InputError also for a range whose first number is larger than the second."""
         super().__post_init__()
         for name, value in self.to_json().items():
             pair = value if isinstance(value, tuple) and len(value) == 2 else (0, 0)
@@ -37,95 +37,102 @@ class Ranges(Settings):
 
 
 CONFIGURATION, POSITION, POSE = "configuration", "position", "pose"
-"""What is given of the goal: a configuration, the position of the robot's tip, or its whole pose."""
+"""Kinds of targets: a goal configuration, a position of the robot's tip, or its pose."""
 
-BATCH = 64
-"""Configurations drawn at once; a good part of them is usable."""
-BATCHES = 8
-"""Draws before a scene is given up: a few leave hardly any room."""
-SCENES = 100
-"""Scenes given up, for want of a start or of a goal, before a family is called impossible."""
-AT_LIMIT = 1e-3
-"""Joints closer than this to a limit count as clipped [rad]."""
-FULL_POSE = InverseKinematicsSettings(max_rounds=4, patience=2)
-"""A few rounds: a target inside an obstacle is better drawn anew than searched for long."""
-POSE_JOINTS = 6
-"""Joints that any pose takes."""
-POSITION_ONLY = replace(FULL_POSE, position_only=True)
+BATCH_SIZE = 64
+"""Configurations sampled at once; many of them are free."""
+MAX_BATCHES = 8
+"""Batches before a scene is given up: some scenes leave hardly any free space."""
+MAX_SCENES = 100
+"""Scenes without a free start or goal before sampling fails with an error."""
+LIMIT_MARGIN = 1e-3
+"""Joints within this distance of a limit count as clipped [rad]."""
+POSE_IK = InverseKinematicsSettings(max_rounds=4, patience=2)
+"""Few rounds: it is faster to sample another target than to search long for one inside an obstacle."""
+MIN_POSE_DOF = 6
+"""Minimum number of joints for an arm to reach arbitrary poses."""
+POSITION_IK = replace(POSE_IK, position_only=True)
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """A random problem. With several goals, all of them bring the tip to one target."""
+class SampledProblem:
+    """A random problem. All of its goals bring the tip to the same target."""
 
     scene: Scene
     """The floor first, if the family has one."""
     start: Float[ndarray, "dof"]
     goals: Float[ndarray, "k dof"]
     T_base_tip: Float[ndarray, "4 4"]
-    """The target; where only its position is given, the orientation is that of the first goal."""
+    """The target; if only its position is given, the orientation is that of the first goal."""
 
     def problem(self, robot: Robot) -> Problem:
-        """Any of the goals will do, and any of whole turns of their joints."""
+        """The problem to reach any of the goals, with any number of full turns of their joints."""
         goals = np.concatenate([robot.same_stance(goal, self.start) for goal in self.goals])
         return Problem(robot, self.scene, self.start, JointGoal(goals))
 
 
 @runtime_checkable
 class Family(Protocol):
-    """Random problems of one kind. A new family is a file with one of these and a line in FAMILIES."""
+    """Random problems of one kind. A new family is a file with such an object and a line in FAMILIES."""
 
     __dataclass_fields__: ClassVar[dict[str, Any]]
-    """Its settings, which data sets keep."""
+    """The settings, which data sets store."""
 
     @property
     def floor(self) -> Box | None:
-        """The first shape of every scene; None if they have no floor."""
+        """The first shape of every scene; None if the scenes have no floor."""
         ...
 
     @property
     def region(self) -> Float[ndarray, "2 3"]:
-        """Low and high corner of where the robot's tip is at start and goal [m]."""
+        """Lower and upper corner of the box of tip positions at start and goal [m]."""
         ...
 
     @property
-    def most_obstacles(self) -> int:
-        """Of a scene, the floor left out."""
+    def max_obstacles(self) -> int:
+        """Maximum number of obstacles of a scene, without the floor."""
         ...
 
     def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
-        """A random scene. `keep_out` are spheres, x y z radius, that nothing but the floor may enter."""
+        """A random scene. keep_out: spheres (x, y, z, radius) that only the floor may intersect."""
         ...
 
-    def draw(self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION) -> Drawn:
-        """A random problem with up to so many goals; the same state of `rng` gives the same one.
+    def draw(
+        self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION
+    ) -> SampledProblem:
+        """A random problem with up to `goals` goals; the same state of `rng` gives the same problem.
 
-        Obstacles stay clear of the robot's immovable base; start and goals are free of collision. Raises
-        InputError if the family leaves this robot no such problem.
+        Obstacles do not intersect the robot's fixed base, and start and goals are free of collision. Raises
+        InputError if no such problem was found for this robot.
         """
         ...
 
 
-def first_drawn(draw: Callable[[], Drawn | None], family: Family, robot: Robot) -> Drawn:
-    """The first problem that `draw` makes: it draws a scene anew and gives None if that has no ends."""
-    for _ in range(SCENES):
+def sample_until_found(
+    draw: Callable[[], SampledProblem | None], family: Family, robot: Robot
+) -> SampledProblem:
+    """The first problem that `draw` returns. Each call tries one scene; None means it has no free start or
+    goal."""
+    for _ in range(MAX_SCENES):
         drawn = draw()
         if drawn is not None:
             return drawn
     raise InputError(
-        f"no free start and goal in {SCENES} scenes of {type(family).__name__} for {robot.name}: its tip "
-        f"{robot.tip} cannot be where these scenes want it"
+        f"no free start and goal in {MAX_SCENES} scenes of {type(family).__name__} for {robot.name}: its tip "
+        f"{robot.tip} does not reach the targets of these scenes"
     )
 
 
 def uniform_configurations(
     robot: Robot, region: Float[ndarray, "2 3"], checker: CollisionChecker, count: int, rng: Generator
 ) -> Float[ndarray, "k dof"]:
-    """Up to `count` configurations, uniform within the joint limits among those that are free of collision
-    and have the origin of the tip link in the region; fewer where a number of draws found no more."""
+    """Up to `count` collision-free configurations with the origin of the tip link in the region.
+
+    They are uniform within the joint limits. There are fewer if MAX_BATCHES batches contain no more.
+    """
     found = np.zeros((0, robot.dof))
-    for _ in range(BATCHES):
-        q = robot.least_turns(rng.uniform(robot.lower, robot.upper, (BATCH, robot.dof)))
+    for _ in range(MAX_BATCHES):
+        q = robot.least_turns(rng.uniform(robot.lower, robot.upper, (BATCH_SIZE, robot.dof)))
         xyz = link_origins(robot, q, robot.tip)
         q = q[((xyz >= region[0]) & (xyz <= region[1])).all(axis=1)]
         found = np.concatenate([found, q[checker.free(q)] if len(q) else q])
@@ -140,25 +147,26 @@ def reaching_configurations(
     count: int,
     checker: CollisionChecker,
     rng: Generator,
-    settings: InverseKinematicsSettings = FULL_POSE,
+    settings: InverseKinematicsSettings = POSE_IK,
 ) -> Float[ndarray, "k dof"]:
-    """Up to `count` free configurations with the tip at its target, as float32: what data hold, so that the
-    validator sees exactly these. Arms of fewer than six joints reach positions alone.
+    """Up to `count` free configurations with the tip at its target. Arms with fewer than six joints only
+    reach the position.
 
-    Solutions with a joint at a limit, where the solver clips it, would be far too many, and are left out.
+    They are float32, as in data sets, so that the validator gets exactly the stored values. Solutions with a
+    joint at a limit are left out: the solver clips joints there, so they would be far too frequent.
     """
 
     def accept(q: Float[ndarray, "n dof"]) -> Bool[ndarray, "n"]:
-        inside = ((q > robot.lower + AT_LIMIT) & (q < robot.upper - AT_LIMIT)).all(axis=1)
+        inside = ((q > robot.lower + LIMIT_MARGIN) & (q < robot.upper - LIMIT_MARGIN)).all(axis=1)
         return inside & checker.free(q)
 
-    settings = replace(settings, position_only=True) if robot.dof < POSE_JOINTS else settings
+    settings = replace(settings, position_only=True) if robot.dof < MIN_POSE_DOF else settings
     q = inverse_kinematics(robot, robot.tip, T_base_tip, count, rng=rng, accept=accept, settings=settings)
     return robot.least_turns(q).astype(np.float32)
 
 
 def base_spheres(robot: Robot) -> Float[ndarray, "m 4"]:
-    """Collision spheres, x y z radius, of the links that no planned joint moves, in the base frame [m]."""
+    """Collision spheres (x, y, z, radius) of the links that no planned joint moves, in the base frame [m]."""
     parts = [np.zeros((0, 4))]
     for link, spheres in robot.spheres.items():
         if robot.link_frame(link) == 0:
@@ -167,8 +175,8 @@ def base_spheres(robot: Robot) -> Float[ndarray, "m 4"]:
     return np.concatenate(parts)
 
 
-def keeps_out(shape: Sphere | Box, keep_out: Float[ndarray, "m 4"] | None) -> bool:
-    """Whether a shape stays clear of spheres, x y z radius."""
+def is_clear_of(shape: Sphere | Box, keep_out: Float[ndarray, "m 4"] | None) -> bool:
+    """Whether a shape intersects none of the spheres (x, y, z, radius)."""
     if keep_out is None:
         return True
     local = keep_out[:, :3] - shape.center

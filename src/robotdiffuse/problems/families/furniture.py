@@ -1,8 +1,8 @@
-"""What the families of furniture share: shelves, crates and tables around an arm that stands on the ground.
+"""Furniture: base of the families with shelves, crates and tables around an arm that stands on the ground.
 
-Everything is made of spheres and of boxes turned about the vertical, so the scenes pack as ROP's do. Each
-comes with regions, where the fingers of the arm have something to do: in compartments, in crates and between
-the things on a table; `sample_target` draws poses there.
+All shapes are spheres, and boxes rotated about the vertical axis, so that the scenes can be packed like
+ROP's. Each scene has regions in which the arm works: in compartments, in crates and between the objects on a
+table. `sample_target` samples poses with the fingers in a region.
 """
 
 from abc import ABC, abstractmethod
@@ -19,15 +19,15 @@ from robotdiffuse.core.settings import Natural, Positive, Share
 from robotdiffuse.core.transforms import rotation_about, rotation_z_to, transform
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
-    POSE_JOINTS,
-    Drawn,
+    MIN_POSE_DOF,
     PositiveRange,
     Range,
     Ranges,
+    SampledProblem,
     base_spheres,
-    first_drawn,
-    keeps_out,
+    is_clear_of,
     reaching_configurations,
+    sample_until_found,
 )
 from robotdiffuse.robots.kinematics import link_pose
 from robotdiffuse.robots.robot import Robot
@@ -35,95 +35,95 @@ from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Sphere
 
 FLOOR = Box((0.0, 0.0, -0.05), (3.0, 3.0, 0.1), name="floor")
-"""With its top at z = 0: wide enough for all that stands around the arm."""
+"""A floor with its top at z = 0, large enough for all furniture around the arm."""
 SHOULDER = np.array([0.0, 0.0, 0.33])
-"""Reaches are measured from here, a Panda's shoulder [m]."""
-MARGIN = 0.03
-"""Targets keep this distance from the sides of their region where it is wide enough [m]."""
-FINGERS = 0.1
-"""From the origin of a Panda's tip link, along its z axis, to about its fingertips [m]."""
-HAND = 0.3
-"""The tip is at most this far from the middle of the region that its fingers are in [m]."""
+"""Origin of reaches: a Panda's shoulder [m]."""
+REGION_MARGIN = 0.03
+"""Distance of targets from the sides of their region, if it is wide enough [m]."""
+FINGER_LENGTH = 0.1
+"""Approximate distance from the origin of a Panda's tip link, along its z axis, to its fingertips [m]."""
+HAND_LENGTH = 0.3
+"""Maximum distance of the tip from the middle of the region that contains its fingers [m]."""
 DOWN = np.array([0.0, 0.0, -1.0])
 AHEAD = np.array([1.0, 0.0, 0.0])
-"""Of a piece of furniture: away from the arm."""
+"""Direction away from the arm, in the frame of the furniture."""
 MAX_TRIES = 1000
-"""Draws of a scene before the settings are called impossible."""
+"""Samples of a scene before the settings are rejected."""
 PLACE_TRIES = 30
-"""Draws of a free place for one thing before the scene is drawn anew."""
-GAP = 0.01
-"""Least distance between the things that stand on a table or on the ground [m]."""
+"""Samples of a free place for one object before the scene is sampled anew."""
+MIN_GAP = 0.01
+"""Minimum distance between the objects on a table or on the ground [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A box free of furniture, turned about the vertical, where the fingers are to be at start or goal."""
+    """A box without obstacles, rotated about the vertical axis, for the fingers at start or goal."""
 
     center: Float[ndarray, "3"]
     """In the base frame [m]."""
     size: Float[ndarray, "3"]
     """Full edge lengths [m]."""
     yaw: float
-    """Of the box [rad]."""
+    """Rotation of the box about the vertical axis [rad]."""
     approach: Float[ndarray, "3"]
-    """Unit vector, in the base frame, along which the hand points: into a compartment, down into a crate."""
+    """Unit vector, in the base frame, in which the hand points: into a compartment, or down into a crate."""
 
 
 @dataclass(frozen=True, eq=False)
-class Furnished:
+class FurnishedScene:
     """A scene and its regions, at least two."""
 
     scene: Scene
-    """The floor first."""
+    """The scene; its first shape is the floor."""
     regions: tuple[Region, ...]
 
 
 def sample_target(
-    region: Region, rng: Generator, spread: float = 0.4, fingers: float = FINGERS
+    region: Region, rng: Generator, spread: float = 0.4, finger_length: float = FINGER_LENGTH
 ) -> Float[ndarray, "4 4"]:
     """A random pose T_base_tip of the robot's tip link, with its fingers in the region.
 
-    The point `fingers` [m] ahead of the link's origin, along its z axis, is uniform in the region less a
-    margin. The z axis is uniform among the directions within `spread` [rad] of the region's approach, and the
-    turn about it is uniform.
+    The point at `finger_length` [m] along the link's z axis is uniform in the region, less a margin. The z
+    axis is uniform among the directions within `spread` [rad] of the region's approach, and the rotation
+    about it is uniform.
     """
-    half = np.maximum(region.size / 2 - MARGIN, 0)
+    half = np.maximum(region.size / 2 - REGION_MARGIN, 0)
     point = region.center + rotation_about(-DOWN, region.yaw) @ rng.uniform(-half, half)
     tilt = np.arccos(rng.uniform(np.cos(spread), 1.0))
     turn, roll = rng.uniform(-np.pi, np.pi, 2)
     about_z = [rotation_about(-DOWN, float(angle)) for angle in (turn, roll)]
     tilted = about_z[0] @ rotation_about(np.array([0.0, 1.0, 0.0]), float(tilt)) @ about_z[1]
     rotation = rotation_z_to(region.approach) @ tilted
-    return transform(point - fingers * rotation[:, 2], rotation)
+    return transform(point - finger_length * rotation[:, 2], rotation)
 
 
 @dataclass(frozen=True)
 class Furniture(Ranges, ABC):
-    """What all families share. Every range is drawn from uniformly; equal ends fix the value."""
+    """Settings of all furniture families. Every range is sampled uniformly; equal bounds fix the value."""
 
     bearing: Range = (-np.pi, np.pi)
-    """Direction of the furniture from the base, from the x axis [rad]."""
+    """Direction from the base to the furniture, measured from the x axis [rad]."""
     turn: Range = (-0.3, 0.3)
-    """Turn of the furniture about the vertical, from where it faces the base [rad]."""
+    """Rotation of the furniture about the vertical axis; 0 faces the base [rad]."""
     reach: Positive = 0.8
-    """Regions whose centre is farther than this from the shoulder are left out [m]."""
+    """Maximum distance of the centres of regions from the shoulder; other regions are left out [m]."""
     objects: tuple[Natural, Natural] = (0, 4)
-    """Least and greatest number of loose things."""
+    """Minimum and maximum number of loose objects."""
     object_width: PositiveRange = (0.05, 0.12)
-    """Edges of a loose box, or diameter of a ball, as seen from above [m]."""
+    """Horizontal edge lengths of a loose box, or diameter of a ball [m]."""
     object_height: PositiveRange = (0.06, 0.3)
-    """Of loose boxes [m]."""
+    """Height of loose boxes [m]."""
     ball_share: Share = 0.25
-    """Share of the loose things that are balls."""
+    """Fraction of the loose objects that are balls."""
 
     @property
     @abstractmethod
-    def most_obstacles(self) -> int:
-        """Of a scene, the floor left out."""
+    def max_obstacles(self) -> int:
+        """Maximum number of obstacles of a scene, without the floor."""
 
     @abstractmethod
-    def build(self, rng: Generator) -> "Built":
-        """Shapes and regions, in reach or not; raises NoRoomError."""
+    def build(self, rng: Generator) -> "Build":
+        """The shapes and all regions, whether in reach or not. Raises NoRoomError."""
 
     @property
     def floor(self) -> Box:
@@ -131,15 +131,15 @@ class Furniture(Ranges, ABC):
 
     @property
     def region(self) -> Float[ndarray, "2 3"]:
-        """The hand may be outside a region that its fingers are in."""
-        far = self.reach + HAND
+        """Box of tip positions: the hand may be outside the region that contains its fingers."""
+        far = self.reach + HAND_LENGTH
         return np.array([[-far, -far, 0.0], [far, far, SHOULDER[2] + far]])
 
-    def furnish(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Furnished:
-        """A random scene; the same state of `rng` gives the same one.
+    def furnish(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> FurnishedScene:
+        """A random scene; the same state of `rng` gives the same scene.
 
-        `keep_out` are spheres, x y z radius, that nothing but the floor may enter: those of the robot's
-        immovable base. Raises InputError if the settings leave no scene with two regions in reach.
+        keep_out: spheres (x, y, z, radius), e.g. of the robot's fixed base, that only the floor may
+        intersect. Raises InputError if no scene with two regions in reach was found.
         """
         for _ in range(MAX_TRIES):
             try:
@@ -147,22 +147,27 @@ class Furniture(Ranges, ABC):
             except NoRoomError:
                 continue
             regions = [r for r in regions if np.linalg.norm(r.center - SHOULDER) <= self.reach]
-            if len(regions) >= 2 and all(keeps_out(shape, keep_out) for shape in shapes):
-                return Furnished(Scene([self.floor, *shapes]), tuple(regions))
+            if len(regions) >= 2 and all(is_clear_of(shape, keep_out) for shape in shapes):
+                return FurnishedScene(Scene([self.floor, *shapes]), tuple(regions))
         raise InputError(
             f"no scene of {type(self).__name__} with two regions in reach and nothing in the robot's base in "
-            f"{MAX_TRIES} draws; change distance or reach"
+            f"{MAX_TRIES} samples; change distance or reach"
         )
 
     def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
         return self.furnish(rng, keep_out).scene
 
-    def draw(self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION) -> Drawn:
-        """Start and goals are poses with the fingers in two of the regions, whatever the target; for an arm
-        of fewer than six joints, their positions."""
+    def draw(
+        self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION
+    ) -> SampledProblem:
+        """A random problem; see `Family.draw`.
+
+        For every target, start and goals have the fingers in two of the regions; arms with fewer than six
+        joints only reach the positions of these poses.
+        """
         keep_out = base_spheres(robot)
 
-        def attempt() -> Drawn | None:
+        def attempt() -> SampledProblem | None:
             furnished = self.furnish(rng, keep_out)
             checker = CollisionChecker(robot, furnished.scene)
             first, second = (furnished.regions[i] for i in rng.choice(len(furnished.regions), 2, False))
@@ -171,19 +176,19 @@ class Furniture(Ranges, ABC):
                 return None
             T_base_tip = sample_target(second, rng)
             reached = reaching_configurations(robot, T_base_tip, goals, checker, rng)
-            if len(reached) and robot.dof < POSE_JOINTS:
+            if len(reached) and robot.dof < MIN_POSE_DOF:
                 T_base_tip = link_pose(robot, reached[0].astype(np.float64), robot.tip)
-            return Drawn(furnished.scene, start[0], reached, T_base_tip) if len(reached) else None
+            return SampledProblem(furnished.scene, start[0], reached, T_base_tip) if len(reached) else None
 
-        return first_drawn(attempt, self, robot)
+        return sample_until_found(attempt, self, robot)
 
 
 Corner = tuple[float, float, float]
-Built = tuple[list[Box | Sphere], list[Region]]
+Build = tuple[list[Box | Sphere], list[Region]]
 
 
-class Standing:
-    """Where a piece of furniture stands: x points away from the arm, y to the left, z up from the ground."""
+class FurnitureFrame:
+    """Frame of a piece of furniture: x points away from the arm, y to the left, z up from the ground."""
 
     def __init__(self, settings: Furniture, distance: Range, rng: Generator) -> None:
         bearing, away = rng.uniform(*settings.bearing), rng.uniform(*distance)
@@ -192,10 +197,11 @@ class Standing:
         self.rotation = rotation_about(-DOWN, self.yaw)
 
     def point(self, xyz: Float[ndarray, "3"]) -> Float[ndarray, "3"]:
+        """A point of this frame, in the base frame [m]."""
         return self.rotation @ xyz + [*self.xy, 0.0]
 
     def box(self, low: Corner, high: Corner, name: str, turn: float = 0.0) -> Box:
-        """A box by two corners, then turned about its middle."""
+        """A box with two opposite corners in this frame, then rotated about its middle by `turn` [rad]."""
         half = (self.yaw + turn) / 2
         middle, size = (np.array(low) + high) / 2, np.subtract(high, low)
         return Box(self.point(middle), size, (np.cos(half), 0.0, 0.0, np.sin(half)), name)
@@ -205,8 +211,8 @@ class Standing:
         return Region(self.point(middle), size, self.yaw, self.rotation @ approach)
 
 
-class Thing:
-    """A loose box or ball, at most `tallest` high."""
+class LooseObject:
+    """A random loose box or ball, at most `tallest` high [m]."""
 
     def __init__(self, settings: Furniture, rng: Generator, tallest: float = np.inf) -> None:
         x, y = rng.uniform(*settings.object_width, 2)
@@ -215,34 +221,36 @@ class Thing:
         self.size = (x, x, x) if self.ball else (x, y, min(rng.uniform(*settings.object_height), tallest))
         self.turn = float(rng.uniform(-np.pi, np.pi))
         self.half = x / 2 if self.ball else float(np.hypot(x, y)) / 2
-        """Half the side of a square that holds it, however it is turned."""
+        """Half the side of a square that contains it at any rotation."""
 
-    def placed(self, frame: Standing, x: float, y: float, z: float) -> Box | Sphere:
-        """It stands on the height z at x, y of the frame."""
+    def placed(self, frame: FurnitureFrame, x: float, y: float, z: float) -> Box | Sphere:
+        """The shape at x, y of the frame, standing at height z."""
         a, b, c = self.size
         if self.ball:
             return Sphere(frame.point(np.array([x, y, z + c / 2])), c / 2, "ball")
         return frame.box((x - a / 2, y - b / 2, z), (x + a / 2, y + b / 2, z + c), "thing", self.turn)
 
 
-Square = tuple[float, float, float, float]
+Rectangle = tuple[float, float, float, float]
 """A rectangle on a surface: x, y of the middle, half edges."""
 
 
 class NoRoomError(Exception):
-    """There is no free place for something: the scene is drawn anew."""
+    """No free place for an object was found: the scene is sampled anew."""
 
 
 class Surface:
-    """The upper side of a table or a counter, at a height [m], from 0 to `length` ahead and `side` to either
-    hand: finds free places for things and for the fingers."""
+    """The top of a table or a counter, where free places for objects and for the fingers are found.
 
-    def __init__(self, frame: Standing, length: float, side: float, height: float) -> None:
+    It extends from 0 to `length` along x and to `side` in both directions of y, at a height [m].
+    """
+
+    def __init__(self, frame: FurnitureFrame, length: float, side: float, height: float) -> None:
         self.frame, self.length, self.side, self.height = frame, length, side, height
-        self.taken: list[Square] = []
+        self.taken: list[Rectangle] = []
 
     def place(self, half_x: float, half_y: float, rng: Generator) -> tuple[float, float]:
-        """The middle of a free rectangle, which is taken then; raises NoRoomError."""
+        """The middle of a free rectangle, which is then marked as taken. Raises NoRoomError."""
         fits = half_x < self.length / 2 and half_y < self.side
         for _ in range(PLACE_TRIES if fits else 0):
             x = float(rng.uniform(half_x, self.length - half_x))
@@ -253,7 +261,7 @@ class Surface:
         raise NoRoomError
 
     def spots(self, numbers: tuple[int, int], size: Range, rng: Generator) -> list[Region]:
-        """Regions that nothing stands on, as high as they are wide, where the hand points down."""
+        """Random free regions, as high as they are wide, where the hand points down."""
         found: list[Region] = []
         for _ in range(count(numbers, rng)):
             half = rng.uniform(*size) / 2
@@ -262,19 +270,21 @@ class Surface:
             found.append(self.frame.region(low, high, DOWN))
         return found
 
-    def things(self, settings: Furniture, rng: Generator) -> list[Box | Sphere]:
-        """The settings' number of loose things."""
+    def loose_objects(self, settings: Furniture, rng: Generator) -> list[Box | Sphere]:
+        """The random loose objects of the settings."""
         found: list[Box | Sphere] = []
         for _ in range(count(settings.objects, rng)):
-            thing = Thing(settings, rng)
-            found.append(thing.placed(self.frame, *self.place(thing.half, thing.half, rng), self.height))
+            loose = LooseObject(settings, rng)
+            found.append(loose.placed(self.frame, *self.place(loose.half, loose.half, rng), self.height))
         return found
 
 
-def is_free(square: Square, taken: list[Square]) -> bool:
+def is_free(square: Rectangle, taken: list[Rectangle]) -> bool:
+    """Whether a rectangle keeps MIN_GAP from all those that are taken."""
     x, y, a, b = square
-    return all(abs(x - u) >= a + c + GAP or abs(y - v) >= b + d + GAP for u, v, c, d in taken)
+    return all(abs(x - u) >= a + c + MIN_GAP or abs(y - v) >= b + d + MIN_GAP for u, v, c, d in taken)
 
 
 def count(numbers: tuple[int, int], rng: Generator) -> int:
+    """A random number between two, inclusive."""
     return int(rng.integers(numbers[0], numbers[1] + 1))

@@ -1,4 +1,4 @@
-"""ROP: the paper's family of random scenes, a few spheres and cubes around the arm."""
+"""ROP: the paper's family of random problems, with a few spheres and cubes around the arm."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -14,15 +14,15 @@ from robotdiffuse.core.settings import Natural, OneOf
 from robotdiffuse.problems.families.family import (
     CONFIGURATION,
     POSITION,
-    POSITION_ONLY,
-    Drawn,
+    POSITION_IK,
     PositiveRange,
     Range,
     Ranges,
+    SampledProblem,
     base_spheres,
-    first_drawn,
-    keeps_out,
+    is_clear_of,
     reaching_configurations,
+    sample_until_found,
     uniform_configurations,
 )
 from robotdiffuse.robots.kinematics import link_pose
@@ -32,33 +32,33 @@ from robotdiffuse.scenes.shapes import IDENTITY, Box, Sphere
 
 KINDS = ("sphere", "box")
 FLOOR = Box((0.0, 0.0, -0.05), (2.0, 2.0, 0.1), name="floor")
-"""With its top at z = 0."""
+"""A floor with its top at z = 0."""
 MAX_TRIES = 1000
-"""Draws of an obstacle before the settings are called impossible."""
+"""Samples of an obstacle before the settings are rejected."""
 
 
 @dataclass(frozen=True)
 class Rop(Ranges):
-    """What ROP scenes and problems are drawn from. The defaults are the paper's, as its code has them.
+    """The distribution of ROP scenes and problems. The defaults are those of the paper's code.
 
-    Every range is drawn from uniformly; equal ends fix the value. Lengths in [m], in the robot's base frame.
+    Every range is sampled uniformly; equal bounds fix the value. Lengths in [m], in the robot's base frame.
     """
 
     obstacles: tuple[Natural, Natural] = (2, 2)
-    """Least and greatest number of obstacles, both included."""
+    """Minimum and maximum number of obstacles, inclusive."""
     kinds: tuple[Annotated[str, OneOf(KINDS)], ...] = KINDS
-    """Drawn from for each obstacle: sphere, box (a cube)."""
+    """Kinds of obstacles, one of which is chosen for each: sphere, box (a cube)."""
     sphere_radius: PositiveRange = (0.25, 0.25)
-    """The paper's planner sees 0.25 of spheres of 0.2: a margin of 5 cm."""
+    """The paper's spheres have a radius of 0.2, and its planner inflates them to 0.25: a margin of 5 cm."""
     cube_side: PositiveRange = (0.2, 0.2)
     x: Range = (-1.0, 1.0)
-    """Centres of the obstacles."""
+    """Coordinates of the obstacles' centres."""
     y: Range = (-1.0, 1.0)
     z: Range = (0.1, 1.0)
     yaw: bool = False
-    """Whether cubes are turned about the vertical."""
+    """Whether cubes are rotated about the vertical axis."""
     tip_x: Range = (-0.6, 0.6)
-    """Where the robot's tip is at the start and at the goal."""
+    """Coordinates of the robot's tip at start and goal."""
     tip_y: Range = (-0.6, 0.6)
     tip_z: Range = (0.2, 0.8)
 
@@ -76,14 +76,14 @@ class Rop(Ranges):
         return np.array([self.tip_x, self.tip_y, self.tip_z]).T
 
     @property
-    def most_obstacles(self) -> int:
+    def max_obstacles(self) -> int:
         return self.obstacles[1]
 
     def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
-        """A random scene. `keep_out` are spheres, x y z radius, that no obstacle may enter: those of the
-        robot's immovable base. The floor is not held against them.
+        """A random scene. keep_out: spheres (x, y, z, radius), e.g. of the robot's fixed base, that no
+        obstacle may intersect; the floor may.
 
-        Raises InputError if the settings leave no place for an obstacle.
+        Raises InputError if no place for an obstacle was found.
         """
         low, high = self.obstacles
         return Scene([self.floor, *(self._placed(rng, keep_out) for _ in range(rng.integers(low, high + 1)))])
@@ -91,9 +91,9 @@ class Rop(Ranges):
     def _placed(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None) -> Sphere | Box:
         for _ in range(MAX_TRIES):
             shape = self._obstacle(rng)
-            if keeps_out(shape, keep_out):
+            if is_clear_of(shape, keep_out):
                 return shape
-        raise InputError(f"no obstacle stays clear of the robot's base in {MAX_TRIES} draws; widen x, y, z")
+        raise InputError(f"no obstacle stays clear of the robot's base in {MAX_TRIES} samples; widen x, y, z")
 
     def _obstacle(self, rng: Generator) -> Sphere | Box:
         kind = self.kinds[int(rng.integers(len(self.kinds)))]
@@ -101,38 +101,44 @@ class Rop(Ranges):
         if kind == "sphere":
             return Sphere(center, rng.uniform(*self.sphere_radius))
         side = rng.uniform(*self.cube_side)
-        # A quarter turn of a cube is the cube again.
+        # A quarter turn maps a cube to itself.
         angle = rng.uniform(-np.pi / 4, np.pi / 4) if self.yaw else 0.0
         wxyz = (np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)) if self.yaw else IDENTITY
         return Box(center, (side, side, side), wxyz)
 
-    def draw(self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION) -> Drawn:
-        """Target `position`: the positions of the tip at start and goal are uniform in the region, as the
-        authors' are; configurations come from inverse kinematics. Otherwise start and goal are uniform among
-        the free configurations with the tip in the region; with `pose`, further goals share the tip's pose.
+    def draw(
+        self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION
+    ) -> SampledProblem:
+        """A random problem; see `Family.draw`.
+
+        With target `position`, the tip positions at start and goal are uniform in the region, as in the
+        authors' code, and configurations come from inverse kinematics. Otherwise start and goal are uniform
+        among the free configurations with the tip in the region; with `pose`, all goals share the tip's pose.
         """
         keep_out = base_spheres(robot)
 
-        def attempt() -> Drawn | None:
+        def attempt() -> SampledProblem | None:
             scene = self.scene(rng, keep_out)
             checker = CollisionChecker(robot, scene)
             ends = self._by_position if target == POSITION else self._by_configuration
             return ends(robot, scene, checker, goals, target, rng)
 
-        return first_drawn(attempt, self, robot)
+        return sample_until_found(attempt, self, robot)
 
     def _by_position(
         self, robot: Robot, scene: Scene, checker: CollisionChecker, goals: int, _: str, rng: Generator
-    ) -> Drawn | None:
+    ) -> SampledProblem | None:
         found = []
         for count in (1, goals):
             T_base_tip = np.eye(4)
             T_base_tip[:3, 3] = rng.uniform(*self.region)
-            found.append(reaching_configurations(robot, T_base_tip, count, checker, rng, POSITION_ONLY))
+            found.append(reaching_configurations(robot, T_base_tip, count, checker, rng, POSITION_IK))
             if not len(found[-1]):
                 return None
         (start,), reached = found
-        return Drawn(scene, start, reached, link_pose(robot, reached[0].astype(np.float64), robot.tip))
+        return SampledProblem(
+            scene, start, reached, link_pose(robot, reached[0].astype(np.float64), robot.tip)
+        )
 
     def _by_configuration(
         self,
@@ -142,8 +148,8 @@ class Rop(Ranges):
         goals: int,
         target: str,
         rng: Generator,
-    ) -> Drawn | None:
-        # a draw of two, or two of one each: the distribution is the same, the stream of rng is not
+    ) -> SampledProblem | None:
+        # one call for two or two calls for one: same distribution, but rng is used differently
         each = (2,) if target == CONFIGURATION else (1, 1)
         ends = [uniform_configurations(robot, self.region, checker, count, rng) for count in each]
         if sum(map(len, ends)) < 2:
@@ -151,12 +157,12 @@ class Rop(Ranges):
         start, goal = np.concatenate(ends)
         T_base_tip = link_pose(robot, goal, robot.tip)
         if target == CONFIGURATION:
-            return Drawn(scene, start, goal[None], T_base_tip)
+            return SampledProblem(scene, start, goal[None], T_base_tip)
         reached = goal[None].astype(np.float32)
         if goals > 1:
             others = reaching_configurations(robot, T_base_tip, goals - 1, checker, rng)
             reached = np.concatenate([reached, others])
-        return Drawn(scene, start.astype(np.float32), reached, T_base_tip)
+        return SampledProblem(scene, start.astype(np.float32), reached, T_base_tip)
 
 
 ROP = Rop()

@@ -1,4 +1,5 @@
-"""ROP with more and smaller obstacles of varied size: about half of these problems are not trivial."""
+"""ROP with more and smaller obstacles of varied size: in about half of these problems the straight line is
+blocked."""
 
 from robotdiffuse.problems.families.rop import Rop
 

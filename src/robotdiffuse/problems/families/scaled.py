@@ -1,8 +1,8 @@
-"""Families in the size of an arm: they are made for a Panda, and stretched for arms of another reach.
+"""Scales families to the size of an arm: they are designed for a Panda's reach.
 
-What is drawn is drawn for the arm in the size that has a Panda's reach; then scene and targets take the arm's
-own size. Joints turn through the same angles in both. So the problems of a small arm are as hard as those of
-a large one, and a family needs to know nothing of it.
+A problem is sampled for a copy of the arm that is scaled to a Panda's reach; then scene and targets are
+scaled to the arm's own size. Joint angles are the same for both. Problems are thus equally hard for small and
+large arms, and families do not depend on the size of the arm.
 """
 
 from dataclasses import dataclass, replace
@@ -12,34 +12,34 @@ from numpy import ndarray
 from numpy.random import Generator
 
 from robotdiffuse.problems.families import load_family
-from robotdiffuse.problems.families.family import CONFIGURATION, Drawn, Family
+from robotdiffuse.problems.families.family import CONFIGURATION, Family, SampledProblem
 from robotdiffuse.robots.robot import Robot, once_per_robot
 from robotdiffuse.robots.scaling import reach, scaled
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import Box, Shape, Sphere
 
 PANDA_REACH = 0.855
-"""[m], by `robots.scaling.reach`."""
-ALIKE = (0.8, 1.25)
-"""Arms whose reach is such a share of a Panda's get the families as they are: a table is a table."""
+"""A Panda's reach, as computed by `robots.scaling.reach` [m]."""
+UNSCALED_RANGE = (0.8, 1.25)
+"""Families are not scaled for arms whose reach, relative to a Panda's, is in this range."""
 
 
 @once_per_robot
 def scale_for(robot: Robot) -> float:
-    """What the lengths of families are multiplied by for an arm."""
-    share = reach(robot) / PANDA_REACH
-    return 1.0 if ALIKE[0] <= share <= ALIKE[1] else round(share, 2)
+    """The factor that scales the lengths of families to an arm."""
+    ratio = reach(robot) / PANDA_REACH
+    return 1.0 if UNSCALED_RANGE[0] <= ratio <= UNSCALED_RANGE[1] else round(ratio, 2)
 
 
 def family_for(name: str, robot: Robot) -> Family:
-    """A family in the size of the arm. Raises InputError, listing the known names, for an unknown one."""
+    """A family scaled to the arm. Raises InputError, which lists the known names, for an unknown one."""
     family, scale = load_family(name), scale_for(robot)
     return family if scale == 1.0 else ScaledFamily(family, scale)
 
 
 @dataclass(frozen=True)
 class ScaledFamily:
-    """A family, so many times as large. Raises InputError where the family does."""
+    """A family whose lengths are multiplied by `scale`. Raises InputError where the family does."""
 
     family: Family
     scale: float
@@ -53,23 +53,25 @@ class ScaledFamily:
         return self.family.region * self.scale
 
     @property
-    def most_obstacles(self) -> int:
-        return self.family.most_obstacles
+    def max_obstacles(self) -> int:
+        return self.family.max_obstacles
 
     def scene(self, rng: Generator, keep_out: Float[ndarray, "m 4"] | None = None) -> Scene:
         keep_out = None if keep_out is None else keep_out / self.scale
         return _scene(self.family.scene(rng, keep_out), self.scale)
 
-    def draw(self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION) -> Drawn:
-        drawn = self.family.draw(_as_drawn_for(robot), rng, goals, target)
+    def draw(
+        self, robot: Robot, rng: Generator, goals: int = 1, target: str = CONFIGURATION
+    ) -> SampledProblem:
+        drawn = self.family.draw(_panda_sized(robot), rng, goals, target)
         T_base_tip = drawn.T_base_tip.copy()
         T_base_tip[:3, 3] *= self.scale
         return replace(drawn, scene=_scene(drawn.scene, self.scale), T_base_tip=T_base_tip)
 
 
 @once_per_robot
-def _as_drawn_for(robot: Robot) -> Robot:
-    """The arm with about a Panda's reach."""
+def _panda_sized(robot: Robot) -> Robot:
+    """The arm scaled to about a Panda's reach."""
     return scaled(robot, 1 / scale_for(robot))
 
 
@@ -78,7 +80,7 @@ def _scene(scene: Scene, scale: float) -> Scene:
 
 
 def _sized(shape: Shape, scale: float) -> Shape:
-    """Families are of spheres and boxes."""
+    """The shape, a sphere or a box, with its lengths multiplied by `scale`."""
     if isinstance(shape, Sphere):
         return replace(shape, center=shape.center * scale, radius=shape.radius * scale)
     assert isinstance(shape, Box)

@@ -1,4 +1,4 @@
-"""A table with things on it, sometimes divided by a wall or with a pillar."""
+"""A table with loose objects, sometimes divided by a wall or with a pillar."""
 
 from dataclasses import dataclass
 
@@ -9,43 +9,46 @@ from robotdiffuse.core.settings import Natural, Share
 from robotdiffuse.problems.families.family import PositiveRange
 from robotdiffuse.problems.families.furniture import (
     AHEAD,
-    Built,
+    Build,
     Furniture,
+    FurnitureFrame,
     Region,
-    Standing,
     Surface,
 )
 from robotdiffuse.scenes.shapes import Box, Sphere
 
-BENEATH = 0.3
-"""Tables at least this high have a region beneath [m]."""
+MIN_OPEN_HEIGHT = 0.3
+"""Minimum height of tables with a region beneath them [m]."""
 
 
 @dataclass(frozen=True)
 class Table(Furniture):
-    """A table with things on it, sometimes divided by a wall or with a pillar. Regions are free spots between
-    the things, where the hand points down, and the space beneath a table on legs. Lengths in [m]."""
+    """A table with loose objects, sometimes divided by a wall or with a pillar. Lengths in [m].
+
+    Regions are free spots between the objects, where the hand points down, and the space beneath a table on
+    legs, where it points forward.
+    """
 
     objects: tuple[Natural, Natural] = (3, 10)
     object_height: PositiveRange = (0.08, 0.35)
     distance: PositiveRange = (0.25, 0.4)
-    """From the base to the middle of the near edge."""
+    """From the base to the middle of the near edge of the table."""
     height: PositiveRange = (0.1, 0.5)
-    """Of the upper side."""
+    """Height of the table's top."""
     length: PositiveRange = (0.45, 0.7)
-    """Away from the arm."""
+    """Extent away from the arm."""
     width: PositiveRange = (0.8, 1.4)
     thickness: PositiveRange = (0.02, 0.04)
-    """Of the top, and of a dividing wall."""
+    """Thickness of the top and of a dividing wall."""
     legs_share: Share = 0.5
-    """Share of the tables on four legs; the others are solid."""
+    """Fraction of the tables with four legs; the others are solid."""
     leg_width: PositiveRange = (0.04, 0.07)
     wall_share: Share = 0.5
-    """Share of the tables with a wall that runs away from the arm, in the middle part."""
+    """Fraction of the tables with a wall, near the middle, that runs away from the arm."""
     pillar_share: Share = 0.3
-    """Share of the tables with a pillar."""
+    """Fraction of the tables with a pillar."""
     divider_height: PositiveRange = (0.25, 0.6)
-    """Of walls and pillars."""
+    """Height of walls and pillars."""
     pillar_width: PositiveRange = (0.06, 0.12)
     spots: tuple[Natural, Natural] = (2, 4)
     spot_size: PositiveRange = (0.12, 0.2)
@@ -59,11 +62,11 @@ class Table(Furniture):
             )
 
     @property
-    def most_obstacles(self) -> int:
+    def max_obstacles(self) -> int:
         return 6 + self.objects[1]
 
-    def build(self, rng: Generator) -> Built:
-        frame = Standing(self, self.distance, rng)
+    def build(self, rng: Generator) -> Build:
+        frame = FurnitureFrame(self, self.distance, rng)
         length, side = rng.uniform(*self.length), rng.uniform(*self.width) / 2
         height, t = rng.uniform(*self.height), rng.uniform(*self.thickness)
         legs = rng.random() < self.legs_share
@@ -75,7 +78,7 @@ class Table(Furniture):
             w = rng.uniform(*self.leg_width)
             for x, y in ((0.0, -side), (0.0, side - w), (length - w, -side), (length - w, side - w)):
                 shapes.append(frame.box((x, y, 0.0), (x + w, y + w, under), "leg"))
-            if under > BENEATH:
+            if under > MIN_OPEN_HEIGHT:
                 inner = side - w
                 regions.append(frame.region((0.0, -inner, 0.0), (length / 2, inner, under), AHEAD))
         surface = Surface(frame, length, side, height)
@@ -89,7 +92,7 @@ class Table(Furniture):
             x, y = surface.place(w, w, rng)
             shapes.append(frame.box((x - w, y - w, height), (x + w, y + w, top), "pillar"))
         regions += surface.spots(self.spots, self.spot_size, rng)
-        shapes += surface.things(self, rng)
+        shapes += surface.loose_objects(self, rng)
         return shapes, regions
 
 

@@ -9,7 +9,7 @@ from numpy import ndarray
 
 from robotdiffuse.core.errors import InputError, unknown_name
 from robotdiffuse.core.transforms import inverse, rotation_from_quaternion, transform
-from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere, pose
+from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, Shape, Sphere
 
 NEW_OBSTACLES: dict[str, Callable[[Float[ndarray, "3"], float], Shape]] = {
     "sphere": lambda center, size: Sphere(center, size),
@@ -35,7 +35,7 @@ def new_obstacle(kind: str, center: Float[ndarray, "3"], size: float) -> Shape:
 def handle_pose(shape: Shape) -> Float[ndarray, "4 4"]:
     """T_base_handle of the frame that a shape is dragged by: its own, or the middle of its bounds."""
     if isinstance(shape, Box | Cylinder | Capsule):
-        return pose(shape)
+        return shape.T_base_shape
     if isinstance(shape, Sphere):
         return transform(shape.center)
     if isinstance(shape, Mesh):

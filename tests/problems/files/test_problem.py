@@ -28,7 +28,7 @@ from robotdiffuse.scenes.shapes import Box, Capsule, Cylinder, Mesh, PointCloud,
 
 Z = np.array([0.0, 0.0, 1.0])
 READY = [0.0, -0.785, 0.0, -2.356, 0.0, 1.571, 0.785]
-DATA = Path(__file__).parents[1] / "files"
+DATA = Path(__file__).parents[2] / "files"
 
 
 def crane() -> Robot:
@@ -112,7 +112,7 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
             lambda: problem(goal=PoseGoal("claw", np.eye(4))),
             "unknown link in goal.frame: 'claw'; known: hook, jib, tower",
         ),
-        (lambda: problem(goal=PoseGoal("plinth", np.eye(4))), "'plinth' is moved by no planned joint"),
+        (lambda: problem(goal=PoseGoal("plinth", np.eye(4))), "no planned joint moves 'plinth'"),
         (lambda: PoseGoal(7, np.eye(4)), "goal.frame is 7"),  # type: ignore[arg-type]
         (lambda: PoseGoal("hook", np.eye(3)), "it must be 4 x 4 finite numbers"),
         (lambda: PoseGoal("hook", np.eye(4) * np.nan), "it must be 4 x 4 finite numbers"),
@@ -198,7 +198,7 @@ WRONG: dict[str, tuple[object, str]] = {
         "'open'; it must be a number",
     ),
     "locked NaN": (GOOD | {"locked": {"panda_finger_joint1": float("nan")}}, "panda_finger_joint1 is nan"),
-    "locked a list": (GOOD | {"locked": [1]}, "locked is .* it must map names of joints to values"),
+    "locked a list": (GOOD | {"locked": [1]}, "locked is .* it must map joint names to values"),
     "unknown shape": (shape(pyramid={}), r"unknown shape in scene\[1\]: 'pyramid'; known: box, capsule"),
     "unknown shape field": (
         shape(sphere={"center": [0, 0, 1], "radius": 1, "color": "red"}),

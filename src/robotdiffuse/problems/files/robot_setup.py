@@ -1,4 +1,4 @@
-"""What a robot is given in a problem file: where its base stands, a tool, and objects that it holds.
+"""Reads and writes the robot's setup in problem files: base pose, tool, attached objects and payload.
 
 base: {xyz: [0, 0, 0.7], wxyz: [1, 0, 0, 0]}
 tool: {link: panda_hand, xyz: [0, 0, 0.15], shapes: [{cylinder: {...}}]}
@@ -23,26 +23,27 @@ from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
 from robotdiffuse.scenes.shapes import IDENTITY, Shape
 
-ORIGIN = (0.0, 0.0, 0.0)
-DIGITS = 12
-"""Poses that were computed are written with so many decimals: as they were read."""
+NO_TRANSLATION = (0.0, 0.0, 0.0)
+WRITTEN_DECIMALS = 12
+"""Decimals of computed poses in files: enough to restore the values that were read."""
 
 
 def read_pose(where: str, data: object) -> Float[ndarray, "4 4"]:
-    """The transform of {xyz: [...], wxyz: [...]}, each of which may be left out; InputError otherwise."""
+    """The transform of {xyz: [...], wxyz: [...]}, both optional. Raises InputError for anything else."""
     return pose_of(where, check_fields(where, data, (), ("xyz", "wxyz")))
 
 
 def pose_of(where: str, values: dict[str, Any]) -> Float[ndarray, "4 4"]:
-    """The transform of the fields xyz and wxyz among others, each of which may be left out."""
-    xyz = vector(where, "xyz", values.get("xyz", ORIGIN), 3)
+    """The transform of the fields xyz and wxyz, both optional; other fields are ignored."""
+    xyz = vector(where, "xyz", values.get("xyz", NO_TRANSLATION), 3)
     return transform(xyz, rotation_from_quaternion(unit_quaternion(where, values.get("wxyz", IDENTITY))))
 
 
 def equipped(robot: Robot, tool: object, attached: object, folder: Path) -> tuple[Robot, tuple[str, ...]]:
-    """The robot with the tool and the objects of a problem file, None where there are none; and notes.
+    """The robot with the tool and the attached objects of a problem file, and notes.
 
-    Raises InputError, which names the field, for unknown fields and whatever `Robot.attach` refuses.
+    tool, attached: the fields of the file, None where it has none. Raises InputError that names the field,
+    for unknown fields and whatever `Robot.attach` does not accept.
     """
     notes: list[str] = []
     if tool is not None:
@@ -58,7 +59,7 @@ def equipped(robot: Robot, tool: object, attached: object, folder: Path) -> tupl
         where = f"attached[{i}]"
         if not isinstance(entry, dict) or "link" not in entry:
             raise InputError(
-                f"{where} is {shown(entry)}; it must be a shape and its link, e.g. "
+                f"{where} is {shown(entry)}; it must be a shape with its link, e.g. "
                 "{link: panda_hand, box: {...}}"
             )
         shape = {key: value for key, value in entry.items() if key not in ("link", "touch_links")}
@@ -74,7 +75,7 @@ def equipped(robot: Robot, tool: object, attached: object, folder: Path) -> tupl
 
 
 def equipment_entries(robot: Robot, folder: Path | None) -> dict[str, Any]:
-    """The fields `tool` and `attached` of a robot, as `equipped` takes them."""
+    """The fields `tool` and `attached` of a robot, as `equipped` reads them."""
     entries: dict[str, Any] = {}
     for body in robot.attached:
         shapes = scene_entries(Scene([s for s in body.shapes if isinstance(s, Shape)]), folder)
@@ -88,16 +89,16 @@ def equipment_entries(robot: Robot, folder: Path | None) -> dict[str, Any]:
 
 
 def rounded(value: Any) -> Any:
-    """Plain data with its numbers rounded to DIGITS decimals."""
+    """Plain data with its numbers rounded to WRITTEN_DECIMALS decimals."""
     if isinstance(value, float):
-        return round(value, DIGITS) + 0.0
+        return round(value, WRITTEN_DECIMALS) + 0.0
     if isinstance(value, list):
         return [rounded(item) for item in value]
     return {key: rounded(item) for key, item in value.items()} if isinstance(value, dict) else value
 
 
 def one_shape(where: str, entry: dict[str, Any], folder: Path) -> tuple[tuple[Shape, ...], tuple[str, ...]]:
-    """The one shape of an entry such as {box: {...}}, as a tuple, and notes; InputError names the field."""
+    """The one shape of an entry such as {box: {...}}, as a tuple, and notes. Raises InputError."""
     try:
         scene, notes = read_scene([entry], folder, where)
     except InputError as error:
@@ -113,19 +114,21 @@ def _text(where: str, value: object) -> str:
 
 def _names(where: str, value: object) -> tuple[str, ...]:
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-        raise InputError(f"{where} is {shown(value)}; it must be a list of links")
+        raise InputError(f"{where} is {shown(value)}; it must be a list of link names")
     return tuple(value)
 
 
 def read_payload(data: object) -> Payload:
-    """{mass: 3.0, com: [0, 0, 0.1], link: panda_hand, moments: [...]}, all but the mass optional; InputError
-    for anything else."""
+    """The payload of {mass: 3.0, com: [0, 0, 0.1], link: panda_hand, moments: [...]}.
+
+    All fields but the mass are optional. Raises InputError for anything else.
+    """
     values = check_fields("payload", data, ("mass",), ("com", "link", "moments"))
     return Payload(**values)  # type: ignore[arg-type]
 
 
 def payload_entry(payload: Payload) -> dict[str, object]:
-    """The payload as `read_payload` takes it."""
+    """The field of a payload, as `read_payload` reads it."""
     data: dict[str, object] = {"mass": payload.mass, "com": payload.com.tolist()}
     if payload.link is not None:
         data["link"] = payload.link

@@ -24,7 +24,7 @@ from robotdiffuse.problems.files import (
     load_problems,
     problem_record,
 )
-from robotdiffuse.problems.moveit import (
+from robotdiffuse.problems.files.moveit import (
     MoveItFrames,
     moveit_frames,
     moveit_request,
@@ -38,7 +38,7 @@ from robotdiffuse.robots.parsing.urdf import read_urdf
 from robotdiffuse.robots.robot_folder import read_bundle, write_bundle
 from robotdiffuse.scenes.shapes import Box, Cylinder, Mesh, Sphere
 
-FOLDER = Path(__file__).parents[1] / "files" / "motion_bench_maker"
+FOLDER = Path(__file__).parents[2] / "files" / "motion_bench_maker"
 Z = np.array([0.0, 0.0, 1.0])
 QUARTER = [0, 0, 0.7071067811865476, 0.7071067811865476]
 """xyzw of a quarter turn about z."""
@@ -449,7 +449,7 @@ def test_scaling_factors_are_noted() -> None:
     request = moveit_request(request_data() | asked, moveit_frames({}, load_robot("panda")))
     [note] = request.notes
     assert note == (
-        "the request's max_velocity_scaling_factor 0.1 is not taken over: plan with velocity_scaling=0.1"
+        "the request's max_velocity_scaling_factor 0.1 is ignored: plan with velocity_scaling=0.1"
     )
 
 
@@ -464,7 +464,7 @@ WRONG_REQUESTS: dict[str, tuple[object, str]] = {
     "cartesian speed": (request_data() | {"max_cartesian_speed": 0.1}, "max_cartesian_speed is not supp"),
     "scaling": (
         request_data() | {"max_velocity_scaling_factor": 2},
-        "max_velocity_scaling_factor is 2; it must be a share from 0 to 1",
+        "max_velocity_scaling_factor is 2; it must be a number from 0 to 1",
     ),
     "attached": (
         change(request_data(), ["start_state", "attached_collision_objects"], [1]),
@@ -598,4 +598,4 @@ def test_a_mimic_joint_elsewhere_than_its_master_puts_it_is_a_note(tmp_path: Pat
     request = {"start_state": here, "goal_constraints": [goal]}
     (tmp_path / "request0001.yaml").write_text(yaml.safe_dump(request))
     [entry] = load_motion_bench_maker(tmp_path, robot)
-    assert entry.load().notes == ("start_state: follow is 0.01; planned at 0.03, where grip puts it",)
+    assert entry.load().notes == ("start_state: follow is 0.01; planned at 0.03, which grip implies",)

@@ -1,4 +1,4 @@
-"""Obstacles that move, in problem files.
+"""Reads and writes moving obstacles of problem files.
 
 moving:
   - {sphere: {center: [0.5, -0.6, 0.5], radius: 0.1}, velocity: [0, 0.3, 0]}
@@ -10,16 +10,16 @@ from pathlib import Path
 
 from robotdiffuse.core.errors import InputError, shown
 from robotdiffuse.core.transforms import pose_entry
-from robotdiffuse.problems.robot_setup_files import one_shape, read_pose
+from robotdiffuse.problems.files.robot_setup import one_shape, read_pose
 from robotdiffuse.scenes.files import SHAPES, scene_entries
 from robotdiffuse.scenes.moving_obstacles import MovingObstacle
 from robotdiffuse.scenes.scene import Scene
 
-MOTION = ("velocity", "times", "poses", "max_speed")
+MOTION_FIELDS = ("velocity", "times", "poses", "max_speed")
 
 
 def read_moving(entries: object, folder: Path) -> tuple[MovingObstacle, ...]:
-    """The field `moving` of a problem file; InputError, which names the field, for whatever is wrong."""
+    """The moving obstacles of a problem file. Raises InputError that names the field."""
     if not isinstance(entries, list):
         raise InputError(f"moving is {shown(entries)}; it must be a list of shapes with their motions")
     return tuple(_obstacle(f"moving[{i}]", entry, folder) for i, entry in enumerate(entries))
@@ -32,14 +32,14 @@ def _obstacle(where: str, entry: object, folder: Path) -> MovingObstacle:
             "{sphere: {...}, velocity: [0, 0.3, 0]}"
         )
     kinds = [name for name in entry if name in SHAPES]
-    unknown = [name for name in entry if name not in SHAPES and name not in MOTION]
+    unknown = [name for name in entry if name not in SHAPES and name not in MOTION_FIELDS]
     if unknown or len(kinds) != 1:
         raise InputError(
             f"{where} has the fields {', '.join(map(str, entry))}; it must have one shape of "
-            f"{', '.join(SHAPES)}, and of {', '.join(MOTION)} what says how it moves"
+            f"{', '.join(SHAPES)}, and a motion of {', '.join(MOTION_FIELDS)}"
         )
     [shape], _ = one_shape(where, {kinds[0]: entry[kinds[0]]}, folder)
-    motion = {name: entry[name] for name in MOTION if name in entry}
+    motion = {name: entry[name] for name in MOTION_FIELDS if name in entry}
     try:
         if "poses" in motion:
             if not isinstance(motion["poses"], list):
@@ -51,7 +51,7 @@ def _obstacle(where: str, entry: object, folder: Path) -> MovingObstacle:
 
 
 def moving_entry(obstacle: MovingObstacle, folder: Path | None) -> dict[str, object]:
-    """What `read_moving` takes of one."""
+    """The entry of a moving obstacle, as `read_moving` reads it."""
     [shape] = scene_entries(Scene([obstacle.shape]), folder)
     entry: dict[str, object] = dict(shape)
     if obstacle.velocity is not None:

@@ -1,10 +1,14 @@
-"""Problem files: one problem in YAML or JSON, many in JSON lines or a MotionBenchMaker folder."""
+"""Reads and writes problem files: YAML or JSON with one problem, JSON lines with many.
+
+Also reads folders of MotionBenchMaker, which hold MoveIt files.
+"""
 
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from numbers import Integral
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -13,11 +17,10 @@ from robotdiffuse.core.errors import InputError, check_type, shown, unknown_name
 from robotdiffuse.core.input_files import file_name, no_files, parse_json, parse_yaml, read_text, read_yaml
 from robotdiffuse.core.output_files import write_atomically
 from robotdiffuse.core.transforms import pose_entry
-from robotdiffuse.perception.depth_view import DepthView
 from robotdiffuse.perception.depth_view_files import read_views, view_entry
-from robotdiffuse.problems.constraint_files import constraint_entry, read_constraints
-from robotdiffuse.problems.goal_files import goal_entry, read_goal, read_waypoints
-from robotdiffuse.problems.moveit import (
+from robotdiffuse.problems.files.constraints import constraint_entry, read_constraints
+from robotdiffuse.problems.files.goals import goal_entry, read_goal, read_waypoints
+from robotdiffuse.problems.files.moveit import (
     MoveItRequest,
     holding_at,
     moveit_frames,
@@ -27,16 +30,8 @@ from robotdiffuse.problems.moveit import (
     request_robot_notes,
     scene_robot_notes,
 )
-from robotdiffuse.problems.moving_obstacle_files import moving_entry, read_moving
-from robotdiffuse.problems.problem import (
-    OPTIMISTIC,
-    JointGoal,
-    PoseGoal,
-    Problem,
-    check_clearance,
-    moved_goal,
-)
-from robotdiffuse.problems.robot_setup_files import (
+from robotdiffuse.problems.files.moving_obstacles import moving_entry, read_moving
+from robotdiffuse.problems.files.robot_setup import (
     equipment_entries,
     equipped,
     payload_entry,
@@ -44,28 +39,40 @@ from robotdiffuse.problems.robot_setup_files import (
     read_pose,
     rounded,
 )
+from robotdiffuse.problems.problem import (
+    OPTIMISTIC,
+    Goal,
+    JointGoal,
+    PoseGoal,
+    Problem,
+    ProblemOptions,
+    check_clearance,
+    moved_goal,
+)
 from robotdiffuse.robots import ROBOTS, load_robot
 from robotdiffuse.robots.robot import MIMIC_SLACK, MOVING_KINDS, Robot
 from robotdiffuse.scenes.files import check_fields, read_scene, scene_entries
 from robotdiffuse.scenes.scene import Scene
 
-FIELDS = ("robot", "scene", "start", "goal")
-OPTIONAL = (
+REQUIRED_FIELDS = ("robot", "scene", "start", "goal")
+REQUIRED_WITH_REQUEST = ("robot", "scene", "request")
+OPTIONAL_FIELDS = (
     *("locked", "base", "tool", "attached", "waypoints", "constraints", "clearance", "views", "unknown"),
     *("moving", "start_velocity", "blend", "payload"),
 )
+NOT_WITH_REQUEST = ("waypoints", "blend", "moving", "start_velocity")
 
 
 @dataclass(frozen=True, eq=False)
 class ProblemEntry:
-    """One of many problems: the problem, or what is wrong with it."""
+    """One of many problems: the problem, or the reason why it cannot be used."""
 
     name: str
     problem: Problem | None
     error: str = ""
 
     def load(self) -> Problem:
-        """The problem; InputError if it is not usable."""
+        """The problem. Raises InputError with the reason if it cannot be used."""
         if self.problem is None:
             raise InputError(self.error)
         return self.problem
@@ -74,11 +81,12 @@ class ProblemEntry:
 def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) -> Problem:
     """The problem in a .yaml, .yml or .json file, or the one at `index` (from 0) in a .jsonl file.
 
-    Files named in it are looked up from its folder. `scene` may name a MoveIt planning scene, and `request` a
-    MoveIt motion plan request in place of start and goal. Raises InputError, one line that names the file
-    and the field: unknown or missing fields and shapes, wrong kinds of values, all that `Problem` refuses.
+    File names in it are relative to its folder. `scene` may name a MoveIt planning scene, and `request` a
+    MoveIt motion plan request that replaces start and goal. Raises InputError, one line that names the file
+    and the field, for unknown or missing fields and shapes, values of the wrong type, and whatever `Problem`
+    does not accept.
 
-    ignore_joints: joints of MoveIt files that the robot lacks are a note rather than an error.
+    ignore_joints: joints of MoveIt files that the robot lacks are noted; otherwise they raise InputError.
     """
     file = file_name(file, "problem file")
     check_type("index", index, Integral, "a whole number from 0 on")
@@ -99,10 +107,10 @@ def load_problem(file: str | Path, index: int = 0, ignore_joints: bool = False) 
 
 
 def load_problems(file: str | Path, ignore_joints: bool = False) -> list[ProblemEntry]:
-    """All problems of a .jsonl file, of a MotionBenchMaker folder, or the one of any other problem file.
+    """All problems of a .jsonl file or a MotionBenchMaker folder, or the one problem of another file.
 
-    In a .jsonl file, each line is a problem as in `load_problem`, named after the file and its line; the
-    first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`;
+    In a .jsonl file, each line is a problem as in `load_problem`, named after the file and its line number;
+    the first wrong line raises InputError with its number. For folders see `load_motion_bench_maker`;
     `ignore_joints` as in `load_problem`.
     """
     file = file_name(file, "problem file")
@@ -119,7 +127,7 @@ def load_problems(file: str | Path, ignore_joints: bool = False) -> list[Problem
 
 
 def _lines(text: str) -> list[tuple[int, str]]:
-    """The lines that are not blank, with their numbers from 1."""
+    """The lines that are not blank, with their numbers, counted from 1."""
     return [(i, line) for i, line in enumerate(text.split("\n"), start=1) if line.strip()]
 
 
@@ -128,41 +136,42 @@ def problem_record(
 ) -> dict[str, object]:
     """The problem as the plain data of a problem file; numbers are kept exactly.
 
-    `robot` is what stands for the robot: a bundled name or a path to its URDF; by default where it was read
-    from. Files are named relative to `folder` if they are in it or below, otherwise by their full path.
-    Raises InputError for a robot that could not be found again.
+    robot: the bundled name, or the path to the URDF, to write; by default the one that it was loaded from.
+    folder: files in it or below it are named relative to it, others by their full path.
+    Raises InputError for a robot that is neither bundled nor loaded from a file.
     """
     if robot is None:
         robot = problem.robot.source or problem.robot.name
         if problem.robot.source is None and robot not in ROBOTS:
             raise InputError(
                 f"robot {shown(robot)} is neither bundled nor read from a file; give the path of its URDF as "
-                f"robot"
+                "robot"
             )
     folder = None if folder is None else Path(folder)
-    scene, goal, views, T = problem.known_scene, problem.goal, problem.views, problem.T_world_base
+    scene, goal, views, waypoints = problem.known_scene, problem.goal, problem.views, problem.waypoints
+    constraints, moving, T = problem.constraints, problem.moving, problem.T_world_base
     record: dict[str, object] = {"robot": robot, "locked": problem.robot.locked}
-    if T is not None:
-        scene, goal, views = scene.moved(T), moved_goal(goal, T), [view.moved(T) for view in views]
+    if T is not None:  # files are in the world's frame
+        scene, goal = scene.moved(T), moved_goal(goal, T)
+        views, moving = [view.moved(T) for view in views], [obstacle.moved(T) for obstacle in moving]
+        waypoints = [moved_goal(waypoint, T) for waypoint in waypoints]
+        constraints = [constraint.moved(T) for constraint in constraints]
         record["base"] = rounded(pose_entry(T))
-    as_given = rounded if T is not None else lambda data: data
+    written = rounded if T is not None else lambda data: data
     record |= equipment_entries(problem.robot, folder)
     record |= {
-        "scene": as_given(scene_entries(scene, folder)),
+        "scene": written(scene_entries(scene, folder)),
         "start": problem.start.tolist(),
-        "goal": as_given(goal_entry(goal)),
+        "goal": written(goal_entry(goal)),
     }
-    if problem.waypoints:
-        way = problem.waypoints if T is None else [moved_goal(goal, T) for goal in problem.waypoints]
-        record["waypoints"] = as_given([goal_entry(goal) for goal in way])
+    if waypoints:
+        record["waypoints"] = written([goal_entry(waypoint) for waypoint in waypoints])
     if any(problem.blend):
         record["blend"] = list(problem.blend)
-    if problem.constraints:
-        kept = [one if T is None else one.moved(T) for one in problem.constraints]
-        record["constraints"] = as_given([constraint_entry(one) for one in kept])
-    if problem.moving:
-        moving = problem.moving if T is None else [one.moved(T) for one in problem.moving]
-        record["moving"] = as_given([moving_entry(one, folder) for one in moving])
+    if constraints:
+        record["constraints"] = written([constraint_entry(constraint) for constraint in constraints])
+    if moving:
+        record["moving"] = written([moving_entry(obstacle, folder) for obstacle in moving])
     if problem.start_velocity is not None:
         record["start_velocity"] = problem.start_velocity.tolist()
     if problem.payload is not None:
@@ -170,17 +179,17 @@ def problem_record(
     if problem.clearance is not None:
         record["clearance"] = problem.clearance
     if views:
-        record["views"] = as_given([view_entry(view, folder) for view in views])
+        record["views"] = written([view_entry(view, folder) for view in views])
     if problem.unknown != OPTIMISTIC:
         record["unknown"] = problem.unknown
     return record
 
 
 def problem_from_record(record: object, robots: Mapping[str, Robot] | None = None) -> Problem:
-    """The problem of `problem_record`; InputError as in `load_problem`.
+    """The problem of a record of `problem_record`. Raises InputError as `load_problem` does.
 
-    With `robots`, by their names, it may have no other robot, and no file that it names is read: for records
-    of people who may not read files here.
+    robots: the only robots that the record may name, by name. With them, the record may not name files
+    either: for records from people who may not read files on this machine.
     """
     if robots is None:
         return _problem("problem", record, Path())
@@ -191,7 +200,7 @@ def problem_from_record(record: object, robots: Mapping[str, Robot] | None = Non
 def save_problem(problem: Problem, file: str | Path, robot: str | None = None) -> None:
     """Write a problem to .yaml, .yml or .json (atomically), or append it as a line to .jsonl.
 
-    `robot` as in `problem_record`. Raises InputError for a place that cannot be written to.
+    `robot` as in `problem_record`. Raises InputError if the file cannot be written.
     """
     file = file_name(file, "problem file")
     ending = file.suffix.lower()
@@ -223,18 +232,18 @@ WRITERS: dict[str, Callable[[dict[str, object]], str]] = {
 def load_motion_bench_maker(
     folder: str | Path, robot: Robot | None = None, ignore_joints: bool = False
 ) -> list[ProblemEntry]:
-    """The problems of a folder with pairs of files sceneNNNN.yaml and requestNNNN.yaml, in their order.
+    """The problems of a folder with pairs of files sceneNNNN.yaml and requestNNNN.yaml, in order.
 
-    The robot is the bundled one named by the scenes' robot_model_name, unless one is given. Its joints that
-    are not planned (fingers) are held at the values of the request's start state. A problem that is wrong,
-    e.g. its goal is out of limits or it has joints that the robot lacks (unless `ignore_joints`), becomes an
-    entry with an error. Raises InputError if there is no pair.
+    robot: by default the bundled one that the scenes' robot_model_name names. Its joints that are not planned
+    (fingers) are locked at the values of the request's start state. An invalid problem, e.g. one whose goal
+    is out of limits, or that has joints that the robot lacks (unless `ignore_joints`), becomes an entry with
+    an error. Raises InputError if the folder holds no scene.
     """
     folder = Path(folder)
     scenes = sorted(folder.glob("scene*.yaml"))
     if not scenes:
         raise InputError(
-            f"{folder} has no files scene*.yaml; it must be a folder as MotionBenchMaker writes it"
+            f"{folder} has no files scene*.yaml; it must be a folder written by MotionBenchMaker"
         )
     entries = []
     for scene_file in scenes:
@@ -262,25 +271,18 @@ def _moveit_problem(scene_file: Path, robot: Robot | None, ignore_joints: bool) 
         where = request_file
         request = moveit_request(read_yaml(request_file), frames, scene_file.parent)
         notes += request_robot_notes(request, robot, moveit_model(data), ignore_joints)
-        return _requested(robot, scene, replace(request, notes=(*request.notes, *notes)))
+        return _requested(robot, scene, replace(request, notes=(*request.notes, *notes)), {})
     except InputError as error:
         prefix = "" if str(error).startswith(str(where)) else f"{where}: "
         raise InputError(f"{prefix}{error}") from None
 
 
-def _requested(
-    robot: Robot,
-    scene: Scene,
-    request: MoveItRequest,
-    clearance: float | None = None,
-    views: tuple[DepthView, ...] = (),
-    unknown: str = OPTIMISTIC,
-) -> Problem:
-    held = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
-    held -= {*robot.joint_names}
-    locked = {name: value for name, value in request.start.items() if name in held}
-    robot = robot.with_locked(locked)
-    notes = (*request.notes, *_follower_notes(robot, request.start))
+def _requested(robot: Robot, scene: Scene, request: MoveItRequest, options: ProblemOptions) -> Problem:
+    """The problem of a MoveIt request. Joints that are not planned are locked at its start state."""
+    unplanned = {j.name for j in robot.joints if j.kind in MOVING_KINDS and j.mimic is None}
+    unplanned -= {*robot.joint_names}
+    robot = robot.with_locked({name: value for name, value in request.start.items() if name in unplanned})
+    notes = (*request.notes, *_mimic_notes(robot, request.start))
 
     def values(where: str, positions: dict[str, float]) -> list[float]:
         missing = [name for name in robot.joint_names if name not in positions]
@@ -291,18 +293,20 @@ def _requested(
     start = values("start_state", request.start)
     for held in request.attached:
         robot = holding_at(robot, held, start)
+    goal: Goal
     if request.pose_goal is not None:
         goal = PoseGoal(*request.pose_goal)
-        return Problem(robot, scene, start, goal, notes, clearance, views, unknown)
-    goals = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
-    return Problem(robot, scene, start, JointGoal(goals), notes, clearance, views, unknown)
+    else:
+        rows = [values(f"goal_constraints[{i}]", goal) for i, goal in enumerate(request.joint_goals)]
+        goal = JointGoal(rows)
+    return Problem(robot, scene, start, goal, **{**options, "notes": notes})
 
 
-def _follower_notes(robot: Robot, start: dict[str, float]) -> tuple[str, ...]:
-    """Notes on mimic joints that a start state does not put where the joints that they follow do."""
+def _mimic_notes(robot: Robot, start: dict[str, float]) -> tuple[str, ...]:
+    """Notes on mimic joints whose value in a start state differs from what the joint they mimic implies."""
     mimics = {joint.name: joint.mimic.joint for joint in robot.joints if joint.mimic is not None}
     return tuple(
-        f"start_state: {name} is {start[name]:g}; planned at {robot.locked[name]:g}, where {master} puts it"
+        f"start_state: {name} is {start[name]:g}; planned at {robot.locked[name]:g}, which {master} implies"
         for name, master in mimics.items()
         if name in start and name in robot.locked and abs(robot.locked[name] - start[name]) > MIMIC_SLACK
     )
@@ -317,17 +321,18 @@ def _problem(
 ) -> Problem:
     try:
         requested = isinstance(data, dict) and "request" in data
-        values = check_fields(
-            "problem", data, ("robot", "scene", "request") if requested else FIELDS, OPTIONAL
-        )
+        required = REQUIRED_WITH_REQUEST if requested else REQUIRED_FIELDS
+        values = check_fields("problem", data, required, OPTIONAL_FIELDS)
         robot = _robot(values["robot"], values.get("locked", {}), folder, robots)
         robot, notes = equipped(robot, values.get("tool"), values.get("attached"), folder)
         base = read_pose("base", values["base"]) if "base" in values else None
         if base is not None and (requested or isinstance(values["scene"], str)):
             raise InputError(
-                "base is for scenes in the file itself: MoveIt scenes say where their robot stands"
+                "base cannot be combined with MoveIt files, which contain the pose of their robot's base"
             )
-        clearance = check_clearance("clearance", values["clearance"]) if "clearance" in values else None
+        options: dict[str, Any] = {}
+        if "clearance" in values:
+            options["clearance"] = check_clearance("clearance", values["clearance"])
         frames, model = moveit_frames({}, robot), ""
         if isinstance(values["scene"], str):
             file = folder / values["scene"]
@@ -336,34 +341,31 @@ def _problem(
             frames, model = moveit_frames(content, robot), moveit_model(content)
             scene = moveit_scene(content, frames, file.parent)
         else:
-            scene, more = read_scene(values["scene"], folder)
-            notes += more
-        views, more = read_views(values.get("views", []), folder)
-        unknown = values.get("unknown", OPTIMISTIC)
-        for name in ("waypoints", "blend", "moving", "start_velocity"):
+            scene, scene_notes = read_scene(values["scene"], folder)
+            notes += scene_notes
+        options["views"], view_notes = read_views(values.get("views", []), folder)
+        options["unknown"] = values.get("unknown", OPTIMISTIC)
+        for name in NOT_WITH_REQUEST:
             if requested and name in values:
-                raise InputError(f"{name} is for problems with start and goal in the file, not a request")
-        kept = read_constraints(values.get("constraints", []))
-        payload = read_payload(values["payload"]) if "payload" in values else None
+                raise InputError(f"{name} cannot be combined with request")
+        options["constraints"] = read_constraints(values.get("constraints", []))
+        options["payload"] = read_payload(values["payload"]) if "payload" in values else None
         if requested:
             request = moveit_request(read_yaml(folder / str(values["request"])), frames, folder)
             notes += request_robot_notes(request, robot, model, ignore_joints)
-            request = replace(request, notes=(*request.notes, *notes, *more))
-            asked = _requested(robot, scene, request, clearance, views, unknown)
-            return replace(asked, constraints=kept, payload=payload) if kept or payload else asked
-        goal, notes = read_goal("goal", values["goal"], scene), (*notes, *more)
-        asked = robot, scene, values["start"], goal, notes, clearance, views, unknown
-        more = {
+            request = replace(request, notes=(*request.notes, *notes, *view_notes))
+            return _requested(robot, scene, request, options)  # type: ignore[arg-type]
+        goal = read_goal("goal", values["goal"], scene)
+        options |= {
+            "notes": (*notes, *view_notes),
             "waypoints": read_waypoints(values.get("waypoints", []), scene),
-            "constraints": kept,
             "moving": read_moving(values.get("moving", []), folder),
             "start_velocity": values.get("start_velocity"),
             "blend": values.get("blend", ()),
-            "payload": payload,
         }
         if base is None:
-            return Problem(*asked, **more)
-        return Problem.in_world(base, *asked, **more)
+            return Problem(robot, scene, values["start"], goal, **options)
+        return Problem.in_world(base, robot, scene, values["start"], goal, **options)
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
 
@@ -378,7 +380,7 @@ def _robot(name: object, locked: object, folder: Path, robots: Mapping[str, Robo
     if name not in ROBOTS and (name.endswith((".urdf", ".xacro", ".xml")) or "/" in name):
         name = str((folder / name).absolute())
     if not isinstance(locked, dict):
-        raise InputError(f"locked is {shown(locked)}; it must map names of joints to values")
+        raise InputError(f"locked is {shown(locked)}; it must map joint names to values")
     values = {}
     for joint, value in locked.items():
         array = numbers(value)

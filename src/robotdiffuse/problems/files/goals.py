@@ -1,4 +1,4 @@
-"""Goals in problem files.
+"""Reads and writes goals of problem files.
 
 {joints: [...]}
 {joint_set: [[...], [...]]}
@@ -16,34 +16,35 @@ from numpy import ndarray
 from robotdiffuse.core.bounds import numbers
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import pose_entry
+from robotdiffuse.problems.files.robot_setup import pose_of
 from robotdiffuse.problems.goals import AnyGoal, Goal, JointGoal, PoseGoal, PosesGoal
-from robotdiffuse.problems.robot_setup_files import pose_of
 from robotdiffuse.scenes.files import check_fields
 from robotdiffuse.scenes.scene import Scene
-from robotdiffuse.scenes.shape_transforms import placed
 
-GOALS = ("joints", "joint_set", "pose", "poses", "any")
+GOAL_KINDS = ("joints", "joint_set", "pose", "poses", "any")
 TOLERANCES = ("xyz_tolerance", "rpy_tolerance")
 
 
 def read_goal(field: str, data: object, scene: Scene) -> Goal:
-    """A goal of a problem file; InputError that names its field. Poses are in the frame of the scene, or of
-    one of its objects."""
+    """The goal of an entry of a problem file. Raises InputError that names the field.
+
+    Poses are in the frame of the scene, or of the object of the scene that `relative_to` names.
+    """
     if not isinstance(data, dict) or len(data) != 1:
-        raise InputError(f"{field} is {shown(data)}; it must be one of {', '.join(GOALS)}")
+        raise InputError(f"{field} is {shown(data)}; it must be one of {', '.join(GOAL_KINDS)}")
     [(kind, value)] = data.items()
-    if kind not in GOALS:
-        raise unknown_name(f"field of {field}:", kind, GOALS)
+    if kind not in GOAL_KINDS:
+        raise unknown_name(f"field of {field}:", kind, GOAL_KINDS)
     if kind == "any":
         if not isinstance(value, list) or not value:
-            raise InputError(f"{field}.any is {shown(value)}; it must be a list of goals, not empty")
+            raise InputError(f"{field}.any is {shown(value)}; it must be a non-empty list of goals")
         goals = [read_goal(f"{field}.any[{i}]", one, scene) for i, one in enumerate(value)]
         return AnyGoal(tuple(goals))  # type: ignore[arg-type]
     if kind == "pose":
         return _pose_goal(f"{field}.pose", value, scene)
     if kind == "poses":
         if not isinstance(value, dict) or not value:
-            raise InputError(f"{field}.poses is {shown(value)}; it must have a pose for each of some links")
+            raise InputError(f"{field}.poses is {shown(value)}; it must map link names to poses")
         each = [_pose_goal(f"{field}.poses.{frame}", one, scene, frame) for frame, one in value.items()]
         return PosesGoal(each)
     array = numbers(value)
@@ -54,14 +55,14 @@ def read_goal(field: str, data: object, scene: Scene) -> Goal:
 
 
 def read_waypoints(data: object, scene: Scene) -> tuple[Goal, ...]:
-    """The waypoints of a problem file."""
+    """The waypoints of a problem file. Raises InputError that names the field."""
     if not isinstance(data, list):
         raise InputError(f"waypoints is {shown(data)}; it must be a list of goals")
     return tuple(read_goal(f"waypoints[{i}]", one, scene) for i, one in enumerate(data))
 
 
 def goal_entry(goal: Goal) -> dict[str, Any]:
-    """The goal as `read_goal` takes it."""
+    """The entry of a goal, as `read_goal` reads it."""
     if isinstance(goal, AnyGoal):
         return {"any": [goal_entry(one) for one in goal.goals]}
     if isinstance(goal, JointGoal):
@@ -79,9 +80,9 @@ def _entry(pose: PoseGoal) -> dict[str, Any]:
 
 
 def _pose_goal(field: str, value: object, scene: Scene, frame: object = None) -> PoseGoal:
-    """`frame`: of a pose that does not say it itself."""
-    own = () if frame is not None else ("frame",)
-    pose = {"frame": frame, **check_fields(field, value, (*own, "xyz", "wxyz"), ("relative_to", *TOLERANCES))}
+    """The goal of a pose entry. frame: the link, if the entry itself does not name it."""
+    required = ("xyz", "wxyz") if frame is not None else ("frame", "xyz", "wxyz")
+    pose = {"frame": frame, **check_fields(field, value, required, ("relative_to", *TOLERANCES))}
     T = pose_of(field, pose)
     if "relative_to" in pose:
         T = _object_pose(field, pose["relative_to"], scene) @ T
@@ -93,6 +94,6 @@ def _object_pose(field: str, name: object, scene: Scene) -> Float[ndarray, "4 4"
     if name not in shapes:
         raise unknown_name(f"object in {field}.relative_to:", str(name), shapes)
     try:
-        return placed(shapes[str(name)])
+        return shapes[str(name)].T_base_shape
     except InputError as error:
         raise InputError(f"{field}.relative_to: {error}") from None

@@ -1,4 +1,4 @@
-"""Path constraints in problem files.
+"""Reads and writes path constraints of problem files.
 
 constraints:
   - axis_cone: {frame: panda_hand, axis: [0, 0, 1], direction: [0, 0, -1], angle: 0.1745}
@@ -17,21 +17,21 @@ from numpy import ndarray
 from robotdiffuse.core.errors import InputError, shown, unknown_name
 from robotdiffuse.core.transforms import pose_entry
 from robotdiffuse.problems.constraints import CONSTRAINTS, Constraint, PositionBox
-from robotdiffuse.problems.robot_setup_files import pose_of
+from robotdiffuse.problems.files.robot_setup import pose_of
 from robotdiffuse.scenes.files import check_fields
 
-POSE = ("xyz", "wxyz")
+POSE_FIELDS = ("xyz", "wxyz")
 
 
 def read_constraints(data: object) -> tuple[Constraint, ...]:
-    """The constraints of a problem file; InputError that names the field."""
+    """The constraints of a problem file. Raises InputError that names the field."""
     if not isinstance(data, list):
         raise InputError(f"constraints is {shown(data)}; it must be a list of constraints")
     return tuple(_constraint(f"constraints[{i}]", entry) for i, entry in enumerate(data))
 
 
 def constraint_entry(constraint: Constraint) -> dict[str, Any]:
-    """The constraint as `read_constraints` takes it."""
+    """The entry of a constraint, as `read_constraints` reads it."""
     values: dict[str, Any] = {}
     for field in fields(constraint):
         value = getattr(constraint, field.name)
@@ -54,9 +54,9 @@ def _constraint(where: str, entry: object) -> Constraint:
     kind, where = CONSTRAINTS[name], f"{where}.{name}"
     names = [field.name for field in fields(kind) if field.name != "T_base_box"]
     required = [field.name for field in fields(kind) if field.default is MISSING]
-    optional = [n for n in names if n not in required] + [*(POSE if kind is PositionBox else ())]
+    optional = [n for n in names if n not in required] + [*(POSE_FIELDS if kind is PositionBox else ())]
     values = dict(check_fields(where, given, required, optional))
-    posed = {key: values.pop(key) for key in POSE if key in values and kind is PositionBox}
+    posed = {key: values.pop(key) for key in POSE_FIELDS if key in values and kind is PositionBox}
     if posed:
         values["T_base_box"] = pose_of(where, posed)
     try:

@@ -1,6 +1,7 @@
-"""MoveIt's planning scenes and motion plan requests in YAML, as MotionBenchMaker and robowflex write them.
+"""Reads MoveIt planning scenes and motion plan requests in YAML, as MotionBenchMaker and robowflex write
+them.
 
-Vectors may be lists or mappings (x, y, z), quaternions are xyzw there. Message definitions:
+In these files, vectors may be lists or mappings (x, y, z), and quaternions are xyzw. Message definitions:
 https://docs.ros.org/en/noetic/api/moveit_msgs/html/msg/PlanningScene.html and MotionPlanRequest.html.
 """
 
@@ -33,9 +34,9 @@ PRIMITIVES: dict[str, tuple[int, Callable[[ndarray, ndarray, ndarray, str], Shap
     "sphere": (1, lambda size, xyz, wxyz, name: Sphere(xyz, size[0], name)),
     "cylinder": (2, lambda size, xyz, wxyz, name: Cylinder(xyz, size[1], size[0], wxyz, name)),
 }
-"""By type: how many dimensions it has, and the shape (a cylinder's dimensions are height and radius)."""
+"""For each type, the number of its dimensions and the shape (a cylinder's dimensions are height, radius)."""
 TYPE_NUMBERS = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone", 5: "prism"}
-"""Types as the messages number them (shape_msgs/SolidPrimitive)."""
+"""Numbers of the types in messages (shape_msgs/SolidPrimitive)."""
 NO_POSE = {"position": [0, 0, 0], "orientation": [0, 0, 0, 1]}
 
 
@@ -47,34 +48,35 @@ class MoveItAttached:
     link: str
     shapes: tuple[Shape, ...]
     in_link: bool
-    """Whether the shapes are in the frame of the link; else they are where they stand at the start, in the
-    base's."""
+    """Whether the shapes are in the frame of the link; otherwise they are in the frame of the base, at the
+    start."""
     touch_links: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
 class MoveItRequest:
-    """What a motion plan request asks for. Either `joint_goals` is not empty or `pose_goal` is not None."""
+    """The content of a motion plan request. Either `joint_goals` is not empty or `pose_goal` is not None."""
 
     start: dict[str, float]
-    """Joint values by name [rad] or [m], fingers included."""
+    """Joint values by name [rad] or [m], including fingers."""
     joint_goals: tuple[dict[str, float], ...] = ()
-    """Each a goal of its own."""
+    """Alternative goals, each with joint values by name."""
     pose_goal: tuple[str, Float[ndarray, "4 4"]] | None = None
-    """A link and T_base_link."""
+    """A link and its goal pose T_base_link."""
     attached: tuple[MoveItAttached, ...] = ()
     notes: tuple[str, ...] = ()
-    """What is not taken over."""
+    """Notes on parts of the request that are ignored."""
 
 
 def read_moveit_scene(file: str | Path, robot: Robot | None = None, ignore_joints: bool = False) -> Scene:
     """The collision objects of a planning scene, in the frame of the robot's base.
 
-    Where the root of the robot's URDF stands is taken from robot_state.multi_dof_joint_state, where its base
-    is from there from the robot (None: base and root are one), frames from fixed_frame_transforms and from
-    the links that stand still with the base. The allowed collision matrix is not used: the robot brings its
-    own. Raises InputError, naming file and object, for a missing or damaged file, unknown frames, shapes
-    without a counterpart (cone, plane, octomap), and, unless `ignore_joints`, joints that the robot lacks.
+    The pose of the root of the robot's URDF comes from robot_state.multi_dof_joint_state, the pose of its
+    base relative to the root from the robot (None: base and root are the same), and frames from
+    fixed_frame_transforms and from the links that are fixed to the base. The allowed collision matrix is
+    ignored, because the robot has its own. Raises InputError, naming file and object, for a missing or
+    damaged file, unknown frames, shapes that are not supported (cone, plane, octomap), and, unless
+    `ignore_joints`, joints that the robot lacks.
     """
     return read_noted_moveit_scene(file, robot, ignore_joints)[0]
 
@@ -82,7 +84,7 @@ def read_moveit_scene(file: str | Path, robot: Robot | None = None, ignore_joint
 def read_noted_moveit_scene(
     file: str | Path, robot: Robot | None = None, ignore_joints: bool = False
 ) -> tuple[Scene, tuple[str, ...]]:
-    """`read_moveit_scene`, and notes on differences between its robot and the one given."""
+    """`read_moveit_scene`, and notes on differences between the scene's robot and `robot`."""
     data = read_yaml(file)
     try:
         notes = () if robot is None else scene_robot_notes(data, robot, ignore_joints)
@@ -94,9 +96,9 @@ def read_noted_moveit_scene(
 def scene_robot_notes(data: object, robot: Robot, ignore_joints: bool = False) -> tuple[str, ...]:
     """Notes on differences between a robot and the one of a parsed planning scene.
 
-    Raises InputError for joints that the robot lacks, unless they are to be ignored. Another model name alone
-    is a note: copies of one arm have many names, and all joints are known. Names of multi-dof joints are not
-    looked at: they are virtual joints of an SRDF, and their transforms place the robot's root.
+    Raises InputError for joints that the robot lacks, unless `ignore_joints`. A different model name alone is
+    only noted: the same arm has many names, and all joints are known. Names of multi-dof joints are ignored:
+    they are virtual joints of an SRDF, whose transforms give the pose of the robot's root.
     """
     data = _mapping("a planning scene", data)
     state = _mapping("robot_state", data.get("robot_state"))
@@ -126,9 +128,9 @@ def request_robot_notes(
 def joint_notes(
     where: str, values: dict[str, float], robot: Robot, model: str, ignore_joints: bool
 ) -> tuple[str, ...]:
-    """A note on joints that a robot lacks, if they are to be ignored; else InputError.
+    """A note on joints that the robot lacks. Raises InputError for them unless `ignore_joints`.
 
-    A fixed joint of the robot counts as known at zero, where it stands.
+    A fixed joint of the robot counts as known if its value is zero.
     """
     kinds = {joint.name: joint.kind for joint in robot.joints}
     lacking = [
@@ -153,20 +155,20 @@ class MoveItFrames(dict[str, ndarray]):
     """T_base_frame of the frames that objects of a planning scene may be given in; '' is the scene's own.
 
     These are the scene's own frame, the frames that the file defines, and the links that fixed joints connect
-    with the robot's base. A frame that is not there raises InputError, which says what is known, or why the
-    place of the robot's base in the scene is not.
+    with the robot's base. Looking up an unknown frame raises InputError, which lists the known frames, or
+    says why the pose of the robot's base in the scene is unknown.
     """
 
     def __init__(
         self, robot: Robot | None, T_own_root: Float[ndarray, "4 4"], own: tuple[str, ...] = ("", "world")
     ) -> None:
-        """`own` are the names of the scene's own frame, T_own_root is where the URDF's root stands in it."""
+        """own: names of the scene's own frame; T_own_root: pose of the URDF's root in it."""
         super().__init__({} if robot is None else robot.above | robot.fixed_below)
         self.links = frozenset(self)
-        """Frames of the robot, which a file cannot place anew."""
+        """Frames of the robot, whose poses a file cannot change."""
         T_base_root = np.eye(4) if robot is None else robot.T_base_root
         self.lost = ""
-        """Why the scene's own frame is not known; empty if it is."""
+        """Why the pose of the scene's own frame is unknown; empty if it is known."""
         if T_base_root is not None:
             T_base_own = T_base_root @ inverse(T_own_root)
             self.update({name: T_base_own for name in own if name not in self.links})
@@ -181,7 +183,7 @@ class MoveItFrames(dict[str, ndarray]):
         known = [frame for frame in self if frame]
         if self.lost:
             raise InputError(
-                f"frame_id of {where} is {shown(name)}, and where the robot's base is in it cannot be known: "
+                f"frame_id of {where} is {shown(name)}, and the pose of the robot's base in it is unknown: "
                 f"{self.lost}; known frames: {', '.join(known)}"
             )
         raise unknown_name(f"frame_id of {where}:", name, known)
@@ -190,8 +192,8 @@ class MoveItFrames(dict[str, ndarray]):
 def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
     """The frames of a parsed planning scene; `robot` as in `read_moveit_scene`.
 
-    The scene's own frame is the one that robot_state.multi_dof_joint_state places the robot in, `world` if it
-    says none. Raises InputError if it places more than the robot's root, which one transform does.
+    The scene's own frame is the one in which robot_state.multi_dof_joint_state gives the pose of the robot,
+    by default `world`. Raises InputError if it has more than one transform, that of the robot's root.
     """
     state = _mapping("robot_state", _mapping("a planning scene", data).get("robot_state"))
     if state.get("attached_collision_objects"):
@@ -221,7 +223,7 @@ def moveit_frames(data: object, robot: Robot | None = None) -> MoveItFrames:
 
 
 def moveit_scene(data: object, frames: MoveItFrames, folder: Path) -> Scene:
-    """`read_moveit_scene` for a parsed file; `folder` is where mesh files are looked up."""
+    """`read_moveit_scene` for a parsed file; names of mesh files are relative to `folder`."""
     world = _mapping("world", _mapping("a planning scene", data).get("world"))
     octomap = _mapping("octomap", _mapping("octomap", world.get("octomap")).get("octomap"))
     if octomap.get("data"):
@@ -275,7 +277,7 @@ def _mesh(where: str, part: dict[str, Any], xyz: ndarray, wxyz: ndarray, name: s
     if "resource" in part:
         file = str(part["resource"]).removeprefix("file://")
         if "://" in file:
-            raise InputError(f"{where}.resource is {file}; it must be a file, or the vertices be given")
+            raise InputError(f"{where}.resource is {file}; it must be a file, or the mesh must have vertices")
         vertices, faces = read_triangles(folder / file)
         vertices = vertices * vector(where, "dimensions", part.get("dimensions", [1, 1, 1]), 3)
     else:
@@ -288,11 +290,11 @@ def _mesh(where: str, part: dict[str, Any], xyz: ndarray, wxyz: ndarray, name: s
 
 
 def moveit_request(data: object, frames: MoveItFrames, folder: Path = Path()) -> MoveItRequest:
-    """Start, held objects and goals of a parsed request; `frames` and `folder` as of its scene.
+    """Start, attached objects and goals of a parsed request; `frames` and `folder` are those of its scene.
 
-    Several goal constraints of joints are a set of goals. A position and an orientation constraint of one
-    link are a pose: the centre of the region; its size and the tolerances are not used. Raises InputError for
-    anything else, and for path constraints, which would change the problem if ignored.
+    Several joint goal constraints are alternative goals. A position and an orientation constraint of one link
+    are a pose goal at the centre of the region, whose size and tolerances are ignored. Raises InputError for
+    anything else, and for path constraints, because ignoring them would change the problem.
     """
     data = _mapping("a motion plan request", data)
     for name in ("path_constraints", "trajectory_constraints"):
@@ -324,17 +326,15 @@ def _joint_state(where: str, value: object) -> dict[str, float]:
 
 
 def _scaling_notes(data: dict[str, Any]) -> tuple[str, ...]:
-    """Of shares of the rates' limits, where they are less than all: 0 stands for all there."""
+    """Notes on velocity and acceleration scaling factors below 1, which are ignored; 0 means 1 in MoveIt."""
     notes = []
     for what in ("velocity", "acceleration"):
         name = f"max_{what}_scaling_factor"
         share = float(vector("request", name, [data.get(name) or 0], 1)[0])
         if not 0 <= share <= 1:
-            raise InputError(f"{name} is {shown(data[name])}; it must be a share from 0 to 1")
+            raise InputError(f"{name} is {shown(data[name])}; it must be a number from 0 to 1")
         if 0 < share < 1:
-            notes.append(
-                f"the request's {name} {share:g} is not taken over: plan with {what}_scaling={share:g}"
-            )
+            notes.append(f"the request's {name} {share:g} is ignored: plan with {what}_scaling={share:g}")
     return tuple(notes)
 
 
@@ -344,7 +344,7 @@ def _attached(i: int, entry: object, frames: MoveItFrames, folder: Path) -> Move
     link, given = str(entry.get("link_name") or ""), _mapping(f"{where}.object", entry.get("object"))
     header = _mapping(f"{where}.object.header", given.get("header"))
     in_link = str(header.get("frame_id") or "").removeprefix("/") == link
-    if in_link:  # its shapes are as they are given
+    if in_link:  # the shapes are already in the frame of the link
         frames = MoveItFrames(None, np.eye(4), (link,))
     try:
         shapes = tuple(_object(given, frames, folder))
@@ -355,7 +355,7 @@ def _attached(i: int, entry: object, frames: MoveItFrames, folder: Path) -> Move
 
 
 def holding_at(robot: Robot, held: MoveItAttached, start: list[float]) -> Robot:
-    """The robot with an object that it holds at the start. Links that it has no geometry of may be named."""
+    """The robot with an object attached at the start. touch_links that the robot lacks are ignored."""
     from robotdiffuse.robots.attached_bodies import attach  # compiled code, which most problems do not need
 
     shapes = held.shapes
@@ -388,7 +388,9 @@ def _pose_goal(goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray
     place, turn = (_mapping(where, entry) for entry in (places[0], turns[0]))
     link = place.get("link_name")
     if link != turn.get("link_name"):
-        raise InputError(f"{where} constrains {link} and {turn.get('link_name')}; it must be one link")
+        raise InputError(
+            f"{where} constrains {link} and {turn.get('link_name')}; both must constrain one link"
+        )
     if _xyz("target_point_offset", place.get("target_point_offset") or [0, 0, 0]).any():
         raise InputError(f"{where}.position_constraints[0].target_point_offset must be zero")
     region = _mapping("constraint_region", place.get("constraint_region"))
@@ -402,7 +404,7 @@ def _pose_goal(goal: dict[str, Any], frames: MoveItFrames) -> tuple[str, ndarray
 
 
 def _mapping(where: str, value: object) -> dict[str, Any]:
-    """A mapping; what is absent counts as empty, as in the messages."""
+    """The mapping; None counts as empty, as in the messages."""
     if value is not None and not isinstance(value, dict):
         raise InputError(f"{where} is {shown(value)}; it must be a mapping")
     return value or {}
