@@ -82,9 +82,16 @@ def write_picture(
 
 
 def render(
-    robot: Robot, scene: Scene, motion: Path | Trajectory, settings: PictureSettings
+    robot: Robot,
+    scene: Scene,
+    motion: Path | Trajectory,
+    settings: PictureSettings,
+    camera: Camera | None = None,
 ) -> tuple[np.ndarray, Camera]:
-    """The picture without its caption, uint8 [height, width, 3], and the camera that took it."""
+    """The picture without its caption, uint8 [height, width, 3], and the camera that took it.
+
+    camera: where to look from; without one, from where most of the motion can be seen.
+    """
     surfaces = style.robot_surfaces(robot)
     q = style.dense(motion.positions, 240)
     poses = style.frames(robot, q)
@@ -95,7 +102,8 @@ def render(
     steps = np.linspace(0, len(q) - 1, settings.ghosts + 1).round().astype(int)[:-1] if len(q) > 1 else []
     ghosts = [(style.posed(surfaces[1:], poses[i][1:]), i / (len(q) - 1)) for i in steps]
     faint = join([ghost for ghost, _ in ghosts])
-    camera = best_view(goal, faint, trace, obstacles, settings.width, settings.height, FREE)
+    if camera is None:
+        camera = best_view(goal, faint, trace, obstacles, settings.width, settings.height, FREE)
     big = Camera(camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height)
     image = _paint(big, join([goal, obstacles, _tube(trace)]), ghosts)
     s = SUPERSAMPLING
