@@ -14,18 +14,20 @@ from robotdiffuse.visualization.picture import PictureSettings, render
 
 ROOT = Path(__file__).parents[1]
 SIZE = PictureSettings(width=720, height=450, ghosts=1)
+WHOLE_MOTION = PictureSettings(width=720, height=450, ghosts=10)
+"""So many poses are kept in the picture by the camera."""
 FRAME_TIME = 0.05
 """How long a frame is shown [s]; a multiple of 10 ms, in which GIF counts."""
 SLOWDOWN = 2.0
 FIRST_FRAME_TIME, LAST_FRAME_TIME = 0.5, 1.5
 """The motion rests at its ends for so long [s]."""
-COLORS = 128
+COLORS = 256
 
 
 def frames(problem: rd.Problem, trajectory: rd.Trajectory) -> list[Image.Image]:
     """The arm along the motion: where it began as a ghost, and the way of the cup so far."""
     robot, scene = problem.standing()
-    _, camera = render(robot, scene, trajectory, SIZE)
+    _, camera = render(robot, scene, trajectory, WHOLE_MOTION)
     count = int(np.ceil(SLOWDOWN * trajectory.times[-1] / FRAME_TIME)) + 1
     pictures = []
     for time in np.linspace(0.0, trajectory.times[-1], count):

@@ -1,0 +1,25 @@
+"""A post crosses the arm's way: the arm waits or draws back, and the motion is certified for every moment."""
+
+import numpy as np
+
+import robotdiffuse as rd
+from robotdiffuse.visualization.picture import write_picture
+
+post = rd.Cylinder([0.42, 0.25, 0.4], 0.1, 0.6, name="post")  # where it stands at time 0
+table = rd.Box([0.55, 0.0, 0.0], [0.7, 1.6, 0.1], name="table")
+problem = rd.Problem(
+    robot=rd.load_robot("panda"),
+    scene=rd.Scene([table]),
+    start=[-0.9, 0.3, 0.0, -2.0, 0.0, 2.3, 0.8],
+    goal=[0.9, 0.3, 0.0, -2.0, 0.0, 2.3, 0.8],
+    moving=[rd.MovingObstacle(post, velocity=[0.25, -0.1, 0.0])],  # [m/s]
+)
+result = rd.plan(problem, time_limit=10.0)
+print(result.status.value, result.reason)
+assert result.trajectory is not None
+print(f"{result.trajectory.duration:.2f} s")
+
+# The picture shows the post every half second.
+posts = [problem.moving[0].at(time) for time in np.arange(0.0, result.trajectory.duration, 0.5)]
+scene = rd.Scene([table, *posts])
+write_picture(problem.robot, scene, result.trajectory, "10_moving_obstacles.png")
