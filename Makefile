@@ -56,8 +56,9 @@ docs: .venv/dev.stamp
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 gallery: .venv/dev.stamp
-	set -e; mkdir -p docs/images/gallery; cd docs/images/gallery; \
-		for file in ../../../examples/[0-9]*.py; do ../../../$(BIN)/python "$$file"; done
+	set -e; work=$$(mktemp -d); here=$$PWD; cd $$work; \
+		for file in $$here/examples/[0-9]*.py; do $$here/$(BIN)/python "$$file"; done; \
+		mkdir -p $$here/docs/images/gallery; cp ./*.png $$here/docs/images/gallery; rm -r $$work
 
 # parts of benchmarks, and scripts that need the name of a run or a data set: `make bench` leaves them out
 NOT_RUN := %/report.py %/problems.py %/searches.py %/curves.py %/encoders_on_views.py

@@ -4,7 +4,7 @@ import numpy as np
 
 import robotdiffuse as rd
 from robotdiffuse.scenes.point_cloud import voxel_thin
-from robotdiffuse.visualization.picture import write_picture
+from robotdiffuse.visualization.picture import PictureSettings, write_picture
 
 # In place of a scan: points on a vase. From a file: robotdiffuse.scenes.point_cloud.read_points("cloud.ply")
 rng = np.random.default_rng(0)
@@ -23,4 +23,5 @@ problem = rd.Problem(
 result = rd.plan(problem, time_limit=5.0)
 print(result.status.value, result.reason, f"{result.scene_clearance:.3f} m from {len(cloud.points)} points")
 assert result.trajectory is not None
-write_picture(problem.robot, problem.scene, result.trajectory, "04_point_cloud.png")
+front = PictureSettings(azimuth=0.5)
+write_picture(problem.robot, problem.scene, result.trajectory, "04_point_cloud.png", settings=front)

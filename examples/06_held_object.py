@@ -3,7 +3,7 @@
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.visualization.picture import write_picture
+from robotdiffuse.visualization.picture import PictureSettings, write_picture
 
 start = np.array([-0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
 goal = np.array([0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2])
@@ -18,7 +18,8 @@ problem = rd.Problem(robot, scene, start, goal)
 result = rd.plan(problem, time_limit=5.0)
 print(result.status.value, result.reason)
 assert result.trajectory is not None
-write_picture(robot, scene, result.trajectory, "06_held_object.png")
+front = PictureSettings(azimuth=0.5)
+write_picture(robot, scene, result.trajectory, "06_held_object.png", settings=front)
 
 scene, robot = scene.detach("parcel", robot, goal)
 print([shape.name for shape in scene.shapes])

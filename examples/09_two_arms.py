@@ -4,7 +4,7 @@ import numpy as np
 
 import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_from_rpy, transform
-from robotdiffuse.visualization.picture import write_picture
+from robotdiffuse.visualization.picture import PictureSettings, write_picture
 
 down = rotation_from_rpy(np.pi, 0.0, 0.0)
 any_turn = [0.0, 0.0, np.pi]  # about the vertical
@@ -22,4 +22,5 @@ problem = rd.Problem(rd.load_robot("baxter"), rd.Scene([table]), left + right, g
 result = rd.plan(problem, time_limit=5.0)
 print(result.status.value, result.reason)
 assert result.trajectory is not None
-write_picture(problem.robot, problem.scene, result.trajectory, "09_two_arms.png")
+front = PictureSettings(azimuth=0.3)
+write_picture(problem.robot, problem.scene, result.trajectory, "09_two_arms.png", settings=front)

@@ -156,7 +156,7 @@ def _example(file: Path) -> str:
     tree = ast.parse(source)
     text, first = ast.get_docstring(tree) or "", tree.body[0]
     code = "\n".join(source.splitlines()[first.end_lineno :]).strip()
-    title = file.stem.split("_", 1)[1].replace("_", " ").capitalize()
+    title = file.stem.split("_", 1)[1].replace("_", " ").capitalize().replace("Moveit", "MoveIt")
     picture = f"![{title}](images/gallery/{file.stem}.png)"
     return f'## {title}\n\n{text}\n\n{picture}\n\n```python title="examples/{file.name}"\n{code}\n```'
 

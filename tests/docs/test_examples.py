@@ -26,7 +26,7 @@ def cases() -> list[object]:
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Light and ghosts take seconds to draw; a small picture tells as much to a test."""
     small = picture.PictureSettings(width=160, height=100, ghosts=1)
-    monkeypatch.setattr(picture, "PictureSettings", lambda: small)
+    monkeypatch.setattr(picture, "PictureSettings", lambda **_: small)
 
 
 @pytest.mark.usefixtures("small_pictures")

@@ -47,6 +47,8 @@ class PictureSettings:
     """[pixels]"""
     ghosts: int = 5
     """See-through arms between start and goal, the start included."""
+    azimuth: float | None = None
+    """Of the camera, from the x axis of the base [rad]; None: from where most of the motion can be seen."""
 
     def __post_init__(self) -> None:
         if self.width < 16 or self.height < 16:
@@ -103,7 +105,8 @@ def render(
     ghosts = [(style.posed(surfaces[1:], poses[i][1:]), i / (len(q) - 1)) for i in steps]
     faint = join([ghost for ghost, _ in ghosts])
     if camera is None:
-        camera = best_view(goal, faint, trace, obstacles, settings.width, settings.height, FREE)
+        size = settings.width, settings.height
+        camera = best_view(goal, faint, trace, obstacles, *size, FREE, settings.azimuth)
     big = Camera(camera.eye, camera.target, SUPERSAMPLING * settings.width, SUPERSAMPLING * settings.height)
     image = _paint(big, join([goal, obstacles, _tube(trace)]), ghosts)
     s = SUPERSAMPLING
