@@ -9,7 +9,7 @@ from robotdiffuse.visualization.picture import write_picture
 problem = rd.load_problem(Path(__file__).parent / "data" / "moveit_problem.yaml")
 print([shape.name for shape in problem.scene.shapes])
 
-result = rd.plan(problem, time_limit=5.0)
+result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
 assert result.trajectory is not None
 write_picture(problem.robot, problem.scene, result.trajectory, "02_moveit_scene.png")

@@ -19,7 +19,7 @@ problem = rd.Problem(
         [[0.0, 0.0, 1.0, 0.55], [0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.55], [0.0, 0.0, 0.0, 1.0]],
     ),
 )
-result = rd.plan(problem, time_limit=5.0)
+result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason, result.scene_clearance)
 assert result.trajectory is not None
 write_picture(problem.robot, problem.scene, result.trajectory, "03_mesh.png")

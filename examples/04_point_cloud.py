@@ -20,7 +20,7 @@ problem = rd.Problem(
     goal=[0.9, 0.3, 0.0, -1.9, 0.0, 2.2, 0.8],
     clearance=0.02,
 )
-result = rd.plan(problem, time_limit=5.0)
+result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason, f"{result.scene_clearance:.3f} m from {len(cloud.points)} points")
 assert result.trajectory is not None
 front = PictureSettings(azimuth=0.5)

@@ -18,7 +18,7 @@ image = ray_cast(true_scene, T_base_camera, intrinsics, (640, 480), robot, np.ar
 
 view = rd.DepthView(image, intrinsics, T_base_camera)
 problem = rd.Problem(robot, rd.Scene(), start, goal, views=[view], unknown="predicted")
-result = rd.plan(problem, time_limit=5.0)
+result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, "|", result.assumption, "| confidence", result.confidence)
 assert result.trajectory is not None and result.path is not None
 print("free in the true scene:", rd.verify(rd.Problem(robot, true_scene, start, goal), result.path).valid)

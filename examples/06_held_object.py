@@ -15,7 +15,7 @@ scene = rd.Scene([table, wall, parcel])
 # Where the arm is at `start`, its hand takes the parcel.
 scene, robot = scene.attach("parcel", rd.load_robot("panda"), start, link="panda_hand")
 problem = rd.Problem(robot, scene, start, goal)
-result = rd.plan(problem, time_limit=5.0)
+result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
 assert result.trajectory is not None
 front = PictureSettings(azimuth=0.5)

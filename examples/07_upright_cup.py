@@ -15,7 +15,7 @@ problem = rd.Problem(
     goal=[0.6, 0.2, 0.0, -2.0, 0.0, 2.2, 0.2],
     constraints=[upright],
 )
-result = rd.plan(problem, time_limit=5.0)
+result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
 assert result.trajectory is not None
 write_picture(robot, problem.scene, result.trajectory, "07_upright_cup.png")

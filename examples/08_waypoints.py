@@ -4,7 +4,7 @@ import numpy as np
 
 import robotdiffuse as rd
 from robotdiffuse.core.transforms import rotation_from_rpy, transform
-from robotdiffuse.visualization.picture import write_picture
+from robotdiffuse.visualization.picture import PictureSettings, write_picture
 
 
 def hand_at(x: float, y: float, z: float) -> rd.PoseGoal:
@@ -20,8 +20,9 @@ problem = rd.Problem(
     waypoints=[hand_at(0.45, -0.1, 0.55), hand_at(0.6, 0.1, 0.55), hand_at(0.4, 0.25, 0.4)],
     blend=0.05,  # 0, the default: the motion stops at each
 )
-result = rd.plan(problem, time_limit=5.0)
+result = rd.plan(problem, time_limit=20.0)
 print(result.status.value, result.reason)
 assert result.trajectory is not None
 print(f"{result.trajectory.duration:.2f} s")
-write_picture(problem.robot, problem.scene, result.trajectory, "08_waypoints.png")
+front = PictureSettings(azimuth=0.4)
+write_picture(problem.robot, problem.scene, result.trajectory, "08_waypoints.png", settings=front)

@@ -19,7 +19,7 @@ right = [-1.479, -0.43, 1.496, 1.427, 2.007, -1.564, -2.427]
 table = rd.Box([0.75, 0.0, 0.05], [0.5, 1.2, 0.04], name="table")
 problem = rd.Problem(rd.load_robot("baxter"), rd.Scene([table]), left + right, goal)
 
-result = rd.plan(problem, time_limit=5.0)
+result = rd.plan(problem, time_limit=10.0)
 print(result.status.value, result.reason)
 assert result.trajectory is not None
 front = PictureSettings(azimuth=0.3)

@@ -21,7 +21,7 @@ theirs = fitted(read_motion("theirs.csv"), robot).motion  # joints by name, in t
 report = rd.verify(problem, rd.Path(theirs.joint_names, theirs.positions))
 print("theirs:", "valid" if report.valid else report.violation.message if report.violation else "not valid")
 
-ours = rd.plan(problem, time_limit=5.0).trajectory
+ours = rd.plan(problem, time_limit=10.0).trajectory
 assert ours is not None
 certificate = rd.certify(problem, ours)
 certificate.save("certificate.json")
