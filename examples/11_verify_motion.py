@@ -3,8 +3,6 @@
 import numpy as np
 
 import robotdiffuse as rd
-from robotdiffuse.interop import read_motion
-from robotdiffuse.interop.recorded_motion import fitted
 from robotdiffuse.visualization.picture import write_picture
 
 robot = rd.load_robot("panda")
@@ -17,8 +15,8 @@ problem = rd.Problem(
 waypoints = np.linspace(start, goal, 10)
 np.savetxt("theirs.csv", waypoints, delimiter=",", header=",".join(robot.joint_names), comments="")
 
-theirs = fitted(read_motion("theirs.csv"), robot).motion  # joints by name, in the robot's order
-report = rd.verify(problem, rd.Path(theirs.joint_names, theirs.positions))
+theirs = rd.Path(robot.joint_names, np.loadtxt("theirs.csv", delimiter=",", skiprows=1))
+report = rd.verify(problem, theirs)
 print("theirs:", "valid" if report.valid else report.violation.message if report.violation else "not valid")
 
 ours = rd.plan(problem, time_limit=10.0).trajectory
@@ -26,4 +24,4 @@ assert ours is not None
 certificate = rd.certify(problem, ours)
 certificate.save("certificate.json")
 print("ours: valid; the certificate holds:", certificate.check(problem).valid)
-write_picture(robot, problem.scene, rd.Path(theirs.joint_names, theirs.positions), "11_verify_motion.png")
+write_picture(robot, problem.scene, theirs, "11_verify_motion.png")

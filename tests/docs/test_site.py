@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -60,10 +61,8 @@ def test_the_command_reference_has_every_option(site: Path) -> None:
 
 
 def test_the_python_reference_has_every_public_name(site: Path) -> None:
-    import robotdiffuse as rd
-
     page = (site / "reference" / "python.html").read_text(encoding="utf-8")
-    for name in set(rd.__all__) - {"__version__"}:
+    for name in set(import_module("robotdiffuse").__all__) - {"__version__"}:
         assert f'.{name}"' in page, name
 
 
