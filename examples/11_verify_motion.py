@@ -11,8 +11,8 @@ problem = rd.Problem(
     robot, rd.Scene([rd.Box([0.55, 0.0, 0.55], [0.5, 0.01, 0.5], name="sheet")]), start, goal
 )
 
-# In place of the other planner: waypoints on a straight line, none of which touches the thin sheet.
-waypoints = np.linspace(start, goal, 10)
+# In place of the other planner: waypoints on a straight line, none of which is near the thin sheet.
+waypoints = np.linspace(start, goal, 4)
 np.savetxt("theirs.csv", waypoints, delimiter=",", header=",".join(robot.joint_names), comments="")
 
 theirs = rd.Path(robot.joint_names, np.loadtxt("theirs.csv", delimiter=",", skiprows=1))
